@@ -1,0 +1,65 @@
+"""What can go wrong, each error also the builtin a caller would expect."""
+
+from __future__ import annotations
+
+__all__ = [
+    "DoubtfulResultWarning",
+    "FileError",
+    "LinkError",
+    "NotConvergedError",
+    "ParameterError",
+    "ProbewiseError",
+    "ReachError",
+    "ShapeError",
+]
+
+
+class ProbewiseError(Exception):
+    """Stand above every error that this package raises on purpose."""
+
+
+class ParameterError(ProbewiseError, ValueError):
+    """Report a value outside what is allowed."""
+
+    def __init__(self, name: str, value: object, allowed: str) -> None:
+        self.name, self.value, self.allowed = name, value, allowed
+        super().__init__(f"{name} is {value!r}; allowed: {allowed}")
+
+
+class ShapeError(ProbewiseError, ValueError):
+    """Report arrays whose shapes do not fit together."""
+
+
+class FileError(ProbewiseError, ValueError):
+    """Report a file that cannot be used: which file, where in it, what stood there, what is allowed."""
+
+    def __init__(
+        self, path: object, found: str, allowed: str, *, row: int | None = None, column: str | None = None
+    ) -> None:
+        self.path, self.found, self.allowed, self.row, self.column = str(path), found, allowed, row, column
+        where = str(path)
+        if row is not None:
+            where += f", row {row}"
+        if column is not None:
+            where += f", column {column}"
+        super().__init__(f"{where}: {found}; allowed: {allowed}")
+
+
+class ReachError(ParameterError):
+    """Report a pose that the arm cannot take."""
+
+
+class LinkError(ProbewiseError, OSError):
+    """Report an instrument that does not answer."""
+
+
+class NotConvergedError(ProbewiseError, RuntimeError):
+    """Report a computation that stopped short; `partial` holds what there is."""
+
+    def __init__(self, message: str, partial: object = None) -> None:
+        self.partial = partial
+        super().__init__(message)
+
+
+class DoubtfulResultWarning(UserWarning):
+    """Warn of a result that can be used but not trusted blindly; the result holds the reason too."""

@@ -1,0 +1,55 @@
+"""One inference: a prior, a model that predicts readings, a likelihood that weighs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.priors import Prior
+from probewise.recordings.plan import Recording
+from probewise.sensor.stages import SensorModel
+
+__all__ = ["Likelihood", "Problem", "SensorProblem"]
+
+
+class Likelihood(Protocol):
+    """Score readings against predictions."""
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Log likelihood with all constants, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        ...
+
+
+class Problem(Protocol):
+    """What nested sampling works on."""
+
+    @property
+    def prior(self) -> Prior:
+        """The prior; its names are the problem's parameters."""
+        ...
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log likelihood of a batch of hypotheses, (n_samples, n_params) -> (n_samples,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SensorProblem:
+    """Weigh hypotheses about sensor, scene or both against a recording's usable readings."""
+
+    prior: Prior
+    model: SensorModel
+    likelihood: Likelihood
+    recording: Recording
+
+    def __post_init__(self) -> None:
+        if self.prior.names != self.model.names:
+            raise ParameterError("prior.names", self.prior.names, f"the model's names {self.model.names}")
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Predict the whole plan (lag and backlash need every row), weigh the usable readings."""
+        usable = self.recording.usable
+        predicted = self.model.predict(theta, self.recording.plan)
+        return self.likelihood.log_prob(self.recording.readings[usable], predicted[:, usable])

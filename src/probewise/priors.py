@@ -1,0 +1,184 @@
+"""What is believed before any reading: probability distributions by name.
+
+Priors stand below shapes, sensors and effects because each of these carries its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from scipy.special import ndtri
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["Empty", "Joint", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform"]
+
+
+@runtime_checkable
+class Prior(Protocol):
+    """A distribution of several named parameters that the unit cube can be mapped to."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names, one a column of theta."""
+        ...
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map points of the unit cube, shape (n_samples, n_params), to parameters of the same shape."""
+        ...
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Natural log of the density, shape (n_samples,); -inf outside the support."""
+        ...
+
+
+class Marginal(Protocol):
+    """A distribution of one parameter."""
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape."""
+        ...
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape."""
+        ...
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Spread belief evenly between two bounds."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise ParameterError("Uniform(low, high)", (self.low, self.high), "finite, low < high")
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        return self.low + (self.high - self.low) * u
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        inside = (value >= self.low) & (value <= self.high)
+        return np.where(inside, -math.log(self.high - self.low), -np.inf)
+
+    def __str__(self) -> str:
+        return f"uniform {self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class LogUniform:
+    """Spread belief evenly over orders of magnitude (Jeffreys' prior of a scale, made proper)."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.low < self.high < math.inf):
+            raise ParameterError("LogUniform(low, high)", (self.low, self.high), "0 < low < high, finite")
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        return np.asarray(self.low * (self.high / self.low) ** u)
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        inside = (value >= self.low) & (value <= self.high)
+        safe = np.where(inside, value, self.low)
+        return np.where(inside, -np.log(safe) - math.log(math.log(self.high / self.low)), -np.inf)
+
+    def __str__(self) -> str:
+        return f"log-uniform {self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Believe a value near `mean`, give or take `sd`."""
+
+    mean: float
+    sd: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.mean) and 0 < self.sd < math.inf):
+            raise ParameterError("Normal(mean, sd)", (self.mean, self.sd), "finite, sd > 0")
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        return self.mean + self.sd * np.asarray(ndtri(u))
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        z = (value - self.mean) / self.sd
+        return np.asarray(-0.5 * z * z - math.log(self.sd * math.sqrt(2 * math.pi)))
+
+    def __str__(self) -> str:
+        return f"normal {self.mean:g} ± {self.sd:g}"
+
+
+@dataclass(frozen=True)
+class Product:
+    """Join independent marginals by name."""
+
+    marginals: Mapping[str, Marginal]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.marginals)
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        _require_columns(u, self.names)
+        return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        _require_columns(theta, self.names)
+        total = np.zeros(len(theta))
+        for i, marginal in enumerate(self.marginals.values()):
+            total = total + marginal.log_prob(theta[:, i])
+        return total
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Join independent priors of several parameters each, in order."""
+
+    parts: tuple[Prior, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for part in self.parts for name in part.names)
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        _require_columns(u, self.names)
+        return np.concatenate([p.from_unit_cube(c) for p, c in self._split(u)], axis=-1)
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        _require_columns(theta, self.names)
+        total = np.zeros(len(theta))
+        for part, columns in self._split(theta):
+            total = total + part.log_prob(columns)
+        return total
+
+    def _split(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
+        ends = np.cumsum([len(p.names) for p in self.parts])
+        return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]
+
+
+@dataclass(frozen=True)
+class Empty:
+    """Believe nothing about nothing: the prior of a model without free parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ()
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        return u
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        return np.zeros(len(theta))
+
+
+def _require_columns(values: FloatArray, names: tuple[str, ...]) -> None:
+    if values.ndim != 2 or values.shape[1] != len(names):
+        raise ShapeError(f"parameters have shape {values.shape}; allowed: (n_samples, {len(names)}) for {names}")

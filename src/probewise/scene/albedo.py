@@ -1,0 +1,59 @@
+"""The seams of what lies under the sensor: an area of albedo, a shape, a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from probewise._arrays import FloatArray
+from probewise.priors import Prior
+
+__all__ = ["Region", "Scene", "Shape"]
+
+
+class Region(Protocol):
+    """An albedo field for each hypothesis: `n_regions` of them, 1 where it is the same for all.
+
+    Regions are small frozen values of batched geometry (scene/regions.py). The sensor
+    integrates them in closed form by their kind (sensor/response.py) or, any region at all,
+    pixel by pixel through `coverage` (sensor/discrete.py).
+    """
+
+    @property
+    def n_regions(self) -> int:
+        """How many hypotheses it holds, or 1."""
+        ...
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) lab frame -> (n_regions, n_points)."""
+        ...
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over square pixels turned by `turn_rad` (n_points,): -> (n_regions, n_points)."""
+        ...
+
+
+class Shape(Protocol):
+    """A hypothesis about what lies on the field: named parameters, a prior, and the region they make."""
+
+    @property
+    def prior(self) -> Prior:
+        """What is believed of its parameters before any reading; its names are the shape's parameters."""
+        ...
+
+    def region(self, theta: FloatArray) -> Region:
+        """Build the region of each hypothesis, theta (n_samples, n_params)."""
+        ...
+
+
+class Scene(Protocol):
+    """All that lies under the sensor in one plan: a region for each pattern name."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its free parameters; () where everything is known."""
+        ...
+
+    def regions(self, theta: FloatArray) -> Mapping[str, Region]:
+        """Region by pattern name, theta (n_samples, n_params)."""
+        ...

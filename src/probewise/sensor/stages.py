@@ -1,0 +1,122 @@
+"""The stages a reading passes from pose to number, and the value that each one handles.
+
+Order (the vocabulary's): pose, scene, footprint, seen fraction, response curve, gain, offset,
+lag, saturation, noise. An effect is one function at one stage; the chain applies the effects
+of each stage in the order of stages, whatever the order in which they were found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol, TypeVar
+
+from probewise._arrays import FloatArray
+from probewise.priors import Prior
+from probewise.recordings.plan import Plan
+from probewise.scene.albedo import Region
+
+__all__ = ["Effect", "Footprint", "NoiseLevel", "Poses", "SceneView", "SensorModel", "Stage"]
+
+
+class Stage(IntEnum):
+    """Where in the chain an effect acts."""
+
+    POSE = 0
+    SCENE = 1
+    FOOTPRINT = 2
+    SEEN = 3
+    RESPONSE = 4
+    GAIN = 5
+    OFFSET = 6
+    LAG = 7
+    SATURATION = 8
+    NOISE = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where the sensor really stands: arrays that broadcast to (n_samples, n_points)."""
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    orientation_rad: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SceneView:
+    """What lies under it: region by pattern name."""
+
+    regions: Mapping[str, Region]
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """The SSF as a mixture of Gaussians in the sensor frame.
+
+    Arrays broadcast to (n_samples, n_points, n_gaussians): `weight` (sums to one over the
+    last axis), mean `u_mm`, `v_mm`, covariance `var_u`, `var_v`, `cov_uv` in mm^2.
+    """
+
+    weight: FloatArray
+    u_mm: FloatArray
+    v_mm: FloatArray
+    var_u: FloatArray
+    var_v: FloatArray
+    cov_uv: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevel:
+    """Noise of one reading: `sd` broadcasts to (n_samples, n_points); `rho`, AR(1) within a scan, (n_samples, 1)."""
+
+    sd: FloatArray
+    rho: FloatArray
+
+
+V = TypeVar("V")
+
+
+class Effect(Protocol[V]):
+    """Physics that a model may leave out: one function at one stage.
+
+    `apply` takes and returns that stage's value: Poses, SceneView, Footprint, an array
+    (n_samples, n_points) of seen fraction u (SEEN, RESPONSE), signal (GAIN), reading
+    (OFFSET, LAG, SATURATION), or NoiseLevel (NOISE).
+    """
+
+    @property
+    def name(self) -> str:
+        """Name in the vocabulary, or one of the user's own."""
+        ...
+
+    @property
+    def stage(self) -> Stage:
+        """The stage it acts at."""
+        ...
+
+    @property
+    def prior(self) -> Prior:
+        """Prior of its parameters; names are the vocabulary's, without the effect's name."""
+        ...
+
+    def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
+        """Apply with parameters theta (n_samples, n_params of this effect)."""
+        ...
+
+
+AnyEffect = Effect[Any]
+
+
+class SensorModel(Protocol):
+    """Anything that predicts readings: the chain, the naive sensor, a user's own simulator."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, one a column of theta."""
+        ...
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        ...

@@ -1,1 +1,36 @@
-"""TODO"""
+"""Find a sensor's spatial sensitivity from a recording: its order by evidence, its field as posterior mean.
+
+Paper, sections "Estimating SSF MoG Model Parameters" and "Light Sensor SSF MoG Model": eqs. "Evidence1"
+and "studentT", the table of log evidences, and the weighted mean of sampled SSF fields.
+"""
+
+from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
+from probewise.calibration.fit import Calibration, OrderFit, calibrate, problem_for
+from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
+from probewise.calibration.predict import predict
+from probewise.calibration.priors import PriorRow, ScanGeometry, SSFPrior, default_prior, scan_geometry
+from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
+
+__all__ = [
+    "Calibration",
+    "FittedSensor",
+    "OrderEvidence",
+    "OrderFit",
+    "PriorRow",
+    "SSFPrior",
+    "ScanGeometry",
+    "ScanNoise",
+    "calibrate",
+    "choose_pixel_mm",
+    "default_prior",
+    "draw_sd",
+    "mean_field",
+    "mixture_moments",
+    "noise_by_scan",
+    "pooled_sd",
+    "predict",
+    "problem_for",
+    "read_sensor",
+    "scan_geometry",
+    "write_sensor",
+]

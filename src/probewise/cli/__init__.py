@@ -1,1 +1,87 @@
-"""TODO"""
+"""The command line `probewise`: one file a verb.
+
+The paper's road as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
+(sections 2.2-2.3, the robot finds a shape), `diagnose` (what the model leaves out), `predict`
+(eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once.
+
+Exit status 0: done; 2: input that cannot be used, told in one line, nothing written;
+130: stopped by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+
+from probewise.cli import calibrate, explore, predict
+from probewise.cli._common import OneLineParser, Verb
+from probewise.errors import NotConvergedError, ProbewiseError
+
+__all__ = ["VERBS", "main", "parser"]
+
+VERBS: tuple[Verb, ...] = (calibrate.VERB, predict.VERB, explore.VERB)
+
+
+def parser() -> OneLineParser:
+    """Build the parser of the whole command line."""
+    from probewise import __version__
+
+    top = OneLineParser(
+        prog="probewise",
+        description="Model a sensor, let it choose its own measurements, find the physics its model leaves out.",
+    )
+    top.add_argument("--version", action="version", version=f"probewise {__version__}")
+    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=OneLineParser)
+    for verb in VERBS:
+        verb.add_arguments(verbs.add_parser(verb.name, help=verb.summary, description=verb.summary))
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit status.
+
+    Parameters
+    ----------
+    argv
+        Arguments without the program's name; None takes those of the process.
+    """
+    try:
+        arguments = parser().parse_args(argv)
+    except SystemExit as stop:  # argparse leaves this way after --help, --version and errors
+        return stop.code if isinstance(stop.code, int) else 2
+    verb = next(v for v in VERBS if v.name == arguments.verb)
+    with warnings.catch_warnings():
+        warnings.showwarning = _one_line_warning
+        try:
+            return verb.run(arguments)
+        except KeyboardInterrupt as stop:
+            kept = str(stop) or "nothing was written"
+            _complain(verb, f"stopped; {kept}")
+            return 130
+        except NotConvergedError as error:
+            _complain(verb, str(error))
+            return 1
+        except BrokenPipeError:  # the reader of a pipe left; what was written is complete
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except (ProbewiseError, OSError) as error:
+            _complain(verb, _one_line(error))
+            return 2
+
+
+def _complain(verb: Verb, text: str) -> None:
+    sys.stderr.write(f"probewise {verb.name}: {text}\n")
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+def _one_line_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: object = None, line: object = None
+) -> None:
+    sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")

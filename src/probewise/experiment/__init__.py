@@ -1,1 +1,35 @@
-"""TODO"""
+"""The autonomous experiment: measure, infer, inquire, and write down each measurement (paper, section 2.2 and 2.3)."""
+
+from probewise.experiment.digest import value_digest
+from probewise.experiment.journal import (
+    Belief,
+    Entry,
+    Journal,
+    JournalWriter,
+    read_journal,
+    recording_of,
+    require_same_settings,
+)
+from probewise.experiment.loop import begin, explore, run, step
+from probewise.experiment.values import PAPER_BITS, Experiment, Exploration, OneScan, State, Step
+
+__all__ = [
+    "PAPER_BITS",
+    "Belief",
+    "Entry",
+    "Experiment",
+    "Exploration",
+    "Journal",
+    "JournalWriter",
+    "OneScan",
+    "State",
+    "Step",
+    "begin",
+    "explore",
+    "read_journal",
+    "recording_of",
+    "require_same_settings",
+    "run",
+    "step",
+    "value_digest",
+]

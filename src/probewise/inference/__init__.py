@@ -1,1 +1,27 @@
-"""TODO"""
+"""Likelihoods, and the problem that joins one with a prior, a sensor model and a recording.
+
+The paper's naive likelihood and its Student-t likelihood (sigma integrated out, one for each
+data set), Gaussian ones beside them; any sensor model goes with any of them.
+"""
+
+from probewise.inference.gaussian import GaussianInferred, GaussianKnown
+from probewise.inference.naive import Naive
+from probewise.inference.noise_bounds import reading_span, sd_ceiling, sd_floor, student_t
+from probewise.inference.problem import Likelihood, Problem, SensorProblem
+from probewise.inference.student_t import PooledSigma, StudentT, log_sigma_integral
+
+__all__ = [
+    "GaussianInferred",
+    "GaussianKnown",
+    "Likelihood",
+    "Naive",
+    "PooledSigma",
+    "Problem",
+    "SensorProblem",
+    "StudentT",
+    "log_sigma_integral",
+    "reading_span",
+    "sd_ceiling",
+    "sd_floor",
+    "student_t",
+]

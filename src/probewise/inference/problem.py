@@ -52,4 +52,6 @@ class SensorProblem:
         """Predict the whole plan (lag and backlash need every row), weigh the usable readings."""
         usable = self.recording.usable
         predicted = self.model.predict(theta, self.recording.plan)
+        if usable.all():
+            return self.likelihood.log_prob(self.recording.readings, predicted)
         return self.likelihood.log_prob(self.recording.readings[usable], predicted[:, usable])

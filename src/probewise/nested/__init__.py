@@ -1,1 +1,32 @@
-"""TODO"""
+"""Nested sampling: the evidence of a problem and samples of its posterior.
+
+The paper's section "The Machine Learning System" (50 samples, diversified by about 1000
+Metropolis-Hastings steps) and its section on estimating the SSF's parameters (the evidence Z and
+the stop rule on consecutive values of log Z).
+"""
+
+from probewise.nested.diversify import DiversifyTally, diversify
+from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
+from probewise.nested.result import NestedResult
+from probewise.nested.sampler import run, step
+from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, StopRule
+
+__all__ = [
+    "Bound",
+    "DiversifyTally",
+    "EvidenceChange",
+    "Evaluator",
+    "Move",
+    "NestedResult",
+    "Points",
+    "PriorRejection",
+    "RemainingEvidence",
+    "SliceMove",
+    "State",
+    "StopRule",
+    "Tally",
+    "diversify",
+    "run",
+    "step",
+]

@@ -1,1 +1,55 @@
-"""TODO"""
+"""Plans, recordings and predictions, and their files (paper, "Data Collection for SSF Estimation")."""
+
+from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
+from probewise.recordings.files import (
+    read_plan,
+    read_plan_and_readings,
+    read_recording,
+    write_plan,
+    write_recording,
+)
+from probewise.recordings.fingerprint import fingerprint
+from probewise.recordings.patterns import (
+    Disc,
+    HalfPlane,
+    Image,
+    Pattern,
+    Polygon,
+    Quadrant,
+    Ramp,
+    Stripes,
+    Uniform,
+)
+from probewise.recordings.plan import Instrumentation, Plan, Recording
+from probewise.recordings.plans import paper_plan, two_way_plan
+from probewise.recordings.prediction import Prediction, read_prediction, write_prediction
+from probewise.recordings.shipping import shipped
+
+__all__ = [
+    "Disc",
+    "HalfPlane",
+    "Image",
+    "Instrumentation",
+    "Pattern",
+    "Plan",
+    "Polygon",
+    "Prediction",
+    "Quadrant",
+    "Ramp",
+    "Recording",
+    "Stripes",
+    "Uniform",
+    "fingerprint",
+    "paper_plan",
+    "read_plan",
+    "read_plan_and_readings",
+    "read_prediction",
+    "read_recording",
+    "shipped",
+    "two_way_plan",
+    "write_bytes_atomically",
+    "write_plan",
+    "write_prediction",
+    "write_recording",
+    "write_text_atomically",
+]

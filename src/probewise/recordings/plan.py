@@ -62,7 +62,7 @@ class Plan:
             codes = frozen_int(getattr(self, name))
             if codes.shape != (n_points,):
                 raise ShapeError(f"{name} has shape {codes.shape}; allowed: ({n_points},), as x_mm")
-            if n_points and not (0 <= codes.min() and codes.max() < n_names):
+            if n_points and (codes.min() < 0 or codes.max() >= n_names):
                 raise ParameterError(name, (int(codes.min()), int(codes.max())), f"0 to {n_names - 1}")
             object.__setattr__(self, name, codes)
         covariates = {name: frozen(values) for name, values in self.covariates.items()}
@@ -107,7 +107,7 @@ class Plan:
 
     def take(self, rows: IntArray | BoolArray) -> Plan:
         """Keep these rows, in their order (scans and patterns keep their names)."""
-        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == np.bool_ else np.asarray(rows)
+        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == np.bool_ else np.asarray(rows, dtype=np.int64)
         kept = np.unique(self.scan[rows])
         return Plan(
             x_mm=self.x_mm[rows],

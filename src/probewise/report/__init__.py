@@ -1,1 +1,1 @@
-"""TODO"""
+"""One self-contained HTML page a run, and the figures in it."""

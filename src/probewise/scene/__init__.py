@@ -1,1 +1,50 @@
-"""TODO"""
+"""What lies under the sensor, known or hypothesised.
+
+Paper, section "Robotic Arm Test Bed" (the circle's albedo, eq. 1 to 3) and section "Data
+Collection for SSF Estimation" (the patterns S_BW and S_a to S_d).
+"""
+
+from probewise.scene.albedo import Region, Scene, Shape
+from probewise.scene.patterns import region_of
+from probewise.scene.regions import (
+    EllipseRegion,
+    HalfPlaneRegion,
+    ImageRegion,
+    MixtureOfRegions,
+    PolygonRegion,
+    QuadrantRegion,
+    RampRegion,
+    StripesRegion,
+    UniformRegion,
+    disc_region,
+    outlines,
+)
+from probewise.scene.scenes import HypothesisScene, KnownScene
+from probewise.scene.shapes import AnyOf, Circle, Ellipse, Field, Placed, Rectangle, RegularPolygon
+
+__all__ = [
+    "AnyOf",
+    "Circle",
+    "Ellipse",
+    "EllipseRegion",
+    "Field",
+    "HalfPlaneRegion",
+    "HypothesisScene",
+    "ImageRegion",
+    "KnownScene",
+    "MixtureOfRegions",
+    "Placed",
+    "PolygonRegion",
+    "QuadrantRegion",
+    "RampRegion",
+    "Rectangle",
+    "Region",
+    "RegularPolygon",
+    "Scene",
+    "Shape",
+    "StripesRegion",
+    "UniformRegion",
+    "disc_region",
+    "outlines",
+    "region_of",
+]

@@ -15,7 +15,7 @@ class Region(Protocol):
     """An albedo field for each hypothesis: `n_regions` of them, 1 where it is the same for all.
 
     Regions are small frozen values of batched geometry (scene/regions.py). The sensor
-    integrates them in closed form by their kind (sensor/response.py) or, any region at all,
+    integrates them in closed form by their kind (sensor/gaussian.py) or, any region at all,
     pixel by pixel through `coverage` (sensor/discrete.py).
     """
 

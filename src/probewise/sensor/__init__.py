@@ -1,1 +1,65 @@
-"""TODO"""
+"""From scene to reading: the SSF, what it sees of a scene, and the chain of stages to a number.
+
+Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_max - I_min) R,
+(RwithSSF) and (discreteR) for R, (Ssf) for the mixture of Gaussians, and the naive sensor.
+"""
+
+from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
+from probewise.sensor.discrete import seen_discrete
+from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, seen
+from probewise.sensor.naive import NaiveSensor
+from probewise.sensor.ssf import (
+    FieldSSF,
+    FixedMixture,
+    FreeMixture,
+    SSFField,
+    SSFModel,
+    field_of,
+    footprint_of,
+    mean_mixture,
+    mixture_names,
+    mixture_of_field,
+    total_variation,
+)
+from probewise.sensor.stages import (
+    AnyEffect,
+    Effect,
+    Footprint,
+    NoiseLevel,
+    Poses,
+    SceneView,
+    SensorModel,
+    Stage,
+)
+
+__all__ = [
+    "ACCURATE_NODES",
+    "FAST_NODES",
+    "AnyEffect",
+    "Chain",
+    "Effect",
+    "FieldSSF",
+    "FixedLevels",
+    "FixedMixture",
+    "Footprint",
+    "FreeLevels",
+    "FreeMixture",
+    "Levels",
+    "NaiveSensor",
+    "NoiseLevel",
+    "Poses",
+    "SSFField",
+    "SSFModel",
+    "SceneView",
+    "SensorModel",
+    "Stage",
+    "field_of",
+    "footprint_of",
+    "mean_mixture",
+    "mixture_names",
+    "mixture_of_field",
+    "response",
+    "seen",
+    "seen_discrete",
+    "total_variation",
+]

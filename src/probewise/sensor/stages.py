@@ -13,11 +13,12 @@ from enum import IntEnum
 from typing import Any, Protocol, TypeVar
 
 from probewise._arrays import FloatArray
+from probewise.errors import ShapeError
 from probewise.priors import Prior
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 
-__all__ = ["Effect", "Footprint", "NoiseLevel", "Poses", "SceneView", "SensorModel", "Stage"]
+__all__ = ["Effect", "Footprint", "NoiseLevel", "Poses", "SceneView", "SensorModel", "Stage", "require_columns"]
 
 
 class Stage(IntEnum):
@@ -120,3 +121,9 @@ class SensorModel(Protocol):
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         ...
+
+
+def require_columns(theta: FloatArray, names: tuple[str, ...]) -> None:
+    """Raise ShapeError unless theta has shape (n_samples, len(names))."""
+    if theta.ndim != 2 or theta.shape[1] != len(names):
+        raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_samples, {len(names)}) for {names}")

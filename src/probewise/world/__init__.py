@@ -1,1 +1,43 @@
-"""TODO"""
+"""The independent brute-force world, pixels and rays, that conceals effects (paper, eq. RwithSSF, by summing light).
+
+It shares the file formats with the rest of the package and nothing else: data made by the code
+that explains them prove nothing.
+"""
+
+from probewise.world.concealed import (
+    AmbientGradient,
+    Backlash,
+    Concealed,
+    CorrelatedNoise,
+    GainDrift,
+    Nonlinearity,
+    Rows,
+    Saturation,
+)
+from probewise.world.painting import Oval, Surface, paint
+from probewise.world.rays import seen_white
+from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, tailed_spot
+from probewise.world.world import World, simulate
+
+__all__ = [
+    "AmbientGradient",
+    "Backlash",
+    "Blob",
+    "Concealed",
+    "CorrelatedNoise",
+    "GainDrift",
+    "Nonlinearity",
+    "Oval",
+    "Rows",
+    "Saturation",
+    "Spot",
+    "Surface",
+    "World",
+    "gaussian_spot",
+    "paint",
+    "raster_spot",
+    "ridge_spot",
+    "seen_white",
+    "simulate",
+    "tailed_spot",
+]

@@ -1,1 +1,31 @@
-"""TODO"""
+"""The paper's figures, one function each: data first, then the axes to draw on, and nothing global.
+
+Data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
+predicted against recorded (figure 7), the entropy map with its hypotheses (figures 2 and 8);
+beside them progress towards the precision asked for, and what a diagnosis found.
+"""
+
+from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
+from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
+from probewise.report.plots.progress import information_gained, posterior_widths
+from probewise.report.plots.readings import readings_by_orientation
+from probewise.report.plots.scene import playing_field
+from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
+from probewise.report.plots.verdict import hypothesis_probabilities
+
+__all__ = [
+    "AxesGrid",
+    "calibration_check",
+    "grid_of_axes",
+    "hypothesis_probabilities",
+    "information_gained",
+    "log_evidences",
+    "playing_field",
+    "png",
+    "posterior_widths",
+    "predicted_against_recorded",
+    "readings_by_orientation",
+    "residuals_against",
+    "spatial_sensitivity",
+    "ssf_by_order",
+]

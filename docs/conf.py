@@ -1,0 +1,68 @@
+"""Build the documentation: `sphinx-build -W docs docs/_build/html`."""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stdout
+from pathlib import Path
+
+from probewise import __version__
+from probewise.cli import VERBS, main
+
+HERE = Path(__file__).parent
+
+project = "probewise"
+author = "the probewise authors"
+copyright = "the probewise authors"
+version = release = __version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "numpydoc",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "gallery/**/*.md5", "gallery/**/*.ipynb", "gallery/**/*.py", "gallery/sg_execution_times.rst"]
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+
+templates_path = ["_templates"]
+html_theme = "furo"
+html_title = f"probewise {__version__}"
+html_static_path = ["_static"]
+
+autosummary_generate = True
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": str(HERE.parent / "examples"),
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"plot_",
+    "ignore_pattern": r"(?!plot_).*\.py$",
+    "within_subsection_order": "FileNameSortKey",
+    "download_all_examples": False,
+    "show_memory": False,
+    "min_reported_time": 1000,
+}
+
+
+def write_help(app: object) -> None:
+    """Write what `--help` says to files that the reference includes, so that it cannot fall behind."""
+    folder = HERE / "api" / "cli"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("", *(verb.name for verb in VERBS)):
+        text = io.StringIO()
+        with redirect_stdout(text):
+            main([name, "--help"] if name else ["--help"])
+        (folder / f"{name or 'probewise'}.txt").write_text(text.getvalue(), encoding="utf-8")
+
+
+def setup(app: object) -> None:
+    """Write the help texts before the pages are read."""
+    app.connect("builder-inited", write_help)  # type: ignore[attr-defined]

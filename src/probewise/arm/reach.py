@@ -1,0 +1,93 @@
+"""Where an arm that turns about a vertical axis and stretches can put its sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.errors import ParameterError, ReachError
+
+__all__ = ["FIELD_MM", "Reach"]
+
+FIELD_MM = (1048.0, 520.0)
+"""Width and height of the paper's playing field, 131 x 65 LEGO units of 8 mm."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """A ring about the arm's axis, cut by the field.
+
+    The axis stands beyond the middle of the field's upper long side. The default leaves out the two
+    corners farthest from it, 3 % of the field, at the bottom of the paper's entropy map.
+
+    Parameters
+    ----------
+    field_mm
+        Width and height of the field; its lower left corner is the lab frame's origin.
+    axis_beyond_mm
+        Distance of the axis from the field.
+    nearest_mm, farthest_mm
+        How near to the axis and how far from it the sensor can stand.
+
+    Raises
+    ------
+    ParameterError
+        If a length is negative or not finite, or `nearest_mm` is not below `farthest_mm`.
+    ReachError
+        If no place on the field is within reach.
+    """
+
+    field_mm: tuple[float, float] = FIELD_MM
+    axis_beyond_mm: float = 60.0
+    nearest_mm: float = 40.0
+    farthest_mm: float = 700.0
+
+    def __post_init__(self) -> None:
+        width, height = self.field_mm
+        for name, value in (("field_mm", width), ("field_mm", height), ("farthest_mm", self.farthest_mm)):
+            if not (math.isfinite(value) and value > 0):
+                raise ParameterError(name, value, "a finite length greater than 0")
+        for name, value in (("axis_beyond_mm", self.axis_beyond_mm), ("nearest_mm", self.nearest_mm)):
+            if not (math.isfinite(value) and value >= 0):
+                raise ParameterError(name, value, "a finite length of 0 or more")
+        if self.nearest_mm >= self.farthest_mm:
+            raise ParameterError("nearest_mm", self.nearest_mm, f"less than farthest_mm, {self.farthest_mm:g}")
+        corner = math.hypot(width / 2, height + self.axis_beyond_mm)
+        if self.axis_beyond_mm > self.farthest_mm or corner < self.nearest_mm:
+            raise ReachError(
+                "field_mm",
+                self.field_mm,
+                f"a field that comes within {self.nearest_mm:g} to {self.farthest_mm:g} mm of the axis, which stands "
+                f"{self.axis_beyond_mm:g} mm beyond its upper side; move the arm or choose another field",
+            )
+
+    @classmethod
+    def everywhere(cls, field_mm: tuple[float, float] = FIELD_MM) -> Self:
+        """Make an arm long enough for the whole field."""
+        width, height = field_mm
+        beyond = 60.0
+        return cls(field_mm, beyond, 0.0, math.hypot(width / 2, height + beyond) + 1.0)
+
+    @property
+    def axis_mm(self) -> tuple[float, float]:
+        """Where the axis stands, lab frame."""
+        return self.field_mm[0] / 2, self.field_mm[1] + self.axis_beyond_mm
+
+    def holds(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n_places, 2), are within reach and on the field: shape (n_places,)."""
+        x_mm, y_mm = places_mm[:, 0], places_mm[:, 1]
+        away = np.hypot(x_mm - self.axis_mm[0], y_mm - self.axis_mm[1])
+        on_field = (x_mm >= 0) & (x_mm <= self.field_mm[0]) & (y_mm >= 0) & (y_mm <= self.field_mm[1])
+        return on_field & (away >= self.nearest_mm) & (away <= self.farthest_mm)
+
+    def sentence(self) -> str:
+        """Say where a place may be."""
+        (width, height), (x_mm, y_mm) = self.field_mm, self.axis_mm
+        return (
+            f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {self.nearest_mm:g} to "
+            f"{self.farthest_mm:g} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm"
+        )

@@ -1,0 +1,167 @@
+"""An arm made of arithmetic, behind the same interface as the real one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.arm.instrument import Pose, Reading
+from probewise.arm.reach import Reach
+from probewise.errors import ParameterError, ReachError, ShapeError
+
+__all__ = ["LegoScale", "Light", "SimulatedArm", "Speed"]
+
+Light: TypeAlias = Callable[[Pose, float, float], float]
+"""What the sensor would read at a pose, at a time in s, at a height in mm."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How long things take: moving at `move_mm_s`, then settling, lowering and reading, `read_s` together."""
+
+    move_mm_s: float = 100.0
+    read_s: float = 1.2
+
+    def __post_init__(self) -> None:
+        if not self.move_mm_s > 0:
+            raise ParameterError("move_mm_s", self.move_mm_s, "greater than 0")
+        if not (math.isfinite(self.read_s) and self.read_s >= 0):
+            raise ParameterError("read_s", self.read_s, "0 or more")
+
+
+@dataclass(frozen=True)
+class LegoScale:
+    """The brick's conversion: whole steps from `low` to `high`; `step` None leaves fractions."""
+
+    low: float = 1.0
+    high: float = 100.0
+    step: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ParameterError("low", self.low, f"less than high, {self.high:g}")
+        if self.step is not None and not self.step > 0:
+            raise ParameterError("step", self.step, "greater than 0, or None")
+
+    def convert(self, value: float) -> float:
+        """Round to a step, then keep within the scale; NaN, a reading that did not come, stays NaN."""
+        if math.isnan(value):
+            return value
+        value = min(max(value, self.low), self.high)
+        if self.step is not None:
+            value = round(value / self.step) * self.step
+        # A step that does not divide the range may have rounded past its end.
+        return min(max(value, self.low), self.high)
+
+
+class SimulatedArm:
+    """Move, lower to 14 mm, read, raise: an Instrument whose clock is advanced, never slept.
+
+    Parameters
+    ----------
+    light
+        What the sensor would read at a pose, a time and a height, before the brick's conversion.
+    reach
+        Where the sensor can be put; a field out of reach cannot be made (Reach raises ReachError).
+    speed
+        How long moving and reading take.
+    scale
+        The conversion to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
+    height_mm
+        Height of the sensor above the surface when it reads.
+    start_s
+        What the clock shows at the start, to go on where an earlier run ended.
+    """
+
+    def __init__(
+        self,
+        light: Light,
+        *,
+        reach: Reach | None = None,
+        speed: Speed | None = None,
+        scale: LegoScale | None = LegoScale(),
+        height_mm: float = 14.0,
+        start_s: float = 0.0,
+    ) -> None:
+        if not height_mm > 0:
+            raise ParameterError("height_mm", height_mm, "greater than 0")
+        self._light, self._scale, self._height_mm, self._time_s = light, scale, height_mm, start_s
+        self.reach = Reach() if reach is None else reach
+        self.speed = Speed() if speed is None else speed
+        self._home = self._pose = self._resting_pose()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Bring the arm back to where it rests."""
+        self._pose = self._home
+
+    @property
+    def pose(self) -> Pose:
+        """Where the sensor stands."""
+        return self._pose
+
+    @property
+    def time_s(self) -> float:
+        """What the arm's clock shows."""
+        return self._time_s
+
+    def reachable(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n_places, 2), the arm can take: shape (n_places,).
+
+        Raises
+        ------
+        ShapeError
+            If the places are not pairs.
+        """
+        return self.reach.holds(_pairs(places_mm))
+
+    def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
+        """Seconds to move from `start` to each place (n_places, 2) and read there, shape (n_places,).
+
+        Raises
+        ------
+        ShapeError
+            If the places are not pairs.
+        """
+        places = _pairs(places_mm)
+        away = np.hypot(places[:, 0] - start.x_mm, places[:, 1] - start.y_mm)
+        return np.asarray(away / self.speed.move_mm_s + self.speed.read_s, dtype=np.float64)
+
+    def measure(self, pose: Pose) -> Reading:
+        """Move there, lower, read, raise; the reading is stamped with the time at which it was complete.
+
+        Raises
+        ------
+        ReachError
+            If the arm cannot take the pose; it stays where it is.
+        """
+        place = np.array([[pose.x_mm, pose.y_mm]])
+        if not (math.isfinite(pose.orientation_rad) and self.reach.holds(place)[0]):
+            raise ReachError("pose", pose, f"{self.reach.sentence()}, at a finite orientation")
+        self._time_s += float(self.travel_s(self._pose, place)[0])
+        self._pose = pose
+        value = self._light(pose, self._time_s, self._height_mm)
+        value = value if self._scale is None else self._scale.convert(value)
+        return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": self._height_mm})
+
+    def _resting_pose(self) -> Pose:
+        """Rest below the axis, as near to it as the arm folds (or, with the axis far off, at the field's side)."""
+        x_mm, y_mm = self.reach.axis_mm
+        return Pose(x_mm, max(0.0, min(self.reach.field_mm[1], y_mm - self.reach.nearest_mm)))
+
+
+def _pairs(places_mm: FloatArray) -> FloatArray:
+    places = np.asarray(places_mm, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ShapeError(f"places_mm has shape {places.shape}; allowed: (n_places, 2)")
+    return places

@@ -1,0 +1,47 @@
+"""Predict equal rows of a plan once: scans out and back, and several scans alike, cost one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.recordings import Plan
+from probewise.sensor import SensorModel
+
+__all__ = ["DistinctRows"]
+
+
+class DistinctRows:
+    """Wrap a model whose prediction of a row depends on place, orientation and pattern alone.
+
+    True of every chain without effects: time, order and covariates play no part. It predicts the
+    one plan it was made for.
+    """
+
+    def __init__(self, model: SensorModel, plan: Plan) -> None:
+        keys = np.stack([plan.x_mm, plan.y_mm, plan.orientation_rad, plan.pattern.astype(np.float64)], axis=-1)
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        self._model = model
+        self._plan = plan
+        repeats = len(first) < len(plan)
+        self._rows = inverse.reshape(-1) if repeats else None
+        self._distinct = plan.take(first) if repeats else plan
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The model's parameter names."""
+        return self._model.names
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points).
+
+        Raises
+        ------
+        ParameterError
+            If asked for another plan.
+        """
+        if plan is not self._plan:
+            raise ParameterError("plan", plan, "the plan that DistinctRows was made for")
+        distinct = self._model.predict(theta, self._distinct)
+        return distinct if self._rows is None else np.take(distinct, self._rows, axis=1)

@@ -1,0 +1,168 @@
+"""The posterior mean of SSF fields on a grid fit for the footprint (paper, section on MoG estimation)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError, ShapeError
+from probewise.sensor import Footprint, SSFField, field_of, footprint_of
+
+__all__ = ["by_mass", "choose_pixel_mm", "mean_field", "mixture_moments"]
+
+_SIGMAS = 5.0
+_MAX_PIXELS_A_SIDE = 301
+_SERIES = (1.0, 0.5, 0.2, 0.1)
+# Summed over pixels of width p, a footprint of sd s seems wider by p^2 / 24 s^2 of s, and the response errs by
+# at most 0.24 times that share of the span (the largest z phi(z)): 0.9e-3 where 3.3 pixels make an sd.
+_PIXELS_PER_SD = 3.3
+_LEAST_SHARE = 0.05
+
+
+def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray]:
+    """Compute what a person would ask of each hypothesis' SSF as a whole: centre, widths, correlation.
+
+    Parameters
+    ----------
+    theta
+        Parameters, (n_samples, at least 6 N).
+    n_gaussians
+        Order N.
+
+    Returns
+    -------
+    "centre x'", "centre y'" (mm), "log width along x'", "log width along y'" (of mm), and
+    "correlation of x' and y'", each of shape (n_samples,).
+    """
+    f = _footprint(theta, n_gaussians)
+    u, v = (f.weight * f.u_mm).sum(axis=-1), (f.weight * f.v_mm).sum(axis=-1)
+    du, dv = f.u_mm - u[..., None], f.v_mm - v[..., None]
+    var_u = (f.weight * (f.var_u + du * du)).sum(axis=-1)
+    var_v = (f.weight * (f.var_v + dv * dv)).sum(axis=-1)
+    cov = (f.weight * (f.cov_uv + du * dv)).sum(axis=-1)
+    found = {
+        "centre x'": u,
+        "centre y'": v,
+        "log width along x'": np.log(var_u) / 2,
+        "log width along y'": np.log(var_v) / 2,
+        "correlation of x' and y'": cov / np.sqrt(var_u * var_v),
+    }
+    return {name: values[:, 0] for name, values in found.items()}
+
+
+def by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
+    """Sort the Gaussians of each sample by falling mass; field and predictions stay what they are.
+
+    The prior is exchangeable, so a posterior sample says nothing about which Gaussian is the first;
+    numbered by mass, means and intervals of single columns make sense.
+    """
+    order = np.argsort(-_footprint(theta, n_gaussians).weight[:, 0], axis=1, kind="stable")
+    out = theta.copy()
+    blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
+    out[:, : 6 * n_gaussians] = np.take_along_axis(blocks, order[:, :, None], axis=1).reshape(len(theta), -1)
+    return out
+
+
+def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> float:
+    """Choose the pixel of the mean field: 1 mm, or finer where scan step or footprint ask for it.
+
+    Never coarser than the scan step, nor than the sd of the narrowest Gaussian that holds a
+    twentieth of the mass (median over the samples) over 3.3, so that the sum over pixels errs by
+    less than a thousandth of the span; rounded down to 1, 0.5, 0.2, 0.1 times a power of ten.
+
+    Parameters
+    ----------
+    theta
+        Posterior samples, (n_samples, at least 6 N).
+    n_gaussians
+        Order N.
+    step_mm
+        Scan step.
+    """
+    f = _footprint(theta, n_gaussians)
+    # The smaller eigenvalue of the covariance, as a quotient that keeps its digits.
+    middle, half = (f.var_u + f.var_v) / 2, np.hypot((f.var_u - f.var_v) / 2, f.cov_uv)
+    narrow = np.sqrt((f.var_u * f.var_v - f.cov_uv**2) / (middle + half))
+    narrowest = np.where(f.weight >= _LEAST_SHARE, narrow, np.inf).min(axis=(1, 2))
+    wanted = min(1.0, step_mm, float(np.median(narrowest)) / _PIXELS_PER_SD)
+    decade = 10.0 ** math.ceil(math.log10(wanted) - 1e-9)
+    return next(s * decade for s in _SERIES if s * decade <= wanted * (1 + 1e-9))
+
+
+def mean_field(
+    theta: FloatArray,
+    n_gaussians: int,
+    *,
+    pixel_mm: float = 1.0,
+    weight: FloatArray | None = None,
+    max_pixels: int = _MAX_PIXELS_A_SIDE,
+) -> SSFField:
+    """Average the SSF fields of weighted samples on square pixels, one of them centred on the mechanical origin.
+
+    Parameters
+    ----------
+    theta
+        Samples, (n_samples, at least 6 N), columns a_1, u_1, v_1, A_1, B_1, C_1, ...
+    n_gaussians
+        Order N.
+    pixel_mm
+        Width of a pixel; a footprint that would need more than `max_pixels` a side gets wider ones.
+    weight
+        Posterior weights, (n_samples,); equal where not given.
+    max_pixels
+        Most pixels along one side, 3 or more.
+
+    Returns
+    -------
+    SSFField
+        The mean of fields, not the field of mean parameters. It reaches five sds beyond every
+        centre but those of the outermost thousandth of the mass.
+    """
+    if not (pixel_mm > 0 and math.isfinite(pixel_mm)):
+        raise ParameterError("pixel_mm", pixel_mm, "greater than 0")
+    if max_pixels < 3:
+        raise ParameterError("max_pixels", max_pixels, "3 or more")
+    weight = np.full(len(theta), 1 / len(theta)) if weight is None else weight / weight.sum()
+    if weight.shape != (len(theta),):
+        raise ShapeError(f"weight has shape {weight.shape}; allowed: ({len(theta)},), one a sample")
+    # Samples that hold a thousandth of the weight between them cost most of the time and change nothing.
+    order = np.argsort(-weight)
+    kept = order[: int(np.searchsorted(np.cumsum(weight[order]), 0.999)) + 1]
+    f, shares = _footprint(theta[kept], n_gaussians), weight[kept]
+    mass = shares[:, None, None] * f.weight
+    low_u, high_u = _reach(f.u_mm, np.sqrt(f.var_u), mass)
+    low_v, high_v = _reach(f.v_mm, np.sqrt(f.var_v), mass)
+    widest = max(high_u - low_u, high_v - low_v)
+    if widest / pixel_mm > max_pixels - 2:
+        pixel_mm = _rounded_up(widest / (max_pixels - 2))
+    u_mm, v_mm = _centers(low_u, high_u, pixel_mm), _centers(low_v, high_v, pixel_mm)
+    return field_of(f, u_mm=u_mm, v_mm=v_mm, weights=shares)
+
+
+def _footprint(theta: FloatArray, n_gaussians: int) -> Footprint:
+    return footprint_of(theta[:, : 6 * n_gaussians], n_gaussians)
+
+
+def _centers(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray:
+    """Multiples of the pixel from `low_mm` or just below to `high_mm` or just above."""
+    numbers = np.arange(math.floor(low_mm / pixel_mm), math.ceil(high_mm / pixel_mm) + 1, dtype=np.float64)
+    return pixel_mm * numbers
+
+
+def _reach(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
+    """Bounds that hold five sds about all centres but those of the outermost thousandth of the mass, either side."""
+    return -_upper(_SIGMAS * sd - center, mass), _upper(center + _SIGMAS * sd, mass)
+
+
+def _upper(values: FloatArray, mass: FloatArray) -> float:
+    flat, weight = values.ravel(), mass.ravel()
+    order = np.argsort(flat)
+    ladder = np.cumsum(weight[order])
+    return float(flat[order][np.searchsorted(ladder, 0.999 * ladder[-1])])
+
+
+def _rounded_up(pixel_mm: float) -> float:
+    decade = 10.0 ** math.floor(math.log10(pixel_mm))
+    return float(next(s * decade for s in (1.0, 2.0, 5.0, 10.0) if s * decade >= pixel_mm * (1 - 1e-9)))

@@ -1,0 +1,265 @@
+"""Calibrate: the evidence of one to four Gaussians, the mean SSF field, the fitted sensor (paper, table and fig. 5)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise._display import ShowsItself
+from probewise.calibration.distinct import DistinctRows
+from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field, mixture_moments
+from probewise.calibration.noise import noise_by_scan, pooled_sd
+from probewise.calibration.priors import PriorRow, SSFPrior, default_prior, scan_geometry
+from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
+from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
+from probewise.inference import SensorProblem, sd_ceiling, sd_floor, student_t
+from probewise.nested import NestedResult, State, run
+from probewise.recordings import Recording, fingerprint
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FreeLevels, FreeMixture, SSFField
+
+__all__ = ["Calibration", "OrderFit", "calibrate", "problem_for"]
+
+_N_SAMPLES = 1000
+# A posterior this close to the prior's own sd was not narrowed by the recording.
+_UNINFORMED = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class OrderFit:
+    """What the recording says if the SSF has `n_gaussians` Gaussians: nested run, sensor, prior."""
+
+    n_gaussians: int
+    prior: SSFPrior
+    result: NestedResult
+    sensor: FittedSensor
+
+    @property
+    def log_z(self) -> float:
+        """Natural log of the evidence."""
+        return self.result.log_z
+
+    @property
+    def log_z_error(self) -> float:
+        """Standard error of log Z."""
+        return self.result.log_z_error
+
+    @property
+    def field(self) -> SSFField:
+        """Weighted mean of the sampled SSF fields."""
+        return self.sensor.field
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(ShowsItself):
+    """Hold every order that was tried, and which one the evidence prefers."""
+
+    recording: Recording
+    fits: tuple[OrderFit, ...]
+
+    @property
+    def chosen(self) -> OrderFit:
+        """The order of greatest evidence."""
+        return max(self.fits, key=lambda fit: fit.log_z)
+
+    @property
+    def sensor(self) -> FittedSensor:
+        """The fitted sensor of the chosen order."""
+        return self.chosen.sensor
+
+    @property
+    def orders(self) -> tuple[OrderEvidence, ...]:
+        """The paper's table: log evidence with its error, and parameter counts, one row an order."""
+        return self.sensor.orders
+
+    @property
+    def fields(self) -> dict[int, SSFField]:
+        """Mean SSF field by order."""
+        return {fit.n_gaussians: fit.field for fit in self.fits}
+
+    @property
+    def priors(self) -> tuple[PriorRow, ...]:
+        """The table of priors."""
+        return self.chosen.prior.describe()
+
+    def probabilities(self) -> dict[int, float]:
+        """Posterior probability of each order, all orders equally probable beforehand."""
+        log_z = np.array([fit.log_z for fit in self.fits])
+        weight = np.exp(log_z - log_z.max())
+        return {fit.n_gaussians: float(w) for fit, w in zip(self.fits, weight / weight.sum(), strict=True)}
+
+    def summary(self) -> str:
+        """Describe the calibration in plain text."""
+        return self.sensor.summary()
+
+
+def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
+    """Pose the calibration of one order: chain over the known patterns, Student-t with one sigma a data set.
+
+    Parameters
+    ----------
+    recording
+        The readings.
+    prior
+        Prior of the order's parameters.
+    data_sets
+        Data set of each row, (n_points,) from 0; default: its scan.
+    """
+    plan = recording.plan
+    groups = plan.scan if data_sets is None else np.asarray(data_sets)
+    if groups.shape != (len(plan),):
+        raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one a row")
+    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns))
+    return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    orders: Sequence[int] = (1, 2, 3, 4),
+    n_live: int = 300,
+    rng: np.random.Generator,
+    progress: Callable[[int, State], None] | None = None,
+    prior: Callable[[Recording, int], SSFPrior] = default_prior,
+    data_sets: IntArray | None = None,
+    pixel_mm: float | None = None,
+    n_samples: int = _N_SAMPLES,
+) -> Calibration:
+    """Fit SSFs of several orders to a recording and weigh them by their evidence (paper, section on MoG estimation).
+
+    Parameters
+    ----------
+    recording
+        Readings over known patterns.
+    orders
+        Numbers of Gaussians to try.
+    n_live
+        Live points of nested sampling.
+    rng
+        Source of randomness; every order draws from a stream of its own.
+    progress
+        Called with the order and the sampler's state after every round.
+    prior
+        Makes the prior from the recording and an order.
+    data_sets
+        Data set of each row, which has a noise sd of its own, (n_points,) from 0; default: its scan.
+    pixel_mm
+        Pixel of the mean fields; default by `choose_pixel_mm`, 1 mm or finer.
+    n_samples
+        Equally weighted posterior samples to keep, 500 or more.
+
+    Returns
+    -------
+    Calibration
+        With a `sensor` for each order; the chosen one is that of the greatest evidence.
+
+    Raises
+    ------
+    ParameterError
+        If no order is asked for, or the recording has no contrast (see `scan_geometry`).
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        If there are fewer usable readings than parameters, or the sampler doubts its run.
+    """
+    wanted = tuple(dict.fromkeys(int(n) for n in orders))
+    if not wanted or min(wanted) < 1:
+        raise ParameterError("orders", tuple(orders), "one or more whole numbers from 1")
+    geometry = scan_geometry(recording)
+    n_usable = int(recording.usable.sum())
+    fits = []
+    for n_gaussians, stream in zip(wanted, rng.spawn(len(wanted)), strict=True):
+        notes: tuple[str, ...] = ()
+        if n_usable < 6 * n_gaussians + 2:
+            notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the prior decides much",)
+            warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=2)
+        belief = prior(recording, n_gaussians)
+        problem = problem_for(recording, belief, data_sets=data_sets)
+        told = None if progress is None else _told(progress, n_gaussians)
+        result = run(problem, rng=stream, n_live=n_live, progress=told)
+        sensor = _fitted(recording, problem, result, n_samples, pixel_mm, geometry.step_mm, notes, stream)
+        fits.append(OrderFit(n_gaussians, belief, result, sensor))
+    table = tuple(OrderEvidence(fit.n_gaussians, fit.log_z, fit.log_z_error) for fit in fits)
+    close = _close_call(table)
+    return Calibration(
+        recording,
+        tuple(
+            replace(fit, sensor=replace(fit.sensor, orders=table, notes=(*fit.sensor.notes, *close))) for fit in fits
+        ),
+    )
+
+
+def _told(progress: Callable[[int, State], None], n_gaussians: int) -> Callable[[State], None]:
+    return lambda state: progress(n_gaussians, state)
+
+
+def _fitted(
+    recording: Recording,
+    problem: SensorProblem,
+    result: NestedResult,
+    n_samples: int,
+    pixel_mm: float | None,
+    step_mm: float,
+    notes: tuple[str, ...],
+    rng: np.random.Generator,
+) -> FittedSensor:
+    """Turn a nested run into the sensor it found."""
+    prior = problem.prior
+    if not isinstance(prior, SSFPrior):
+        raise ParameterError("prior", prior, "an SSFPrior")
+    n_gaussians = prior.n_gaussians
+    plan, usable = recording.plan, recording.usable
+    samples = by_mass(result.samples(n_samples, rng=rng), n_gaussians)
+    residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
+    floor, ceiling = sd_floor(recording), sd_ceiling(recording)
+    pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
+    silent = _uninformed(samples, prior, rng)
+    if silent:
+        notes = (*notes, f"the recording says little about {', '.join(silent)}: there the posterior is the prior")
+    n_left_out = len(plan) - int(usable.sum())
+    if n_left_out:
+        notes = (*notes, f"{n_left_out} of {len(plan)} readings missing or out of range, left out")
+    return FittedSensor(
+        names=prior.names,
+        samples=samples,
+        n_gaussians=n_gaussians,
+        noise_sd=pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
+        field=mean_field(result.theta, n_gaussians, pixel_mm=pixel, weight=result.weight),
+        instrumentation=plan.instrumentation,
+        scan_noise=noise_by_scan(
+            residuals, plan.scan[usable], plan.scan_names, sd_floor=floor, sd_ceiling=ceiling, rng=rng
+        ),
+        fingerprint=fingerprint(recording),
+        source=recording.source,
+        priors=prior.describe(),
+        notes=(*notes, *result.warnings),
+    )
+
+
+def _uninformed(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
+    """Name the centre, widths and correlation whose spread the recording did not narrow."""
+    before = mixture_moments(prior.from_unit_cube(rng.random((2000, len(prior.names)))), prior.n_gaussians)
+    after = mixture_moments(samples, prior.n_gaussians)
+    return tuple(
+        name.removeprefix("log ") for name in after if np.std(after[name]) > _UNINFORMED * np.std(before[name])
+    )
+
+
+def _close_call(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
+    """Say so where the two best orders cannot be told apart within the errors of their evidence."""
+    if len(table) < 2:
+        return ()
+    first, second = sorted(table, key=lambda order: -order.log_z)[:2]
+    lead, error = first.log_z - second.log_z, math.hypot(first.log_z_error, second.log_z_error)
+    if lead > 2 * error:
+        return ()
+    return (
+        f"orders {first.n_gaussians} and {second.n_gaussians} are too close to call: "
+        f"log evidence differs by {lead:.2f} ± {error:.2f}",
+    )

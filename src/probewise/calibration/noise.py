@@ -1,0 +1,122 @@
+"""The noise that a calibration leaves: sd of each scan, and one pooled over scans for readings to come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammainc, gammaincinv
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["ScanNoise", "draw_sd", "noise_by_scan", "pooled_sd"]
+
+
+@dataclass(frozen=True)
+class ScanNoise:
+    """Noise of one scan: how many readings it rests on, posterior mean and sd of its sd, in the reading's unit."""
+
+    scan: str
+    n_readings: int
+    mean: float
+    sd: float
+
+
+def draw_sd(
+    sum_of_squares: FloatArray, n_readings: int, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator
+) -> FloatArray:
+    """Draw the sd of Gaussian noise given residuals, under the proper 1/sd prior of the Student-t likelihood.
+
+    The posterior is sd^(-1 - n) exp(-Q / (2 sd^2)) on [floor, ceiling], so Q / (2 sd^2) follows a
+    gamma distribution of shape n / 2 cut off at both ends, and is drawn by its quantile function.
+
+    Parameters
+    ----------
+    sum_of_squares
+        Q, the sum of squared residuals of each hypothesis, shape (n_samples,).
+    n_readings
+        How many residuals each sum holds.
+    sd_floor, sd_ceiling
+        Bounds of the prior, in the reading's unit.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    One sd for each hypothesis, shape (n_samples,).
+
+    Raises
+    ------
+    ParameterError
+        If `n_readings` is below 1 or the bounds are not 0 < floor < ceiling.
+    """
+    if n_readings < 1:
+        raise ParameterError("n_readings", n_readings, "1 or more")
+    if not 0 < sd_floor < sd_ceiling < np.inf:
+        raise ParameterError("(sd_floor, sd_ceiling)", (sd_floor, sd_ceiling), "0 < floor < ceiling, finite")
+    shape = n_readings / 2
+    # With Q = 0 the likelihood is sd^-n and the posterior piles up at the floor, as tiny residuals do.
+    q = np.maximum(sum_of_squares, n_readings * (1e-6 * sd_floor) ** 2)
+    least, most = q / (2 * sd_ceiling**2), q / (2 * sd_floor**2)
+    low, high = gammainc(shape, least), gammainc(shape, most)
+    drawn = gammaincinv(shape, low + (high - low) * rng.random(q.shape))
+    # Where the whole posterior lies in a tail too thin for the incomplete gamma, it sits at the nearer bound.
+    thin = ~(high - low > 1e-280) | ~np.isfinite(drawn) | (drawn <= 0)
+    at_bound = np.where(most < shape, sd_floor, sd_ceiling)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sd = np.sqrt(q / (2 * drawn))
+    return np.clip(np.where(thin, at_bound, sd), sd_floor, sd_ceiling)
+
+
+def pooled_sd(residuals: FloatArray, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator) -> FloatArray:
+    """Draw one sd for each hypothesis from all residuals together: the noise of a new scan.
+
+    Parameters
+    ----------
+    residuals
+        Reading less prediction of the usable rows, shape (n_samples, n_points).
+    sd_floor, sd_ceiling
+        Bounds of the prior, in the reading's unit.
+    rng
+        Source of randomness.
+    """
+    total = np.einsum("sp,sp->s", residuals, residuals)
+    return draw_sd(total, residuals.shape[1], sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
+
+
+def noise_by_scan(
+    residuals: FloatArray,
+    scan: IntArray,
+    scan_names: tuple[str, ...],
+    *,
+    sd_floor: float,
+    sd_ceiling: float,
+    rng: np.random.Generator,
+) -> tuple[ScanNoise, ...]:
+    """Sum up the posterior of every scan's own sd, in the order of scans.
+
+    Parameters
+    ----------
+    residuals
+        Reading less prediction of the usable rows, shape (n_samples, n_points).
+    scan
+        Data set of each row, an index into `scan_names`, shape (n_points,).
+    scan_names
+        Names of the data sets.
+    sd_floor, sd_ceiling
+        Bounds of the prior, in the reading's unit.
+    rng
+        Source of randomness.
+    """
+    if residuals.shape[1:] != scan.shape:
+        raise ShapeError(
+            f"residuals have shape {residuals.shape}; allowed: (n_samples, {scan.size}), one a row of scan"
+        )
+    out = []
+    for k, name in enumerate(scan_names):
+        rows = residuals[:, scan == k]
+        if rows.shape[1]:
+            sd = pooled_sd(rows, sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
+            out.append(ScanNoise(name, rows.shape[1], float(sd.mean()), float(sd.std())))
+    return tuple(out)

@@ -1,0 +1,101 @@
+"""Predict the readings of any plan by a fitted sensor (paper, eq. "modelI" and its figure of predicted readings)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.calibration.density import log_cell_density, log_gaussian_density
+from probewise.calibration.distinct import DistinctRows
+from probewise.calibration.sensor_file import FittedSensor
+from probewise.errors import DoubtfulResultWarning, ShapeError
+from probewise.recordings import Plan, Prediction, Recording
+from probewise.scene import KnownScene
+
+__all__ = ["predict"]
+
+# Numbers held at once by one pass over a block of samples: about 30 MB.
+_BLOCK = 4_000_000
+
+
+def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[float] | None = None) -> Prediction:
+    """Predict every row of a plan, and score its readings where there are any.
+
+    Mean and sd are those of one new reading, parameter uncertainty and noise together. The density
+    is the mixture, over the posterior samples, of a Gaussian with that sample's prediction and
+    pooled noise sd; where the plan declares a quantisation step, the mass of the reading's cell
+    divided by the step. Each row is scored alone. New patterns, scans and angles are predicted like
+    any other; an effect that belongs to one scan plays no part (see `FittedSensor.chain`).
+
+    Parameters
+    ----------
+    sensor
+        The fitted sensor.
+    plan
+        Where, when and over what to read, n_points rows.
+    readings
+        What was read, shape (n_points,), NaN where missing; `None` for a plan.
+
+    Returns
+    -------
+    Prediction
+        `log_density` is NaN where a reading is missing or out of the plan's declared range.
+
+    Raises
+    ------
+    ShapeError
+        If there are not as many readings as rows.
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        If the plan declares another unit than the sensor was calibrated in.
+    """
+    recorded = np.full(len(plan), np.nan) if readings is None else np.asarray(readings, dtype=np.float64)
+    if recorded.shape != (len(plan),):
+        raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one a row of the plan")
+    if plan.instrumentation.unit != sensor.instrumentation.unit:
+        warnings.warn(
+            f"the plan's readings are in {plan.instrumentation.unit!r}, "
+            f"the sensor was calibrated in {sensor.instrumentation.unit!r}; predictions are in the sensor's",
+            DoubtfulResultWarning,
+            stacklevel=2,
+        )
+    scored = Recording(plan, recorded).usable
+    step = plan.instrumentation.step
+    chain = sensor.chain(KnownScene(plan.patterns))
+    model = chain if sensor.effects else DistinctRows(chain, plan)
+    theta = sensor.carried_samples
+    n_samples, n_points = len(theta), len(plan)
+    per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))
+
+    total, squares, variance = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
+    log_sum = np.full(int(scored.sum()), -np.inf)
+    center: FloatArray | None = None
+    for first in range(0, n_samples, per_block):
+        block = slice(first, first + per_block)
+        mean = model.predict(theta[block], plan)
+        sd = np.broadcast_to(chain.noise_level(theta[block], plan, sensor.noise_sd[block, None]).sd, mean.shape)
+        if center is None:
+            center = mean.mean(axis=0)  # Sums about a nearby value keep their digits.
+        total += (mean - center).sum(axis=0)
+        squares += ((mean - center) ** 2).sum(axis=0)
+        variance += (sd**2).sum(axis=0)
+        if log_sum.size:
+            at = recorded[scored]
+            log_p = (
+                log_gaussian_density(at, mean[:, scored], sd[:, scored])
+                if step is None
+                else log_cell_density(at, mean[:, scored], sd[:, scored], step)
+            )
+            log_sum = np.logaddexp(log_sum, np.logaddexp.reduce(log_p, axis=0))
+    shift = total / n_samples
+    spread = np.maximum(squares / n_samples - shift**2, 0.0)
+    log_density = np.full(n_points, np.nan)
+    log_density[scored] = log_sum - math.log(n_samples)
+    base = np.zeros(n_points) if center is None else center
+    return Prediction(plan, base + shift, np.sqrt(spread + variance / n_samples), log_density)

@@ -1,0 +1,249 @@
+"""What is believed of a sensor before its recording: proper priors from scan step, span and reading range.
+
+The paper assigns uniform priors and prints no bounds. Uniform belief in A and B puts almost all
+of it on footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A lies within
+a factor 1.4 of the smallest sd), and the evidence for an order then weighs that accident. Here a
+width is a scale that is unknown by orders of magnitude, so A and B are log-uniform; every bound
+comes from what the scans can resolve and contain. `SSFPrior(precision=Uniform(...))` is the paper's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError, ShapeError
+from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.recordings import Recording
+from probewise.scene import KnownScene
+
+__all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "default_prior", "scan_geometry"]
+
+_MAX_CORRELATION = 0.98
+_AMPLITUDE = Uniform(0.0, 1.0)
+_PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
+
+
+@dataclass(frozen=True)
+class PriorRow:
+    """One line of the report's table of priors."""
+
+    parameter: str
+    unit: str
+    distribution: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class SSFPrior:
+    """Believe the same of each of `n_gaussians` Gaussians, independently, and of the two levels (paper, 6 N + 2).
+
+    The Gaussians are exchangeable: no ordering is imposed, so each of the N! labellings of a
+    footprint holds the same evidence, and the evidence of the order counts them all, as it must.
+    C = r sqrt(A B) with r uniform on (-max_correlation, max_correlation): every draw is a
+    positive definite Gaussian.
+
+    Parameters
+    ----------
+    n_gaussians
+        How many Gaussians make up the SSF.
+    offset_mm
+        Prior of each centre coordinate u, v in the sensor frame.
+    precision
+        Prior of A and of B, mm^-2; the conditional sd of the Gaussian along x' is (2 A)^(-1/2).
+    i_min, i_max
+        Priors of the readings over albedo 0 and 1, in the reading's unit.
+    amplitude
+        Prior of a_n; only ratios of the a_n reach the data.
+    max_correlation
+        Largest |C| / sqrt(A B), below 1.
+    """
+
+    n_gaussians: int
+    offset_mm: Marginal
+    precision: Marginal
+    i_min: Marginal
+    i_max: Marginal
+    amplitude: Marginal = _AMPLITUDE
+    max_correlation: float = _MAX_CORRELATION
+    reasons: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.n_gaussians < 1:
+            raise ParameterError("n_gaussians", self.n_gaussians, "1 or more")
+        if not 0 < self.max_correlation < 1:
+            raise ParameterError("max_correlation", self.max_correlation, "above 0, below 1")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names in the sensor's order: a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max."""
+        gaussians = (f"{p}_{n}" for n in range(1, self.n_gaussians + 1) for p in _PER_GAUSSIAN)
+        return (*gaussians, "I_min", "I_max")
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map the unit cube to parameters, (n_samples, 6 N + 2) both ways."""
+        self._require_columns(u)
+        out = np.empty(u.shape)
+        for n in range(self.n_gaussians):
+            g, x = out[:, 6 * n : 6 * n + 6], u[:, 6 * n : 6 * n + 6]
+            g[:, 0] = self.amplitude.from_unit(x[:, 0])
+            g[:, 1] = self.offset_mm.from_unit(x[:, 1])
+            g[:, 2] = self.offset_mm.from_unit(x[:, 2])
+            g[:, 3] = self.precision.from_unit(x[:, 3])
+            g[:, 4] = self.precision.from_unit(x[:, 4])
+            g[:, 5] = self.max_correlation * (2 * x[:, 5] - 1) * np.sqrt(g[:, 3] * g[:, 4])
+        out[:, -2] = self.i_min.from_unit(u[:, -2])
+        out[:, -1] = self.i_max.from_unit(u[:, -1])
+        return out
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
+        self._require_columns(theta)
+        total = self.i_min.log_prob(theta[:, -2]) + self.i_max.log_prob(theta[:, -1])
+        for n in range(self.n_gaussians):
+            a, u, v, p, q, c = theta[:, 6 * n : 6 * n + 6].T
+            total = total + self.amplitude.log_prob(a) + self.offset_mm.log_prob(u) + self.offset_mm.log_prob(v)
+            total = total + self.precision.log_prob(p) + self.precision.log_prob(q)
+            scale = np.sqrt(np.maximum(p, 0) * np.maximum(q, 0))
+            inside = (scale > 0) & (np.abs(c) <= self.max_correlation * scale * (1 + 1e-12))
+            safe = np.where(inside, scale, 1.0)
+            total = total + np.where(inside, -np.log(2 * self.max_correlation * safe), -np.inf)
+        return total
+
+    def describe(self) -> tuple[PriorRow, ...]:
+        """Return the table of priors for the report, one row a kind of parameter."""
+        why = dict(self.reasons)
+        rows = (
+            ("a_n", "1", str(self.amplitude), "only ratios of the a_n reach the data"),
+            ("u_n, v_n", "mm", str(self.offset_mm), why.get("offset_mm", "given")),
+            ("A_n, B_n", "mm^-2", str(self.precision), why.get("precision", "given")),
+            (
+                "C_n",
+                "mm^-2",
+                f"uniform -{self.max_correlation:g} to {self.max_correlation:g} times sqrt(A_n B_n)",
+                "every draw is positive definite",
+            ),
+            ("I_min", "reading", str(self.i_min), why.get("levels", "given")),
+            ("I_max", "reading", str(self.i_max), why.get("levels", "given")),
+        )
+        return tuple(PriorRow(*row) for row in rows)
+
+    def _require_columns(self, values: FloatArray) -> None:
+        if values.ndim != 2 or values.shape[1] != len(self.names):
+            raise ShapeError(f"parameters have shape {values.shape}; allowed: (n_samples, {len(self.names)})")
+
+
+@dataclass(frozen=True)
+class ScanGeometry:
+    """What the design of a recording can resolve and contain.
+
+    `step_mm` is the median move within scans, `span_mm` the median length of the scans that
+    move; `low`, `high` the extreme readings; `albedo_low`, `albedo_high` the extreme albedo
+    under the commanded places; `inverted` where dark places read high.
+    """
+
+    step_mm: float
+    span_mm: float
+    low: float
+    high: float
+    albedo_low: float
+    albedo_high: float
+    inverted: bool
+
+
+def scan_geometry(recording: Recording) -> ScanGeometry:
+    """Measure step, span and reading range of a recording's usable rows.
+
+    Raises
+    ------
+    ParameterError
+        If no reading is usable, all are equal, the sensor never moves, or the albedo under it never changes.
+    """
+    plan = recording.plan
+    usable = recording.usable
+    readings = recording.readings[usable]
+    if readings.size == 0:
+        raise ParameterError("recording", f"{len(recording)} rows, none usable", "readings present and within min..max")
+    low, high = float(readings.min()), float(readings.max())
+    if not low < high:
+        raise ParameterError(
+            "recording", f"all {readings.size} usable readings equal {low:g}", "readings that differ: scan an edge"
+        )
+    place = np.stack([plan.x_mm, plan.y_mm], axis=-1)
+    moves: list[FloatArray] = []
+    lengths: list[float] = []
+    for rows in plan.rows_by_scan():
+        steps = np.hypot(*np.diff(place[rows], axis=0).T)
+        if (steps > 0).any():
+            moves.append(steps[steps > 0])
+            lengths.append(float(np.hypot(*np.ptp(place[rows], axis=0))))
+    extent = float(np.hypot(*np.ptp(place, axis=0)))
+    if not lengths and extent == 0:
+        raise ParameterError("recording", "every reading taken at one place", "scans that move over an edge")
+    span = float(np.median(lengths)) if lengths else extent
+    # Places far apart, such as a robot's own choice, bound no footprint from below: keep a factor of 50.
+    step = min(float(np.median(np.concatenate(moves))) if moves else span, span / 50)
+    albedo = _albedo_under(recording)[usable]
+    albedo_low, albedo_high = float(albedo.min()), float(albedo.max())
+    if not albedo_low < albedo_high:
+        raise ParameterError(
+            "recording", f"albedo {albedo_low:g} under every usable place", "places on both sides of an edge"
+        )
+    covariance = float(np.mean((albedo - albedo.mean()) * (readings - readings.mean())))
+    return ScanGeometry(step, span, low, high, albedo_low, albedo_high, inverted=covariance < 0)
+
+
+def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
+    """Derive the prior of an SSF of `n_gaussians` from the recording's step, span and reading range.
+
+    Centres lie within a quarter of the span from the mechanical origin, so that a scan centred on
+    an edge contains the transition; conditional sds from half a step (nothing finer is resolved) to
+    a quarter of the span (nothing wider is contained); each level within half the reading range of
+    where the readings, scaled to albedo 0 and 1, place it. Directions in which the recording says
+    nothing, such as along a single edge, keep this prior.
+
+    Raises
+    ------
+    ParameterError
+        If the recording has no contrast (see `scan_geometry`) or `n_gaussians` is below 1.
+    """
+    g = scan_geometry(recording)
+    reach = g.span_mm / 4
+    finest, widest = g.step_mm / 2, g.span_mm / 4
+    gain = (g.high - g.low) / (g.albedo_high - g.albedo_low) * (-1 if g.inverted else 1)
+    at_low = g.high if g.inverted else g.low
+    black = at_low - gain * g.albedo_low
+    white = black + gain
+    half = abs(gain) / 2
+    level = "within half the reading range of the extreme readings"
+    if (g.albedo_low, g.albedo_high) != (0.0, 1.0):
+        level += f", scaled from albedo {g.albedo_low:g}..{g.albedo_high:g} to 0..1"
+    return SSFPrior(
+        n_gaussians=n_gaussians,
+        offset_mm=Uniform(-reach, reach),
+        precision=LogUniform(1 / (2 * widest**2), 1 / (2 * finest**2)),
+        i_min=Uniform(black - half, black + half),
+        i_max=Uniform(white - half, white + half),
+        reasons=(
+            ("offset_mm", f"a quarter of the scans' span of {g.span_mm:g} mm either side of the mechanical origin"),
+            (
+                "precision",
+                f"conditional sd (2A)^(-1/2) from {finest:.3g} mm (half a scan step) to {widest:.3g} mm "
+                "(a quarter of the span), equal belief per decade",
+            ),
+            ("levels", level),
+        ),
+    )
+
+
+def _albedo_under(recording: Recording) -> FloatArray:
+    """Albedo at the commanded places, (n_points,)."""
+    plan = recording.plan
+    regions = KnownScene(plan.patterns).regions(np.empty((1, 0)))
+    out = np.empty(len(plan))
+    for name, rows in plan.rows_by_pattern():
+        points = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
+        out[rows] = regions[name].albedo(points)[0]
+    return out

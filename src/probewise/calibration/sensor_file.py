@@ -1,0 +1,409 @@
+"""A fitted sensor, and sensor.json, the file that carries it to prediction, robot and diagnosis."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._display import ShowsItself
+from probewise._version import __version__
+from probewise.calibration.noise import ScanNoise
+from probewise.calibration.priors import PriorRow
+from probewise.effects import VOCABULARY
+from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
+from probewise.recordings import Instrumentation, write_text_atomically
+from probewise.scene import KnownScene, Scene
+from probewise.sensor import AnyEffect, Chain, FreeLevels, FreeMixture, SSFField, mixture_names
+
+__all__ = ["BOUND_TO_SCANS", "FORMAT", "MIN_SAMPLES", "FittedSensor", "OrderEvidence", "read_sensor", "write_sensor"]
+
+T = TypeVar("T")
+
+FORMAT = "sensor/1"
+MIN_SAMPLES = 500
+# Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
+BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
+
+
+@dataclass(frozen=True)
+class OrderEvidence:
+    """One line of the paper's table: log evidence of an order, its error, and the counts 6 N and 6 N + 2."""
+
+    n_gaussians: int
+    log_z: float
+    log_z_error: float
+
+    @property
+    def n_ssf_parameters(self) -> int:
+        """Parameters of the SSF alone, as the paper's table counts them: 6 N."""
+        return 6 * self.n_gaussians
+
+    @property
+    def n_parameters(self) -> int:
+        """Parameters estimated, I_min and I_max included: 6 N + 2."""
+        return 6 * self.n_gaussians + 2
+
+
+@dataclass(frozen=True, eq=False)
+class FittedSensor(ShowsItself):
+    """Hold what a recording taught about a sensor: its posterior, its noise, its mean SSF field.
+
+    Attributes
+    ----------
+    names
+        Parameters, one a column of `samples`: a_1 ... C_N, I_min, I_max, then "<effect>.<parameter>".
+    samples
+        Equally weighted posterior samples, (n_samples, n_params), at least 500.
+    n_gaussians
+        Order N of the SSF.
+    noise_sd
+        sd of one new reading in a new scan, one for each sample, (n_samples,): pooled over scans.
+    field
+        Posterior mean of the SSF fields, the discrete SSF that the robot uses (paper, eq. "discreteR").
+    instrumentation
+        Unit, range and step of the readings, and what took them.
+    effects
+        Names of the effects in the model, in the order of their columns.
+    scan_noise
+        Noise of each scan of the recording.
+    fingerprint, source
+        Of the recording: hash of its content, and its file name.
+    orders
+        Log evidence of every order tried.
+    priors
+        The table of priors.
+    notes
+        Why the result should be used with care; empty where nothing stands against it.
+    version
+        The package's.
+    """
+
+    names: tuple[str, ...]
+    samples: FloatArray
+    n_gaussians: int
+    noise_sd: FloatArray
+    field: SSFField
+    instrumentation: Instrumentation
+    effects: tuple[str, ...] = ()
+    scan_noise: tuple[ScanNoise, ...] = ()
+    fingerprint: str = ""
+    source: str = ""
+    orders: tuple[OrderEvidence, ...] = ()
+    priors: tuple[PriorRow, ...] = ()
+    notes: tuple[str, ...] = ()
+    version: str = __version__
+
+    def __post_init__(self) -> None:
+        samples, noise_sd = frozen(self.samples), frozen(self.noise_sd)
+        if samples.ndim != 2 or samples.shape[1] != len(self.names):
+            raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(self.names)})")
+        if len(samples) < MIN_SAMPLES:
+            raise ParameterError("n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
+        if noise_sd.shape != (len(samples),):
+            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one a sample")
+        require_finite("samples", samples)
+        require_finite("noise_sd", noise_sd)
+        if not (noise_sd > 0).all():
+            raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
+        unknown = [name for name in self.effects if name not in VOCABULARY and name not in BOUND_TO_SCANS]
+        if unknown:
+            raise ParameterError("effects", unknown[0], ", ".join(sorted(VOCABULARY)))
+        wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
+        if self.names[: len(wanted)] != wanted:
+            raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
+        owners = tuple(dict.fromkeys(name.partition(".")[0] for name in self.names[len(wanted) :]))
+        if owners != tuple(name for name in self.effects if name in owners) or not set(owners) <= set(self.effects):
+            raise ParameterError("names", self.names, f"columns after I_max named after the effects {self.effects}")
+        det = _determinants(samples, self.n_gaussians)
+        if not (det > 0).all():
+            raise ParameterError("A B - C^2", float(det.min()), "greater than 0 in every sample")
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "noise_sd", noise_sd)
+
+    @property
+    def carried_effects(self) -> tuple[AnyEffect, ...]:
+        """The effects that act on new scans too."""
+        return tuple(VOCABULARY[name]() for name in self.effects if name not in BOUND_TO_SCANS)
+
+    @property
+    def carried_samples(self) -> FloatArray:
+        """Samples in the order of the columns of `chain`, without effects that belong to single scans."""
+        return self.samples[:, [self.names.index(name) for name in self.chain(KnownScene({})).names]]
+
+    def chain(self, scene: Scene) -> Chain:
+        """Build the model that predicts new readings over a scene, with the effects that carry over.
+
+        Its parameters are the columns of `carried_samples`, if the scene has none of its own.
+        """
+        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.carried_effects)
+
+    def mean(self) -> dict[str, float]:
+        """Posterior mean by parameter."""
+        return dict(zip(self.names, self.samples.mean(axis=0).tolist(), strict=True))
+
+    def sd(self) -> dict[str, float]:
+        """Posterior standard deviation by parameter."""
+        return dict(zip(self.names, self.samples.std(axis=0).tolist(), strict=True))
+
+    def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Central interval of each parameter that holds `mass`."""
+        if not 0 < mass < 1:
+            raise ParameterError("mass", mass, "greater than 0, less than 1")
+        low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
+        return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
+
+    def summary(self) -> str:
+        """Describe the sensor in plain text."""
+        unit = self.instrumentation.unit
+        lines = [
+            f"{self.n_gaussians} Gaussian{'s' if self.n_gaussians > 1 else ''}, {len(self.samples)} posterior samples"
+            + (f", with {', '.join(self.effects)}" if self.effects else ""),
+            f"noise of a new reading  {self.noise_sd.mean():.4g} ± {self.noise_sd.std():.2g} {unit}",
+        ]
+        if self.orders:
+            lines.append("Gaussians  parameters  of the SSF   log evidence")
+            best = max(self.orders, key=lambda order: order.log_z)
+            lines += [
+                f"{o.n_gaussians:>9}  {o.n_parameters:>10}  {o.n_ssf_parameters:>10}  "
+                f"{o.log_z:>10.2f} ± {o.log_z_error:.2f}{'  most probable' if o is best else ''}"
+                for o in self.orders
+            ]
+        width = max(9, *(len(name) for name in self.names))
+        lines.append(f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval")
+        mean, sd, interval = self.mean(), self.sd(), self.interval()
+        lines += [
+            f"{name:<{width}}  {mean[name]:>11.5g}  {sd[name]:>11.3g}  {low:.5g} to {high:.5g}"
+            for name, (low, high) in interval.items()
+        ]
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
+    def to_json(self) -> str:
+        """Write the sensor as strict JSON, format "sensor/1"."""
+        mean, sd, interval = self.mean(), self.sd(), self.interval()
+        document = {
+            "format": FORMAT,
+            "version": self.version,
+            "recording": {"fingerprint": self.fingerprint, "source": self.source},
+            "instrumentation": asdict(self.instrumentation),
+            "n_gaussians": self.n_gaussians,
+            "parameters": [
+                {"name": n, "unit": self.unit(n), "mean": mean[n], "sd": sd[n], "interval95": list(interval[n])}
+                for n in self.names
+            ],
+            "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
+            "effects": list(self.effects),
+            "noise": {
+                "model": "independent Gaussian, one sd pooled over scans; one value a sample",
+                "mean": float(self.noise_sd.mean()),
+                "scans": [asdict(scan) for scan in self.scan_noise],
+                "sd": self.noise_sd.tolist(),
+            },
+            "orders": [
+                asdict(o) | {"n_ssf_parameters": o.n_ssf_parameters, "n_parameters": o.n_parameters}
+                for o in self.orders
+            ],
+            "priors": [asdict(row) for row in self.priors],
+            "notes": list(self.notes),
+            "field": {
+                "pixel_mm": float(self.field.pixel_mm),
+                "origin_mm": [float(x) for x in self.field.origin_mm],
+                "rows": "from low to high y', columns from low to high x'",
+                "values": self.field.values.tolist(),
+            },
+            "samples": self.samples.tolist(),
+        }
+        return json.dumps(document, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, path: object = "sensor.json") -> FittedSensor:
+        """Read what `to_json` wrote; `path` is what error messages call it.
+
+        Raises
+        ------
+        FileError
+            If the text is damaged, incomplete, or of another format or version of it.
+        """
+        try:
+            document = json.loads(text, parse_constant=_refuse)
+        except ValueError as error:
+            raise FileError(
+                path, f"no strict JSON ({error})", "a sensor.json as `probewise calibrate` writes"
+            ) from error
+        found = document.get("format") if isinstance(document, dict) else None
+        if found != FORMAT:
+            raise FileError(path, f"format {found!r}", f"{FORMAT!r}; calibrate the recording anew with this version")
+        read = _Reader(path, document)
+        try:
+            sensor = cls(
+                names=tuple(_text(read, p, "name", "parameters") for p in read.items("parameters")),
+                samples=read.array("samples", ndim=2),
+                n_gaussians=read.whole("n_gaussians"),
+                noise_sd=read.array("noise", "sd", ndim=1),
+                field=SSFField(
+                    read.array("field", "values", ndim=2),
+                    read.number("field", "pixel_mm"),
+                    _pair(read.array("field", "origin_mm", ndim=1), read),
+                ),
+                instrumentation=_instrumentation(read),
+                effects=tuple(read.texts("effects")),
+                scan_noise=tuple(_record(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")),
+                fingerprint=read.text("recording", "fingerprint"),
+                source=read.text("recording", "source"),
+                orders=tuple(_record(read, OrderEvidence, o, "orders") for o in read.items("orders")),
+                priors=tuple(_record(read, PriorRow, p, "priors") for p in read.items("priors")),
+                notes=tuple(read.texts("notes")),
+                version=read.text("version"),
+            )
+        except FileError:
+            raise
+        except (ProbewiseError, ValueError, TypeError) as error:
+            raise FileError(path, f"contents that do not fit together ({error})", "an undamaged sensor.json") from error
+        return sensor
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a parameter."""
+        if "." in name:
+            owner, _, parameter = name.partition(".")
+            effect = VOCABULARY[owner]() if owner in VOCABULARY else None
+            return "" if effect is None else dict(zip(effect.prior.names, effect.units, strict=True)).get(parameter, "")
+        if name in ("I_min", "I_max"):
+            return self.instrumentation.unit
+        return {"a": "1", "u": "mm", "v": "mm"}.get(name[0], "mm^-2")
+
+
+def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
+    """Write sensor.json in one piece or not at all."""
+    write_text_atomically(path, sensor.to_json())
+
+
+def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
+    """Read sensor.json.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, damaged, or of another format.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise FileError(path, f"cannot be read ({reason})", "a sensor.json as `probewise calibrate` writes") from error
+    return FittedSensor.from_json(text, path)
+
+
+def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
+    a, b, c = (samples[:, k : 6 * n_gaussians : 6] for k in (3, 4, 5))
+    return np.where(a > 0, a * b - c * c, -np.inf)
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} stands for a number")
+
+
+class _Reader:
+    """Take typed values out of a parsed document, naming file and place where one is missing or wrong."""
+
+    def __init__(self, path: object, document: Mapping[str, Any]) -> None:
+        self.path, self.document = path, document
+
+    def value(self, *keys: str) -> Any:
+        at: Any = self.document
+        for key in keys:
+            if not isinstance(at, dict) or key not in at:
+                raise FileError(self.path, f"no {'.'.join(keys)}", "every entry that `probewise calibrate` writes")
+            at = at[key]
+        return at
+
+    def wrong(self, place: str, found: object, allowed: str) -> FileError:
+        return FileError(self.path, f"{place} is {found!r:.60}", allowed)
+
+    def text(self, *keys: str) -> str:
+        found = self.value(*keys)
+        if not isinstance(found, str):
+            raise self.wrong(".".join(keys), found, "a text")
+        return found
+
+    def texts(self, *keys: str) -> list[str]:
+        found = self.value(*keys)
+        if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+            raise self.wrong(".".join(keys), found, "a list of texts")
+        return found
+
+    def items(self, *keys: str) -> list[dict[str, Any]]:
+        found = self.value(*keys)
+        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+            raise self.wrong(".".join(keys), found, "a list of objects")
+        return found
+
+    def number(self, *keys: str) -> float:
+        found = self.value(*keys)
+        if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
+            raise self.wrong(".".join(keys), found, "a finite number")
+        return float(found)
+
+    def whole(self, *keys: str) -> int:
+        found = self.value(*keys)
+        if isinstance(found, bool) or not isinstance(found, int):
+            raise self.wrong(".".join(keys), found, "a whole number")
+        return found
+
+    def array(self, *keys: str, ndim: int) -> FloatArray:
+        found = self.value(*keys)
+        try:
+            array = np.array(found, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise self.wrong(".".join(keys), found, f"numbers in {ndim} equal dimensions") from error
+        if array.ndim != ndim or not np.isfinite(array).all():
+            raise self.wrong(".".join(keys), found, f"finite numbers in {ndim} equal dimensions")
+        return array
+
+
+def _text(read: _Reader, item: Mapping[str, Any], key: str, place: str) -> str:
+    found = item.get(key)
+    if not isinstance(found, str):
+        raise read.wrong(f"{place}.{key}", found, "a text")
+    return found
+
+
+def _pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
+    if values.shape != (2,):
+        raise read.wrong("field.origin_mm", values.tolist(), "two numbers")
+    return float(values[0]), float(values[1])
+
+
+def _record(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -> T:
+    """Build one of the small values of texts, numbers and counts, by the types of its fields."""
+    kinds: dict[str, type | tuple[type, ...]] = {"str": str, "int": int, "float": (int, float)}
+    values: dict[str, object] = {}
+    for field in fields(kind):  # type: ignore[arg-type]
+        found = item.get(field.name)
+        wrong = isinstance(found, bool) or not isinstance(found, kinds[str(field.type)])
+        if wrong or (isinstance(found, int | float) and not math.isfinite(found)):
+            raise read.wrong(f"{place}.{field.name}", found, f"a value of kind {field.type}")
+        values[field.name] = found
+    return kind(**values)
+
+
+def _instrumentation(read: _Reader) -> Instrumentation:
+    def optional(key: str) -> float | None:
+        return None if read.value("instrumentation", key) is None else read.number("instrumentation", key)
+
+    return Instrumentation(
+        unit=read.text("instrumentation", "unit"),
+        min=optional("min"),
+        max=optional("max"),
+        step=optional("step"),
+        sensor=read.text("instrumentation", "sensor"),
+        height_mm=optional("height_mm"),
+        controls=tuple(read.texts("instrumentation", "controls")),
+        description=read.text("instrumentation", "description"),
+    )

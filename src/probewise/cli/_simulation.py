@@ -1,0 +1,162 @@
+"""Put a simulated arm over a simulated field, and pose the experiment that its sensor model makes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm import Pose, Reach, Reading, SimulatedArm
+from probewise.calibration import FittedSensor
+from probewise.errors import ParameterError
+from probewise.experiment import Experiment
+from probewise.inference import GaussianKnown, Naive
+from probewise.inquiry import Grid
+from probewise.recordings import Disc, Polygon
+from probewise.scene import (
+    AnyOf,
+    Circle,
+    Ellipse,
+    EllipseRegion,
+    Field,
+    HypothesisScene,
+    PolygonRegion,
+    Rectangle,
+    RegularPolygon,
+    Shape,
+)
+from probewise.sensor import Chain, FieldSSF, FixedLevels, NaiveSensor
+from probewise.world import Oval, Spot, Surface, World
+
+__all__ = ["SHAPES", "experiment_for", "field_arm", "parse_field", "parse_truth", "shape_named", "surface_of", "world_like"]
+
+SHAPES: Mapping[str, Callable[[Field], Shape]] = {
+    "circle": lambda field: Circle(field),
+    "ellipse": lambda field: Ellipse(field),
+    "rectangle": lambda field: Rectangle(field),
+    "triangle": lambda field: RegularPolygon(3, field),
+    "hexagon": lambda field: RegularPolygon(6, field),
+}
+
+
+def parse_field(text: str) -> Field:
+    """Read "WIDTH,HEIGHT" in mm."""
+    try:
+        width, height = (float(cell) for cell in text.split(","))
+    except ValueError as error:
+        raise ParameterError("--field", text, "WIDTH,HEIGHT in mm, such as 1048,520") from error
+    return Field(width, height)
+
+
+def shape_named(names: Sequence[str], field: Field) -> Shape:
+    """Build the hypothesis: one shape, or a set of shapes."""
+    chosen = {name: SHAPES[name](field) for name in dict.fromkeys(names)}
+    return AnyOf(chosen) if len(chosen) > 1 else next(iter(chosen.values()))
+
+
+def experiment_for(sensor: FittedSensor, shape: Shape, field: Field, *, model: str, n_live: int) -> Experiment:
+    """Pose the experiment: a known sensor over a shape that is not known.
+
+    Parameters
+    ----------
+    sensor
+        As calibrated. The SSF model takes its mean field, the naive model its two levels.
+    shape
+        What may lie on the field.
+    field
+        Where to look: 131 x 65 places, as in the paper.
+    model
+        "ssf" or "naive".
+    n_live
+        Live points of nested sampling at every reading.
+    """
+    means = sensor.mean()
+    levels = FixedLevels(means["I_min"], means["I_max"])
+    scene = HypothesisScene(shape)
+    noise_sd = lego_noise_sd(sensor)
+    grid = Grid(field.width_mm, field.height_mm)
+    if model == "naive":
+        likelihood = Naive(levels.i_min, noise_sd, levels.i_max, noise_sd)
+        return Experiment(shape, NaiveSensor(levels, scene), likelihood, noise_sd, grid, n_live=n_live)
+    chain = Chain(FieldSSF(sensor.field), levels, scene)
+    return Experiment(shape, chain, GaussianKnown(noise_sd), noise_sd, grid, n_live=n_live)
+
+
+def lego_noise_sd(sensor: FittedSensor) -> float:
+    """Sd of one reading in whole LEGO units: the calibrated noise, and that of rounding to one unit."""
+    return math.hypot(float(sensor.noise_sd.mean()), 1 / math.sqrt(12))
+
+
+def world_like(sensor: FittedSensor) -> World:
+    """Build the world that a sensor.json describes: its mean field as the spot, its levels and noise."""
+    field, means = sensor.field, sensor.mean()
+    corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
+    spot = Spot(np.asarray(field.values), field.pixel_mm, corner)
+    return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=float(sensor.noise_sd.mean()))
+
+
+def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> tuple[str, FloatArray]:
+    """Read "[SHAPE:]V,V,...", the parameters of what lies there; without a text draw it from the prior.
+
+    Returns
+    -------
+    Name of the shape, and its parameters, shape (n_params,).
+    """
+    if text is None:
+        name = names[int(rng.integers(len(names)))]
+        prior = SHAPES[name](field).prior
+        return name, prior.from_unit_cube(rng.random((1, len(prior.names))))[0]
+    name, _, listed = text.rpartition(":")
+    name = name or names[0]
+    if name not in SHAPES:
+        raise ParameterError("--truth", text, f"a shape of {', '.join(SHAPES)} before the colon")
+    prior = SHAPES[name](field).prior
+    allowed = f"{len(prior.names)} numbers within their bounds, {','.join(prior.names)}"
+    try:
+        theta = np.array([float(cell) for cell in listed.split(",")])
+    except ValueError as error:
+        raise ParameterError("--truth", text, allowed) from error
+    if theta.shape != (len(prior.names),) or not np.isfinite(theta).all():
+        raise ParameterError("--truth", text, allowed)
+    return name, theta
+
+
+def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
+    """Paint the shape for the world: geometry alone crosses over."""
+    region = SHAPES[name](field).region(theta[None, :])
+    if isinstance(region, EllipseRegion):
+        center, axes = region.center_mm[0].tolist(), region.semi_axes_mm[0].tolist()
+        if axes[0] == axes[1]:
+            return Disc((center[0], center[1]), axes[0])
+        return Oval((center[0], center[1]), (axes[0], axes[1]), float(region.angle_rad[0]))
+    if isinstance(region, PolygonRegion):
+        return Polygon(tuple((float(x), float(y)) for x, y in region.vertices_mm[0]))
+    raise ParameterError("shape", name, "one whose outline is an ellipse or a polygon")
+
+
+def field_arm(
+    world: World, surface: Surface, field: Field, *, seed: int, taken: Sequence[Reading] = ()
+) -> SimulatedArm:
+    """Stand the simulated arm over a surface.
+
+    Parameters
+    ----------
+    world, surface, field
+        What it reads, and how large the field is.
+    seed
+        Of the noise. Each reading has a generator of its own, so that a run that was stopped goes on
+        with the noise it would have had.
+    taken
+        Readings taken before.
+    """
+    number = itertools.count(len(taken))
+
+    def light(pose: Pose, time_s: float, height_mm: float) -> float:
+        rng = np.random.default_rng([seed, next(number)])
+        return world.read(surface, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng)
+
+    reach = Reach((field.width_mm, field.height_mm))
+    return SimulatedArm(light, reach=reach, start_s=taken[-1].time_s if taken else 0.0)

@@ -1,0 +1,65 @@
+"""`probewise calibrate`: a sensor model from a recording, its number of Gaussians chosen by evidence."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, positive_int, say, staged
+
+__all__ = ["VERB"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument("recording", type=Path, metavar="REC.csv", help="recording, its JSON beside it")
+    add_out_directory(parser)
+    parser.add_argument(
+        "--orders",
+        type=positive_int,
+        nargs="+",
+        default=[1, 2, 3, 4],
+        metavar="N",
+        help="numbers of Gaussians to weigh (default 1 2 3 4)",
+    )
+    parser.add_argument(
+        "--live", type=positive_int, default=300, metavar="N", help="live points of nested sampling (default 300)"
+    )
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate and write sensor.json, report.html and the figures."""
+    import numpy as np
+
+    from probewise.calibration import calibrate, predict, write_sensor
+    from probewise.cli._progress import nested_progress
+    from probewise.recordings import read_recording
+    from probewise.report import calibration as report
+
+    out = check_out_directory(arguments.out)
+    recording = read_recording(arguments.recording)
+    orders = tuple(sorted(set(arguments.orders)))
+    with nested_progress(quiet=arguments.quiet) as progress:
+        result = calibrate(
+            recording,
+            orders=orders,
+            n_live=arguments.live,
+            rng=np.random.default_rng(arguments.seed),
+            progress=progress,
+        )
+    prediction = predict(result.sensor, recording.plan, recording.readings)
+    drawn = report.figures(result, recording, prediction)
+    with staged(out) as stage:
+        write_sensor(result.sensor, stage / "sensor.json")
+        for name, png in drawn.items():
+            (stage / name).write_bytes(png)
+        page = report.write_page(result, recording, prediction, drawn, seed=arguments.seed)
+        (stage / "report.html").write_text(page, encoding="utf-8")
+    for note in recording.notes:
+        say(f"note: {note}", quiet=arguments.quiet)
+    say(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+VERB = Verb("calibrate", "Fit the sensor model of a recording; weigh numbers of Gaussians.", add_arguments, run)

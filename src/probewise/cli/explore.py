@@ -1,0 +1,140 @@
+"""`probewise explore`: the robot chooses its own measurements until it knows the shape."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, positive_int, say, staged
+from probewise.errors import FileError
+
+if TYPE_CHECKING:
+    from probewise.arm import Reading
+
+__all__ = ["VERB"]
+
+SHAPE_NAMES = ("circle", "ellipse", "rectangle", "triangle", "hexagon")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument("--sensor", type=Path, required=True, metavar="S.json", help="sensor model")
+    add_out_directory(parser)
+    parser.add_argument("--model", choices=("ssf", "naive"), default="ssf", help="what the robot takes its sensor for")
+    parser.add_argument(
+        "--shape",
+        nargs="+",
+        choices=SHAPE_NAMES,
+        default=["circle"],
+        metavar="SHAPE",
+        help=f"what may lie on the field, one or several of {', '.join(SHAPE_NAMES)} (default circle)",
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="[SHAPE:]V,V,...",
+        help="what the simulated world hides, a circle as X,Y,R in mm (default: drawn from the seed)",
+    )
+    parser.add_argument(
+        "--field", default="1048,520", metavar="W,H", help="width and height of the field in mm (default 1048,520)"
+    )
+    parser.add_argument(
+        "--arm", choices=("simulated",), default="simulated", help="where the readings come from (default simulated)"
+    )
+    parser.add_argument(
+        "--max-readings", type=positive_int, default=100, metavar="N", help="stop here at the latest (default 100)"
+    )
+    parser.add_argument(
+        "--live", type=positive_int, default=200, metavar="N", help="live points of nested sampling (default 200)"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on from the journal in DIR")
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, infer, inquire; keep a journal and a picture of every step."""
+    import numpy as np
+    from tqdm import tqdm
+
+    from probewise.calibration import read_sensor
+    from probewise.cli import _simulation as simulation
+    from probewise.experiment import Exploration, explore
+    from probewise.recordings import write_bytes_atomically
+    from probewise.report import exploration as report
+    from probewise.scene import outlines
+
+    out = check_out_directory(arguments.out)
+    sensor = read_sensor(arguments.sensor)
+    field = simulation.parse_field(arguments.field)
+    run_rng, truth_rng = np.random.default_rng(arguments.seed).spawn(2)
+    name, truth = simulation.parse_truth(arguments.truth, arguments.shape, field, rng=truth_rng)
+    experiment = simulation.experiment_for(
+        sensor,
+        simulation.shape_named(arguments.shape, field),
+        field,
+        model=arguments.model,
+        n_live=arguments.live,
+    )
+    journal = out / "journal.jsonl"
+    taken = _taken_before(journal, resume=arguments.resume)
+    arm = simulation.field_arm(
+        simulation.world_like(sensor),
+        simulation.surface_of(name, truth, field),
+        field,
+        seed=arguments.seed,
+        taken=taken,
+    )
+    means = sensor.mean()
+    drawing = {
+        "levels": (means["I_min"], means["I_max"]),
+        "truth_mm": outlines(simulation.SHAPES[name](field).region(truth[None, :]))[0],
+    }
+    say(f"seed {arguments.seed}", quiet=arguments.quiet)
+    folder = out / "frames"
+    folder.mkdir(parents=True, exist_ok=True)
+    steps, frames, readings = [], [], []
+    with (
+        arm,
+        tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
+    ):
+        try:
+            for step in explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal):
+                steps.append(step)
+                pose = step.reading.pose
+                readings.append((pose.x_mm, pose.y_mm, step.reading.value))
+                frames.append(report.frame(step, experiment, readings, **drawing))
+                write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
+                bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
+                bar.update()
+        except KeyboardInterrupt as stop:
+            kept = f"{journal} keeps {len(steps)} readings; go on with --resume"
+            raise KeyboardInterrupt(kept) from stop
+    result = Exploration(experiment, tuple(steps))
+    prior_names = simulation.SHAPES[name](field).prior.names
+    known = _truth_by_name(name, dict(zip(prior_names, truth.tolist(), strict=True)), experiment.names)
+    with staged(out) as stage:
+        page = report.write_page(result, frames, seed=arguments.seed, model=arguments.model, truth=known)
+        (stage / "report.html").write_text(page, encoding="utf-8")
+    say(f"{result.summary()}\nerror        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
+    say(f"written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _taken_before(journal: Path, *, resume: bool) -> tuple[Reading, ...]:
+    from probewise.experiment import read_journal
+
+    if resume and not journal.exists():
+        raise FileError(journal, "no such file", "a journal to resume; without --resume a new run begins")
+    if not journal.exists():
+        return ()
+    if not resume:
+        raise FileError(journal, "a run's journal stands there", "--resume to go on with it, or another --out")
+    return read_journal(journal).readings
+
+
+def _truth_by_name(shape: str, truth: dict[str, float], names: tuple[str, ...]) -> dict[str, float]:
+    """Name the truth as the hypothesis does: in a set of shapes "rectangle.width_mm", with the centre shared."""
+    return {n: truth[n.removeprefix(f"{shape}.")] for n in names if n.removeprefix(f"{shape}.") in truth}
+
+
+VERB = Verb("explore", "Let the robot find a shape, choosing each measurement itself.", add_arguments, run)

@@ -1,0 +1,46 @@
+"""`probewise predict`: what a sensor model expects of a plan, and how well it expected a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from probewise.cli._common import Verb, add_quiet, check_out_file, say
+
+__all__ = ["VERB"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument("sensor", type=Path, metavar="S.json", help="sensor model, as calibrate and diagnose write it")
+    parser.add_argument("plan", type=Path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
+    parser.add_argument("--out", type=Path, required=True, metavar="P.csv", help="where the prediction goes")
+    add_quiet(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Predict every row, and say how well the readings were expected where there are any."""
+    import numpy as np
+
+    from probewise.calibration import predict, read_sensor
+    from probewise.recordings import read_plan_and_readings, write_prediction
+
+    out = check_out_file(arguments.out, arguments.sensor, arguments.plan)
+    sensor = read_sensor(arguments.sensor)
+    plan, readings = read_plan_and_readings(arguments.plan)
+    prediction = predict(sensor, plan, readings)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_prediction(prediction, out)
+    say(f"{len(plan)} readings predicted: {out}", quiet=arguments.quiet)
+    scored = np.isfinite(prediction.log_density)
+    if readings is not None and scored.any():
+        z = (readings[scored] - prediction.mean[scored]) / prediction.sd[scored]
+        say(
+            f"of {int(scored.sum())} recorded: chi-square a reading {float(np.mean(z**2)):.3f}, "
+            f"log density a reading {float(prediction.log_density[scored].mean()):.3f}",
+            quiet=arguments.quiet,
+        )
+    return 0
+
+
+VERB = Verb("predict", "Predict the readings of a plan: mean, sd, log density, a row each.", add_arguments, run)

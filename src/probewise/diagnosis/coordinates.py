@@ -1,0 +1,156 @@
+"""Coordinates in which every prior is a standard normal, so that fits and evidences need no special case.
+
+The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their
+widths, the inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, all of
+order one. An effect's coordinates are the normal scores of its own prior.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from probewise._arrays import FloatArray, frozen
+from probewise.effects import Extent, NamedEffect
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["FARTHEST", "SensorCoordinates", "default_sensor", "effect_scores", "effect_values", "sensor_from_posterior"]
+
+FARTHEST = 6.0
+"""Bound of every coordinate: six standard deviations of its prior."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorCoordinates:
+    """A normal prior of the SSF's and the levels' natural coordinates.
+
+    `center` has shape (6 n_gaussians + 1,), `factor` is a square root of the covariance.
+    `exchangeable` Gaussians can trade names, which the evidence counts.
+    """
+
+    n_gaussians: int
+    center: FloatArray
+    factor: FloatArray
+    exchangeable: bool = True
+
+    def __post_init__(self) -> None:
+        n_params = 6 * self.n_gaussians + 1
+        object.__setattr__(self, "center", frozen(self.center))
+        object.__setattr__(self, "factor", frozen(self.factor))
+        if self.center.shape != (n_params,) or self.factor.shape != (n_params, n_params):
+            raise ShapeError(
+                f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n_params},) and "
+                f"({n_params}, {n_params}) for {self.n_gaussians} Gaussians"
+            )
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates: one less than the paper's, whose amplitudes have a common factor."""
+        return len(self.center)
+
+    @property
+    def log_multiplicity(self) -> float:
+        """Log of the number of equal peaks of the posterior."""
+        return math.lgamma(self.n_gaussians + 1) if self.exchangeable else 0.0
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max: one column more."""
+        return natural_to_theta(self.center + z @ self.factor.T, self.n_gaussians)
+
+    def z(self, theta: FloatArray) -> FloatArray:
+        """Invert `theta`."""
+        return np.asarray(np.linalg.solve(self.factor, (theta_to_natural(theta, self.n_gaussians) - self.center).T).T)
+
+
+def natural_to_theta(natural: FloatArray, n_gaussians: int) -> FloatArray:
+    """Map natural coordinates (n_samples, 6 N + 1) to the paper's parameters (n_samples, 6 N + 2)."""
+    n_logits = n_gaussians - 1
+    logits = np.concatenate([np.zeros((len(natural), 1)), natural[:, :n_logits]], axis=1)
+    shares = np.exp(logits - logits.max(axis=1, keepdims=True))
+    shares /= shares.sum(axis=1, keepdims=True)
+    blocks = natural[:, n_logits:-2].reshape(len(natural), n_gaussians, 5)
+    u, v, log_sd_u, log_sd_v, turn = (blocks[..., k] for k in range(5))
+    rho = np.tanh(turn)
+    rest = 2 * (1 - rho**2)
+    a_uu = np.exp(-2 * log_sd_u) / rest  # [[A, C], [C, B]] is half the inverse of the covariance
+    b_vv = np.exp(-2 * log_sd_v) / rest
+    c_uv = -rho * np.exp(-log_sd_u - log_sd_v) / rest
+    amplitude = shares * np.sqrt(a_uu * b_vv - c_uv**2) / math.pi  # mass_n = a_n pi / sqrt(AB - C^2) = share
+    columns = np.stack([amplitude, u, v, a_uu, b_vv, c_uv], axis=-1).reshape(len(natural), 6 * n_gaussians)
+    return np.concatenate([columns, natural[:, -2:]], axis=1)
+
+
+def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
+    """Invert `natural_to_theta`; the amplitudes may carry any common factor."""
+    blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
+    amplitude, u, v, a_uu, b_vv, c_uv = (blocks[..., k] for k in range(6))
+    det = a_uu * b_vv - c_uv**2
+    log_mass = np.log(amplitude) - 0.5 * np.log(det)
+    rho = -c_uv / np.sqrt(a_uu * b_vv)
+    rest = 2 * (1 - rho**2)
+    parts = np.stack([u, v, -0.5 * np.log(a_uu * rest), -0.5 * np.log(b_vv * rest), np.arctanh(rho)], axis=-1)
+    logits = log_mass[:, 1:] - log_mass[:, :1]
+    return np.concatenate([logits, parts.reshape(len(theta), 5 * n_gaussians), theta[:, -2:]], axis=1)
+
+
+def default_sensor(extent: Extent, n_gaussians: int) -> SensorCoordinates:
+    """Believe in a footprint of about a fourteenth of the longest scan, give or take a factor of two."""
+    length = extent.length_mm
+    one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
+    one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
+    center = np.array([0.0] * (n_gaussians - 1) + one_center * n_gaussians + [extent.low, extent.high])
+    sd = np.array([1.5] * (n_gaussians - 1) + one_sd * n_gaussians + [extent.span / 2] * 2)
+    return SensorCoordinates(n_gaussians, center, np.diag(sd))
+
+
+def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> SensorCoordinates:
+    """Take an earlier sensor's posterior, by its mean and covariance, as the prior.
+
+    Only the SSF's and the levels' columns are used; effects of the earlier model are not carried over.
+
+    Raises
+    ------
+    ParameterError
+        If the names are not those of a mixture of Gaussians with two free levels.
+    """
+    names = list(names)
+    n_gaussians = sum(name.startswith("a_") for name in names)
+    wanted = [f"{p}_{n}" for n in range(1, n_gaussians + 1) for p in ("a", "u", "v", "A", "B", "C")]
+    wanted += ["I_min", "I_max"]
+    if n_gaussians == 0 or any(name not in names for name in wanted):
+        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
+    at = [names.index(name) for name in wanted]
+    mean = np.asarray(mean, dtype=np.float64)[at]
+    cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
+    center = theta_to_natural(mean[None, :], n_gaussians)[0]
+    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
+    up = theta_to_natural(mean + np.diag(steps), n_gaussians)
+    down = theta_to_natural(mean - np.diag(steps), n_gaussians)
+    slope = ((up - down) / (2 * steps[:, None])).T
+    natural_cov = slope @ cov @ slope.T
+    floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
+    return SensorCoordinates(
+        n_gaussians, center, np.linalg.cholesky(natural_cov + np.diag(floor)), exchangeable=False
+    )
+
+
+def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
+    """Map normal scores, (n_samples, n_params), to the effect's own parameters."""
+    return effect.prior.from_unit_cube(ndtr(z))
+
+
+def effect_scores(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
+    """Invert `effect_values` within the bounds, by bisection on each independent parameter."""
+    low = np.full(values.shape, -FARTHEST + 0.5)
+    high = -low
+    rising = effect_values(effect, high) > effect_values(effect, low)
+    for _ in range(40):
+        middle = (low + high) / 2
+        below = (effect_values(effect, middle) < values) == rising
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return (low + high) / 2

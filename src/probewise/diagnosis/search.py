@@ -1,0 +1,418 @@
+"""Score, weigh, combine: which set of effects explains the recording?
+
+Every subset of effects on the mean, under every noise model and several SSF orders. Templates screen,
+a beam of the best is refitted jointly and non-linearly, Laplace weighs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.coordinates import SensorCoordinates, default_sensor
+from probewise.diagnosis.covariates import Covariate, covariates_of, slope_along_the_move
+from probewise.diagnosis.evidence import Blocks, Linearised, NoiseEvidence, block_log_bayes_factors, weigh
+from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.noise import NoiseModel, Whitener, white
+from probewise.diagnosis.templates import (
+    EffectTemplates,
+    UnknownTemplates,
+    effect_templates,
+    subsets,
+    unknown_templates,
+)
+from probewise.effects import Extent, NamedEffect
+from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
+
+__all__ = ["Candidate", "PriorOdds", "Search", "search"]
+
+Names = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PriorOdds:
+    """What is believed of hypotheses before any reading.
+
+    Half of all recordings are clean. Of the mean: `clean_mean`, `unknown`, and the rest shared out over
+    combinations, by size, then evenly. Of the noise: `white`, the rest evenly over noise models.
+    """
+
+    clean_mean: float = 0.60
+    unknown: float = 0.06
+    by_size: tuple[float, ...] = (0.27, 0.05, 0.02)
+    white: float = 0.84
+
+    def log_mean(self, names: Names, n_effects: int) -> float:
+        """Log prior of a combination of effects on the mean."""
+        if not names:
+            return math.log(self.clean_mean)
+        return math.log(self.by_size[len(names) - 1] / math.comb(n_effects, len(names)))
+
+    def log_noise(self, names: Names, n_models: int) -> float:
+        """Log prior of a noise model, one of `n_models` with the white one."""
+        return math.log((1 - self.white) / max(n_models - 1, 1)) if names else math.log(self.white)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A combination of effects on the mean at one SSF order, refitted and weighed under each noise model."""
+
+    found: Fit
+    evidence: Mapping[Names, NoiseEvidence]
+
+    @property
+    def names(self) -> Names:
+        """Its effects on the mean, sorted."""
+        return tuple(sorted(self.found.model.names))
+
+    @property
+    def n_gaussians(self) -> int:
+        """Its SSF order."""
+        return self.found.model.sensor.n_gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Everything weighed: refitted candidates by (order, names), and the screened rest."""
+
+    recording: Recording
+    effects: Mapping[str, NamedEffect[Any]]
+    noise_models: Mapping[Names, NoiseModel]
+    sensors: Mapping[int, SensorCoordinates]
+    candidates: Mapping[tuple[int, Names], Candidate]
+    screened: Mapping[tuple[Names, Names], float]  # (mean, noise) -> log Bayes factor against the null
+    unknown: Mapping[Names, float]  # noise -> log Bayes factor of `unknown` against the null
+    order: int  # at which the search was made
+    prior: PriorOdds
+    sd_floor: float
+    covariates: tuple[Covariate, ...]
+    unknown_bases: UnknownTemplates
+    slope: FloatArray
+    probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)  # (mean, noise); ("unknown",)
+    order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
+
+    def best(self, names: Names, noise: Names = ()) -> Candidate | None:
+        """Return the refitted candidate of these effects with the most evidence over orders."""
+        options = [c for (_, key), c in self.candidates.items() if key == names]
+        return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
+
+
+def search(
+    recording: Recording,
+    effects: Mapping[str, NamedEffect[Any]],
+    *,
+    sensor: SensorCoordinates | None,
+    sd_floor: float,
+    prior: PriorOdds | None = None,
+    max_order: int = 3,
+    beam: int = 3,
+    depth: int = 3,
+) -> Search:
+    """Weigh every combination of effects.
+
+    Parameters
+    ----------
+    recording
+        What was read.
+    effects
+        The vocabulary to search, by name.
+    sensor
+        The prior of the sensor; None: calibrated from the recording alone.
+    sd_floor
+        Least believable noise sd.
+    prior
+        Prior odds.
+    max_order
+        Largest SSF order tried without a sensor; one more where the largest wins.
+    beam, depth
+        How many combinations of each size are refitted, and the largest size.
+    """
+    return _Searcher(recording, effects, sensor, sd_floor, prior or PriorOdds(), max_order, beam, depth).run()
+
+
+@dataclass(eq=False)
+class _Searcher:
+    """The state of one search: a memory of fits, filled as the beam widens."""
+
+    recording: Recording
+    effects: Mapping[str, NamedEffect[Any]]
+    sensor: SensorCoordinates | None
+    sd_floor: float
+    prior: PriorOdds
+    max_order: int
+    beam: int
+    depth: int
+
+    def __post_init__(self) -> None:
+        self.usable: IntArray = np.flatnonzero(self.recording.usable)
+        self.n_points = len(self.usable)
+        self.extent = Extent.of(self.recording)
+        self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
+        on_noise = [n for n, e in self.effects.items() if e.stage is Stage.NOISE]
+        self.noise_models = {
+            names: NoiseModel.of([self.effects[n] for n in names], self.recording) for names in subsets(on_noise, 2)
+        }
+        self.candidates: dict[tuple[int, Names], Candidate] = {}
+        self.sensors: dict[int, SensorCoordinates] = {}
+
+    def run(self) -> Search:
+        order = self._null_fits()
+        null = self.candidates[order, ()]
+        level = null.found.predicted
+        slope = slope_along_the_move(null.found.model, null.found.z)[self.usable]
+        covariates = tuple(covariates_of(self.recording.plan, self.usable, level, slope))
+        bases = unknown_templates(covariates, level - level.min(), self.n_points)
+        screened, unknown = self._screen(null, bases)
+        self._grow_beam(order, screened)
+        search = Search(
+            self.recording,
+            self.effects,
+            self.noise_models,
+            self.sensors,
+            self.candidates,
+            screened,
+            unknown,
+            order,
+            self.prior,
+            self.sd_floor,
+            covariates,
+            bases,
+            slope,
+        )
+        self._other_orders(search)
+        return weighed(search)
+
+    def _fit(self, model: Model, starts: FloatArray, whitener: Whitener, max_steps: int = 30) -> Fit:
+        fits = [
+            fit(model, self.recording, start, whitener, sd_floor=self.sd_floor, max_steps=max_steps)
+            for start in starts
+        ]
+        return min(fits, key=lambda f: f.objective)
+
+    def _weighed(self, model: Model, starts: FloatArray, max_steps: int = 30) -> Candidate:
+        """Fit with white noise, weigh under every noise model, refit where another one is more probable."""
+        found = self._fit(model, starts, white(self.n_points), max_steps)
+        evidence = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
+        score = {
+            k: e.log_z + self.prior.log_noise(k, len(self.noise_models)) for k, e in evidence.items()
+        }
+        best = max(score, key=lambda k: score[k])
+        if best:
+            found = self._fit(model, found.z[None, :], evidence[best].whitener, max_steps)
+            evidence = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
+        candidate = Candidate(found, evidence)
+        self.candidates[model.sensor.n_gaussians, tuple(sorted(model.names))] = candidate
+        return candidate
+
+    def _null_fits(self) -> int:
+        """Fit the null at each SSF order; one more is always a rival. Return the order of most evidence."""
+        plan = self.recording.plan
+        if self.sensor is not None:
+            n = self.sensor.n_gaussians
+            self.sensors[n] = self.sensor
+            self._weighed(Model(self.sensor, (), plan), np.zeros((1, self.sensor.n_params)))
+            return n
+        first = default_sensor(self.extent, 1)
+        self.sensors[1] = first
+        last = self._weighed(Model(first, (), plan), starts_of_one_gaussian(first))
+        log_z = {1: _best_log_z(last)}
+        for n in range(2, self.max_order + 2):
+            if n > self.max_order and max(log_z, key=lambda k: log_z[k]) != self.max_order:
+                break
+            wanted = default_sensor(self.extent, n)
+            self.sensors[n] = wanted
+            starts = start_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
+            last = self._weighed(Model(wanted, (), plan), starts)
+            log_z[n] = _best_log_z(last)
+        return max(log_z, key=lambda k: log_z[k])
+
+    def _templates(self, found: Fit, names: Sequence[str]) -> dict[str, EffectTemplates]:
+        return {n: effect_templates(found, self.mean_effects[n], self.usable) for n in names}
+
+    def _screen(
+        self, null: Candidate, bases: UnknownTemplates
+    ) -> tuple[dict[tuple[Names, Names], float], dict[Names, float]]:
+        """Weigh all combinations about the null by templates, under every noise model's best node."""
+        templates = self._templates(null.found, list(self.mean_effects))
+        combinations = list(subsets(list(self.mean_effects), min(self.depth, 2)))[1:]
+        screened: dict[tuple[Names, Names], float] = {}
+        unknown: dict[Names, float] = {}
+        for noise, evidence in null.evidence.items():
+            problem = Linearised.of(null.found, evidence.whitener)
+            columns, owners = [], []
+            for i, names in enumerate(combinations):
+                for entry in _products([templates[n].columns for n in names]):
+                    columns.append(np.concatenate(entry, axis=1))
+                    owners.append(i)
+            scores = _log_bayes_factors(problem, columns)
+            for i, names in enumerate(combinations):
+                of = scores[np.array(owners) == i]
+                screened[names, noise] = float(logsumexp(of)) - math.log(len(of))
+            unknown[noise] = _mean_by_family(_log_bayes_factors(problem, bases.columns), bases.families)
+        return screened, unknown
+
+    def _grow_beam(self, order: int, screened: Mapping[tuple[Names, Names], float]) -> None:
+        """Refit the best combinations of each size, each grown from the best of the size before."""
+        null = self.candidates[order, ()]
+        reference = {k: e.log_z for k, e in null.evidence.items()}
+        grown: dict[Names, tuple[float, Candidate]] = {(): (0.0, null)}
+        for size in range(1, min(self.depth, len(self.mean_effects)) + 1):
+            wishes: dict[Names, tuple[float, Candidate, str]] = {}
+            for parent in grown.values():
+                self._wish(parent[1], reference, wishes)
+            if size == 2:
+                for (names, noise), value in screened.items():
+                    if len(names) == 2 and value > wishes.get(names, (-np.inf,))[0]:
+                        parent = grown.get(names[:1]) or grown.get(names[1:])
+                        if parent is not None:
+                            added = names[1] if parent[1].names == names[:1] else names[0]
+                            wishes[names] = (value + reference[noise] - max(reference.values()), parent[1], added)
+            ranked = sorted(wishes, key=lambda names: -wishes[names][0])
+            best_so_far = max(score for score, _ in grown.values())
+            grown = {}
+            for rank, names in enumerate(ranked[: self.beam]):
+                score, parent_candidate, added = wishes[names]
+                # A combination that screening puts this far behind cannot come to matter.
+                if size > 1 and score < best_so_far - 4 or (size == 1 and rank >= 2 and score < -4):
+                    continue
+                candidate = self._extend(parent_candidate, added)
+                gain = max(e.log_z - max(reference.values()) for e in candidate.evidence.values())
+                grown[names] = (gain, candidate)
+            if not grown:
+                break
+
+    def _wish(
+        self,
+        parent: Candidate,
+        reference: Mapping[Names, float],
+        wishes: dict[Names, tuple[float, Candidate, str]],
+    ) -> None:
+        """Screen every effect that a fit does not hold yet."""
+        missing = [n for n in self.mean_effects if n not in parent.names]
+        templates = self._templates(parent.found, missing)
+        for evidence in parent.evidence.values():
+            problem = Linearised.of(parent.found, evidence.whitener)
+            for name in missing:
+                scores = _log_bayes_factors(problem, templates[name].columns)
+                score = float(logsumexp(scores)) - math.log(len(scores))
+                score += evidence.log_z - max(reference.values())
+                names = tuple(sorted((*parent.names, name)))
+                if score > wishes.get(names, (-np.inf,))[0]:
+                    wishes[names] = (score, parent, name)
+
+    def _extend(self, parent: Candidate, name: str) -> Candidate:
+        """Refit with one more effect, from the two best entries of its bank."""
+        effect = self.mean_effects[name]
+        templates = effect_templates(parent.found, effect, self.usable)
+        best = max(parent.evidence.values(), key=lambda e: e.log_z)
+        problem = Linearised.of(parent.found, best.whitener)
+        scores = _log_bayes_factors(problem, templates.columns)
+        model = parent.found.model.with_effect(effect)
+        starts = []
+        for at in np.argsort(-scores)[:2]:
+            projected = problem.project(templates.columns[at])
+            amount = np.linalg.lstsq(projected, problem.residual, rcond=None)[0]
+            setting = _scaled_setting(effect, templates.settings[at], amount)
+            starts.append(np.concatenate([parent.found.z, model.scores_of(setting[None, :])[0]]))
+        return self._weighed(model, np.stack(starts))
+
+    def _other_orders(self, search: Search) -> None:
+        """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
+        if self.sensor is not None:
+            return
+        first = weighed(search)
+        ranked = sorted(first.probabilities, key=lambda key: -first.probabilities[key])
+        leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:3]
+        for names in leaders:
+            if sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-3:
+                continue
+            source = self.candidates.get((search.order, names))
+            if source is None:
+                continue
+            for n, sensor in self.sensors.items():
+                if n == search.order or (n > search.order + 1):
+                    continue
+                null = self.candidates[n, ()]
+                effects = source.found.model.effects
+                model = Model(sensor, effects, self.recording.plan)
+                own = source.found.z[source.found.model.sensor.n_params :]
+                self._weighed(model, np.concatenate([null.found.z, own])[None, :])
+
+
+def weighed(search: Search) -> Search:
+    """Turn evidences into probabilities of (mean, noise) hypotheses, summed over SSF orders."""
+    prior, n_effects = search.prior, sum(e.stage is not Stage.NOISE for e in search.effects.values())
+    orders = sorted(search.sensors)
+    log_order = -math.log(len(orders))
+    log_p: dict[tuple[Names, Names], float] = {}
+    null_at = search.candidates[search.order, ()]
+    for noise in search.noise_models:
+        log_noise = prior.log_noise(noise, len(search.noise_models))
+        clean = [search.candidates[n, ()].evidence[noise].log_z for n in orders if (n, ()) in search.candidates]
+        log_clean = float(logsumexp(clean)) + log_order
+        log_p[(), noise] = log_clean + prior.log_mean((), n_effects) + log_noise
+        log_p[("unknown",), noise] = (
+            null_at.evidence[noise].log_z + log_order + search.unknown[noise] + math.log(prior.unknown) + log_noise
+        )
+        refitted = {names for _, names in search.candidates if names}
+        for names in refitted:
+            values = [c.evidence[noise].log_z for (_, key), c in search.candidates.items() if key == names]
+            log_p[names, noise] = (
+                float(logsumexp(values)) + log_order + prior.log_mean(names, n_effects) + log_noise
+            )
+        for (names, model), value in search.screened.items():
+            if model == noise and names not in refitted:
+                log_p[names, noise] = (
+                    null_at.evidence[noise].log_z + log_order + value + prior.log_mean(names, n_effects) + log_noise
+                )
+    total = float(logsumexp(list(log_p.values())))
+    clean_by_order = {
+        n: float(logsumexp([search.candidates[n, ()].evidence[k].log_z for k in search.noise_models])) for n in orders
+    }
+    norm = float(logsumexp(list(clean_by_order.values())))
+    return replace(
+        search,
+        probabilities={key: math.exp(value - total) for key, value in log_p.items()},
+        order_probabilities={n: math.exp(v - norm) for n, v in clean_by_order.items()},
+    )
+
+
+def _best_log_z(candidate: Candidate) -> float:
+    return max(e.log_z for e in candidate.evidence.values())
+
+
+def _log_bayes_factors(problem: Linearised, columns: Sequence[FloatArray]) -> FloatArray:
+    blocks = Blocks.of(problem, columns, [""] * len(columns))
+    return block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_points)[:, 0]
+
+
+def _mean_by_family(values: FloatArray, families: Sequence[str]) -> float:
+    """Average Bayes factors within each covariate, then over covariates."""
+    names = np.array(families)
+    means = [float(logsumexp(values[names == f])) - math.log(np.sum(names == f)) for f in dict.fromkeys(families)]
+    return float(logsumexp(means)) - math.log(len(means))
+
+
+def _products(banks: Sequence[Sequence[FloatArray]]) -> list[tuple[FloatArray, ...]]:
+    out: list[tuple[FloatArray, ...]] = [()]
+    for bank in banks:
+        out = [(*head, entry) for head in out for entry in bank]
+    return out
+
+
+def _scaled_setting(effect: NamedEffect[Any], setting: FloatArray, amount: FloatArray) -> FloatArray:
+    """Turn a bank entry (n_columns, n_params) and its fitted amounts (n_columns,) into one start (n_params,).
+
+    Amplitudes scale with the amounts; what is no amplitude (a level, an exponent) starts as in the bank.
+    """
+    start = setting[0].copy()
+    for k in effect.amplitudes:
+        start[k] = amount @ setting[:, k]
+    return np.asarray(start)

@@ -1,0 +1,107 @@
+"""Priors of an effect's size: zero most likely, large never ruled out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import erfc
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+
+__all__ = ["SMALLEST_AND_LARGEST", "HeavyTailed", "LogHeavyTailed"]
+
+SMALLEST_AND_LARGEST = (0.05, 25.0)
+"""Scales of the mixture over the typical size: a narrower prior names worse as the effect grows."""
+
+_N_SCALES = 9
+
+
+@dataclass(frozen=True)
+class HeavyTailed:
+    """Mix normal distributions about zero whose sd run from 0.05 to 25 times a typical size.
+
+    The weights are equal, so the density falls about as 1/|x| over three decades and is
+    proper at both ends. With `positive` only the upper half is kept.
+    """
+
+    typical: float
+    positive: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.typical < math.inf:
+            raise ParameterError("HeavyTailed(typical)", self.typical, "greater than 0, finite")
+
+    @cached_property
+    def _sds(self) -> FloatArray:
+        low, high = SMALLEST_AND_LARGEST
+        return self.typical * np.geomspace(low, high, _N_SCALES)
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape."""
+        x = np.asarray(value, dtype=np.float64)[..., None] / self._sds
+        terms = np.exp(-0.5 * x * x) / (self._sds * math.sqrt(2 * math.pi))
+        with np.errstate(divide="ignore"):
+            density = np.log(terms.mean(axis=-1))
+        if not self.positive:
+            return np.asarray(density)
+        return np.where(np.asarray(value) >= 0, density + math.log(2.0), -np.inf)
+
+    def _upper(self, x: FloatArray) -> FloatArray:
+        """Probability above x of the two-sided mixture."""
+        return np.asarray(0.5 * erfc(x[..., None] / (self._sds * math.sqrt(2))).mean(axis=-1))
+
+    @cached_property
+    def _table(self) -> tuple[FloatArray, FloatArray]:
+        """Size against minus log of twice the upper tail: smooth, monotone, from 0."""
+        x = self.typical * np.concatenate([[0.0], np.geomspace(1e-5, 300.0, 600)])
+        return -np.log(2 * self._upper(x)), x
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape: a table, then Newton steps on the log of the tail."""
+        u = np.asarray(u, dtype=np.float64)
+        if self.positive:
+            tail, sign = (1.0 - u) / 2, np.ones_like(u)
+        else:
+            tail, sign = np.minimum(u, 1.0 - u), np.where(u < 0.5, -1.0, 1.0)
+        tail = np.clip(tail, 1e-15, 0.5)
+        goal = -np.log(2 * tail)
+        depth, size = self._table
+        x = np.interp(goal, depth, size)
+        two_sided = HeavyTailed(self.typical) if self.positive else self
+        for _ in range(3):
+            upper = np.maximum(self._upper(x), 1e-300)
+            slope = np.exp(two_sided.log_prob(x)) / upper
+            x = np.clip(x - (-np.log(2 * upper) - goal) / slope, 0.0, size[-1])
+        return np.asarray(sign * x)
+
+    def __str__(self) -> str:
+        kind = "positive heavy-tailed" if self.positive else "heavy-tailed about 0"
+        return f"{kind}, typical {self.typical:g}"
+
+
+@dataclass(frozen=True)
+class LogHeavyTailed:
+    """Believe that the logarithm is heavy-tailed about zero: a factor or exponent near one."""
+
+    typical_log: float
+
+    @cached_property
+    def _log(self) -> HeavyTailed:
+        return HeavyTailed(self.typical_log)
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape."""
+        return np.exp(self._log.from_unit(u))
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape; -inf at and below zero."""
+        value = np.asarray(value, dtype=np.float64)
+        safe = np.where(value > 0, value, 1.0)
+        return np.where(value > 0, self._log.log_prob(np.log(safe)) - np.log(safe), -np.inf)
+
+    def __str__(self) -> str:
+        return f"logarithm {self._log}"

@@ -1,0 +1,60 @@
+"""Recognise a value again in another process: a digest of its type and every bit of its numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from probewise.errors import ParameterError
+
+__all__ = ["value_digest"]
+
+
+def value_digest(value: object) -> str:
+    """Digest a value built of frozen dataclasses, arrays, numbers and texts (sha256, hex).
+
+    Two values have the same digest when their types, their fields and every bit of their
+    numbers are the same, in whatever process.
+
+    Raises
+    ------
+    ParameterError
+        If it holds anything else, for instance a function: such a thing cannot be recognised again.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, value)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, value: object) -> None:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"<{type(value).__qualname__}>".encode())
+        for item in dataclasses.fields(value):
+            digest.update(item.name.encode())
+            _feed(digest, getattr(value, item.name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"[{value.dtype.str}{value.shape}]".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, Enum):
+        digest.update(f"<{value}>".encode())
+    elif value is None or isinstance(value, (bool, int, float, str, np.generic)):
+        plain = value.item() if isinstance(value, np.generic) else value
+        digest.update(f"{type(plain).__name__}:{plain!r};".encode())
+    elif isinstance(value, Mapping):
+        digest.update(f"{{{len(value)}".encode())
+        for key in sorted(value, key=str):
+            _feed(digest, key)
+            _feed(digest, value[key])
+    elif isinstance(value, Sequence):
+        digest.update(f"({len(value)}".encode())
+        for item in value:
+            _feed(digest, item)
+    else:
+        raise ParameterError(
+            "fingerprint of", value, "frozen dataclasses of arrays, numbers and texts, so that a journal can name them"
+        )

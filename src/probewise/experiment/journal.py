@@ -1,0 +1,320 @@
+"""A run as it happens: one JSON line a measurement, on disk before the next one is asked for.
+
+Format "journal/1". The first line says what was run: field, shape, model, likelihood, the
+fingerprint of the sensor, seed, options. Every further line is a measurement: its index,
+pose, time, reading and covariates, then what was believed after it (mean and sd of each
+parameter, bits gained) and where to look next.
+
+A line reaches the disk in two parts. The reading is written and synchronised as soon as it
+is taken, since it cost the arm a journey; the belief follows when it has been inferred. So a
+process that is killed at any moment loses no reading: a last line without its belief is read
+back as a reading alone, and one that is torn earlier is dropped with a note.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm.instrument import Pose, Reading
+from probewise.errors import FileError
+from probewise.recordings.atomic import write_text_atomically
+from probewise.recordings.patterns import Pattern
+from probewise.recordings.plan import Instrumentation, Plan, Recording
+
+__all__ = [
+    "FORMAT",
+    "Belief",
+    "Entry",
+    "Journal",
+    "JournalWriter",
+    "read_journal",
+    "recording_of",
+    "require_same_settings",
+]
+
+FORMAT = "journal/1"
+PATTERN = "field"
+BELIEF = ', "belief": '
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What was believed after a measurement: mean and sd by parameter, bits gained, the next pose."""
+
+    mean: Mapping[str, float]
+    sd: Mapping[str, float]
+    bits: float
+    next_pose: Pose
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One measurement of a journal; `belief` is None where the run was killed before it was inferred."""
+
+    index: int
+    reading: Reading
+    belief: Belief | None
+
+
+@dataclass(frozen=True, eq=False)
+class Journal:
+    """Hold what a journal file says: its settings, its measurements, notes on what was dropped.
+
+    `n_bytes` is the length of the file up to the last whole line; what follows it is rewritten on resuming.
+    """
+
+    path: str
+    settings: Mapping[str, Any]
+    entries: tuple[Entry, ...]
+    notes: tuple[str, ...]
+    n_bytes: int
+
+    @property
+    def readings(self) -> tuple[Reading, ...]:
+        """The readings in the order of taking."""
+        return tuple(entry.reading for entry in self.entries)
+
+    def recording(
+        self, *, patterns: Mapping[str, Pattern] | None = None, instrumentation: Instrumentation | None = None
+    ) -> Recording:
+        """Turn the readings into a recording over the pattern "field"; see `recording_of`."""
+        return recording_of(self.readings, patterns=patterns, instrumentation=instrumentation, source=self.path)
+
+
+def recording_of(
+    readings: Sequence[Reading],
+    *,
+    patterns: Mapping[str, Pattern] | None = None,
+    instrumentation: Instrumentation | None = None,
+    source: str = "",
+) -> Recording:
+    """Collect readings into a recording: one scan, over the pattern "field".
+
+    Parameters
+    ----------
+    readings
+        In the order of taking.
+    patterns
+        What lay on the field, {"field": ...}, where it is known; a hypothesis takes its place otherwise.
+    instrumentation
+        What took the readings, with unit and range.
+    source
+        Where they come from, for messages.
+
+    Returns
+    -------
+    A recording of n_points = len(readings) rows; a covariate that some readings lack is NaN there.
+    """
+    n = len(readings)
+    names = sorted({name for reading in readings for name in reading.covariates})
+    zeros = np.zeros(n, dtype=np.int64)
+    plan = Plan(
+        x_mm=_column(readings, lambda r: r.pose.x_mm),
+        y_mm=_column(readings, lambda r: r.pose.y_mm),
+        orientation_rad=_column(readings, lambda r: r.pose.orientation_rad),
+        time_s=_column(readings, lambda r: r.time_s),
+        scan=zeros,
+        scan_names=(PATTERN,),
+        pattern=zeros,
+        pattern_names=(PATTERN,),
+        patterns={} if patterns is None else patterns,
+        covariates={name: _column(readings, lambda r, name=name: r.covariates.get(name, math.nan)) for name in names},
+        instrumentation=Instrumentation() if instrumentation is None else instrumentation,
+    )
+    return Recording(plan, _column(readings, lambda r: r.value), source)
+
+
+def _column(readings: Sequence[Reading], value: Any) -> FloatArray:
+    return np.array([value(reading) for reading in readings], dtype=np.float64)
+
+
+def read_journal(path: str | Path) -> Journal:
+    """Read a journal back, whatever the moment at which its writer was killed.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, is no journal of this version, or is damaged before its last line.
+    """
+    try:
+        raw = Path(path).read_bytes()
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error.strerror})", "a journal written by this package") from error
+    *lines, tail = raw.split(b"\n")
+    if not lines:
+        raise FileError(path, "no whole first line", f'a journal, whose first line says "format": "{FORMAT}"', row=1)
+    settings = _parse(path, lines[0], 1)
+    if settings.get("format") != FORMAT:
+        raise FileError(
+            path, f"format {settings.get('format')!r}", f'"{FORMAT}", the version this package writes', row=1
+        )
+    entries = [_entry(path, _parse(path, line, row), row) for row, line in enumerate(lines[1:], start=2)]
+    for row, entry in enumerate(entries, start=2):
+        if entry.index != row - 1:
+            raise FileError(path, f"index {entry.index}", f"{row - 1}: one line a measurement, in order", row=row)
+    notes: list[str] = []
+    if tail:
+        saved = _salvaged(path, tail, len(entries) + 1)
+        if saved is None:
+            notes.append(f"the last line of {path} was torn while it was written and is dropped")
+        else:
+            entries.append(saved)
+            notes.append(f"the last line of {path} was torn after its reading; the reading is kept")
+    return Journal(str(path), settings, tuple(entries), tuple(notes), len(raw) - len(tail))
+
+
+def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
+    try:
+        value = json.loads(line.decode())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise FileError(path, f"no JSON ({error})", "one JSON object a line", row=row) from error
+    if not isinstance(value, dict):
+        raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
+    return value
+
+
+def _salvaged(path: str | Path, tail: bytes, index: int) -> Entry | None:
+    """Recover the reading from a line without its end, or None where the reading itself is torn."""
+    head = tail.split(BELIEF.encode())[0]
+    # The covariates come last and are an object: only a whole first part closes with one more brace.
+    try:
+        entry = _entry(path, _parse(path, head + b"}", index + 1), index + 1)
+    except FileError:
+        return None
+    return entry if entry.index == index else None
+
+
+def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
+    column = "index"
+    try:
+        index = int(line["index"])
+        column = "pose"
+        pose = _pose(line["pose"])
+        column = "time_s"
+        time_s = float(line["time_s"])
+        column = "reading"
+        value = _or_nan(line["reading"])
+        column = "covariates"
+        covariates = {str(name): _or_nan(number) for name, number in line["covariates"].items()}
+        column = "belief"
+        belief = _belief(line["belief"]) if "belief" in line else None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileError(path, f"unusable ({error!r})", "as written", row=row, column=column) from error
+    return Entry(index, Reading(value, pose, time_s, covariates), belief)
+
+
+def _belief(line: Mapping[str, Any]) -> Belief:
+    return Belief(dict(line["mean"]), dict(line["sd"]), float(line["bits"]), _pose(line["next"]))
+
+
+def _or_null(value: float) -> float | None:
+    """JSON has no NaN; a missing reading or covariate is null."""
+    return value if math.isfinite(value) else None
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _pose(line: Mapping[str, Any]) -> Pose:
+    return Pose(float(line["x_mm"]), float(line["y_mm"]), float(line["orientation_rad"]))
+
+
+def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
+    """Raise FileError naming every setting in which a journal differs from the run that wants to resume it."""
+    here = json.loads(json.dumps(settings))
+    different = sorted(
+        name
+        for name in {*journal.settings, *here} - {"format", "version", "spawn_key"}
+        if journal.settings.get(name) != here.get(name)
+    )
+    if different:
+        had = "; ".join(f"{name} {journal.settings.get(name)!r} there, {here.get(name)!r} here" for name in different)
+        raise FileError(
+            journal.path,
+            f"a run with other settings: {had}",
+            "resume with the settings it was begun with, or begin a new journal under another name",
+            row=1,
+        )
+
+
+@dataclass(eq=False)
+class JournalWriter:
+    """Append to a journal; every call returns when the line is on the disk. Use as a context manager."""
+
+    path: Path
+    _file: Any = field(repr=False)
+
+    @classmethod
+    def begin(cls, path: str | Path, settings: Mapping[str, Any]) -> JournalWriter:
+        """Begin a new journal with these settings.
+
+        Raises
+        ------
+        FileError
+            If the file exists already, or cannot be written.
+        """
+        if Path(path).exists():
+            raise FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")
+        write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
+        return cls(Path(path), open(path, "ab"))
+
+    @classmethod
+    def resume(cls, journal: Journal) -> JournalWriter:
+        """Go on behind the last whole line of a journal; a torn line is cut off."""
+        try:
+            file = open(journal.path, "r+b")  # noqa: SIM115  (the writer closes it)
+        except OSError as error:
+            raise FileError(journal.path, f"cannot be written ({error.strerror})", "a file you may write to") from error
+        file.truncate(journal.n_bytes)
+        file.seek(0, os.SEEK_END)
+        return cls(Path(journal.path), file)
+
+    def reading(self, index: int, reading: Reading) -> None:
+        """Write a reading, the first part of its line."""
+        line = {
+            "index": index,
+            "pose": dataclasses.asdict(reading.pose),
+            "time_s": reading.time_s,
+            "reading": _or_null(reading.value),
+            "covariates": {name: _or_null(value) for name, value in reading.covariates.items()},
+        }
+        self._write(json.dumps(line, allow_nan=False)[:-1])
+
+    def belief(self, belief: Belief) -> None:
+        """Write what was believed after that reading, the rest of its line."""
+        line = {
+            "mean": dict(belief.mean),
+            "sd": dict(belief.sd),
+            "bits": belief.bits,
+            "next": dataclasses.asdict(belief.next_pose),
+        }
+        self._write(BELIEF + json.dumps(line, allow_nan=False) + "}\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write(self, text: str) -> None:
+        self._file.write(text.encode())
+        self._file.flush()
+        os.fsync(self._file.fileno())

@@ -1,0 +1,16 @@
+"""Readings less predictions, with their shapes checked once for every likelihood."""
+
+from __future__ import annotations
+
+from probewise._arrays import FloatArray
+from probewise.errors import ShapeError
+
+
+def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Subtract predictions from readings, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+    if readings.ndim != 1 or predicted.ndim != 2 or predicted.shape[1] != readings.size:
+        raise ShapeError(
+            f"readings have shape {readings.shape}, predictions {predicted.shape}; "
+            "allowed: (n_points,) and (n_samples, n_points)"
+        )
+    return readings - predicted

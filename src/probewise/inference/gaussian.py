@@ -1,0 +1,95 @@
+"""Score readings with Gaussian noise whose sd is known, or one of the parameters."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from probewise._arrays import FloatArray, frozen
+from probewise.errors import ParameterError, ShapeError
+from probewise.inference._residuals import residuals
+from probewise.priors import Joint, Marginal, Prior, Product
+from probewise.recordings.plan import Recording
+from probewise.sensor.stages import SensorModel
+
+__all__ = ["GaussianInferred", "GaussianKnown"]
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianKnown:
+    """Score readings with independent Gaussian noise of known sd.
+
+    Parameters
+    ----------
+    sd
+        In units of the reading: a number, or one for each reading, (n_points,).
+    """
+
+    sd: ArrayLike
+
+    def __post_init__(self) -> None:
+        sd = frozen(self.sd)
+        if sd.ndim > 1:
+            raise ShapeError(f"sd has shape {sd.shape}; allowed: a number or (n_points,)")
+        if not ((sd > 0) & np.isfinite(sd)).all():
+            raise ParameterError("sd", sd.tolist(), "greater than 0, finite")
+        object.__setattr__(self, "sd", sd)
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,), all constants kept."""
+        sd = np.asarray(self.sd)
+        if sd.ndim == 1 and sd.size != readings.size:
+            raise ShapeError(f"{readings.size} readings against {sd.size} values of sd; allowed: one each, or a number")
+        z = residuals(readings, predicted) / sd
+        constant = 0.5 * readings.size * _LOG_2PI + float(np.broadcast_to(np.log(sd), readings.shape).sum())
+        return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - constant)
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianInferred:
+    """Weigh hypotheses whose last column is the noise's sd: a `Problem`, like `SensorProblem`.
+
+    Parameters
+    ----------
+    sensor_prior, model, recording
+        As in `SensorProblem`.
+    sd_prior
+        Prior of the sd, in units of the reading, for instance `LogUniform(floor, ceiling)`.
+    sd_name
+        Name of its column.
+    """
+
+    sensor_prior: Prior
+    model: SensorModel
+    recording: Recording
+    sd_prior: Marginal
+    sd_name: str = "noise.sd"
+
+    def __post_init__(self) -> None:
+        if self.sensor_prior.names != self.model.names:
+            raise ParameterError("sensor_prior.names", self.sensor_prior.names, f"the model's names {self.model.names}")
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The sensor's prior with the sd's behind it."""
+        return Joint((self.sensor_prior, Product({self.sd_name: self.sd_prior})))
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Weigh the usable readings, (n_samples, n_params) -> (n_samples,)."""
+        usable = self.recording.usable
+        predicted = self.model.predict(theta[:, :-1], self.recording.plan)[:, usable]
+        readings = self.recording.readings[usable]
+        return log_prob_gaussian(readings, predicted, theta[:, -1])
+
+
+def log_prob_gaussian(readings: FloatArray, predicted: FloatArray, sd: FloatArray) -> FloatArray:
+    """Score hypotheses that each have their own sd, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
+    residual = residuals(readings, predicted)
+    square = np.einsum("ij,ij->i", residual, residual)
+    return np.asarray(-0.5 * square / sd**2 - readings.size * (np.log(sd) + 0.5 * _LOG_2PI))

@@ -1,0 +1,50 @@
+"""Bound the sd of a recording's noise, so that its prior is proper."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise.inference.student_t import StudentT
+from probewise.recordings.plan import Recording
+
+__all__ = ["reading_span", "sd_ceiling", "sd_floor", "student_t"]
+
+
+def reading_span(recording: Recording) -> float:
+    """Range of the usable readings; where they are all equal, the declared range, or else 1."""
+    readings = recording.readings[recording.usable]
+    span = float(np.ptp(readings)) if readings.size else 0.0
+    if span > 0:
+        return span
+    inst = recording.plan.instrumentation
+    if inst.min is not None and inst.max is not None and inst.max > inst.min:
+        return inst.max - inst.min
+    return 1.0
+
+
+def sd_floor(recording: Recording) -> float:
+    """Least sd a reading can have: that of rounding to the declared step, or a thousandth of the span."""
+    step = recording.plan.instrumentation.step or 0.0
+    return max(step / math.sqrt(12.0), 1e-3 * reading_span(recording))
+
+
+def sd_ceiling(recording: Recording) -> float:
+    """Greatest sd worth believing in: the span of the readings, and ten times the floor at least."""
+    return max(reading_span(recording), 10.0 * sd_floor(recording))
+
+
+def student_t(recording: Recording, groups: IntArray | None = None) -> StudentT:
+    """Build the likelihood of a recording's usable readings.
+
+    Parameters
+    ----------
+    recording
+        What was read.
+    groups
+        Data set of each row of the plan, (n_points,); default one for every scan.
+    """
+    rows = recording.plan.scan if groups is None else np.asarray(groups)
+    return StudentT(rows[recording.usable], sd_floor(recording), sd_ceiling(recording))

@@ -1,0 +1,220 @@
+"""Score residuals whose noise level is unknown: the paper's Student-t likelihood, made proper.
+
+The paper integrates a Gaussian over its unknown sigma and keeps [sum of squares]^(-(N-1)/2). A
+prior of sigma without bounds gives an infinite spike where the fit passes through the few readings
+of a small data set, and says nothing after one reading; so here sigma's prior is 1/sigma between a
+floor and a ceiling, and every constant stays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import gammainc, gammaincc, gammaln, logsumexp
+
+from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
+from probewise.errors import ParameterError, ShapeError
+from probewise.inference._residuals import residuals
+
+__all__ = ["PooledSigma", "StudentT", "log_sigma_integral"]
+
+_LOG_2PI = math.log(2 * math.pi)
+_TINY = 1e-250
+_N_TERMS = 100
+
+
+def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float) -> FloatArray:
+    """Log of the integral of sigma^(-n-1) exp(-square / (2 sigma^2)) over sigma from `low` to `high`.
+
+    With t = square / (2 sigma^2) it is (2 / square)^(n/2) / 2 times a difference of two incomplete
+    gamma functions of order n/2. It is taken in log space, from whichever tail both ends lie in,
+    so that it holds from square = 0 to squares whose integral underflows any float.
+
+    Parameters
+    ----------
+    square
+        Sum of squared residuals, 0 or more.
+    n
+        Number of residuals, greater than 0; broadcasts with `square`.
+    low, high
+        Bounds of sigma, 0 < low < high.
+
+    Returns
+    -------
+    Of the arguments' broadcast shape.
+    """
+    s, a = np.broadcast_arrays(np.asarray(square, dtype=np.float64), np.asarray(n, dtype=np.float64) / 2.0)
+    with np.errstate(over="ignore"):
+        t_low, t_high = s / (2.0 * low**2), s / (2.0 * high**2)
+    out = np.empty(s.shape)
+    fits = t_low < a  # residuals below the floor: both ends in the lower tail
+    huge = t_high > a  # residuals beyond the ceiling: both ends in the upper tail
+    if fits.any():
+        b = a[fits]
+        out[fits] = _log_difference(
+            _log_lower_scaled(b, t_low[fits]) - 2.0 * b * math.log(low),
+            _log_lower_scaled(b, t_high[fits]) - 2.0 * b * math.log(high),
+        )
+    if huge.any():
+        b = a[huge]
+        difference = _log_difference(_log_upper(b, t_high[huge]), _log_upper(b, t_low[huge]))
+        out[huge] = difference + b * (math.log(2.0) - np.log(s[huge]))
+    usual = ~(fits | huge)
+    if usual.any():
+        b = a[usual]
+        share = gammainc(b, t_low[usual]) - gammainc(b, t_high[usual])
+        out[usual] = gammaln(b) + np.log(share) + b * (math.log(2.0) - np.log(s[usual]))
+    return out - math.log(2.0)
+
+
+def _log_difference(large: FloatArray, small: FloatArray) -> FloatArray:
+    return np.asarray(large + np.log(-np.expm1(np.minimum(small - large, -1e-300))))
+
+
+def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
+    """Log of gamma(a, t) / t^a, finite at t = 0; for t below a or so."""
+    share = gammainc(a, t)
+    safe = np.where(share > _TINY, t, 1.0)
+    out = np.log(np.maximum(share, _TINY)) + gammaln(a) - a * np.log(safe)
+    rare = share <= _TINY
+    if rare.any():
+        b, x = a[rare], t[rare]
+        term = total = np.ones_like(x)
+        for k in range(1, _N_TERMS):
+            term = term * x / (b + k)
+            total = total + term
+        out[rare] = np.log(total) - x - np.log(b)
+    return np.asarray(out)
+
+
+def _log_upper(a: FloatArray, t: FloatArray) -> FloatArray:
+    """Log of Gamma(a, t), for t above a or so; t may be inf, where it is -inf."""
+    share = gammaincc(a, t)
+    out = np.log(np.maximum(share, _TINY)) + gammaln(a)
+    rare = share <= _TINY
+    if rare.any():
+        b, x = a[rare], t[rare]
+        # Legendre's continued fraction, from its tail.
+        fraction = np.zeros_like(x)
+        for k in range(_N_TERMS, 0, -1):
+            fraction = k * (k - b) / (x + 2 * k + 1 - b - fraction)
+        with np.errstate(invalid="ignore"):
+            value = b * np.log(x) - x - np.log(x + 1 - b - fraction)
+        out[rare] = np.where(np.isposinf(x), -np.inf, value)
+    return np.asarray(out)
+
+
+@dataclass(frozen=True, eq=False)
+class StudentT:
+    """Integrate a Gaussian over the unknown sd of each data set (paper, eq. studentT and the product below it).
+
+    For a data set of N readings with sum of squares S, and L = ln(sd_ceiling / sd_floor):
+    (2 pi)^(-N/2) / L times the integral of sigma^(-N-1) exp(-S / 2 sigma^2) from floor to ceiling.
+
+    Parameters
+    ----------
+    groups
+        Number of the data set each reading belongs to, (n_points,); any integers.
+    sd_floor, sd_ceiling
+        Bounds of every data set's sigma, in units of the reading.
+    """
+
+    groups: IntArray
+    sd_floor: float
+    sd_ceiling: float
+
+    def __post_init__(self) -> None:
+        groups = frozen_int(self.groups)
+        if groups.ndim != 1:
+            raise ShapeError(f"groups have shape {groups.shape}; allowed: (n_points,)")
+        _require_bounds(self.sd_floor, self.sd_ceiling)
+        object.__setattr__(self, "groups", groups)
+
+    @cached_property
+    def _membership(self) -> FloatArray:
+        """One where reading i belongs to data set j, (n_points, n_groups)."""
+        return (self.groups[:, None] == np.unique(self.groups)[None, :]).astype(np.float64)
+
+    @cached_property
+    def _sizes(self) -> FloatArray:
+        return np.asarray(self._membership.sum(axis=0))
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,), all constants kept."""
+        residual = residuals(readings, predicted)
+        if residual.shape[1] != self.groups.size:
+            raise ShapeError(f"{residual.shape[1]} readings against {self.groups.size} groups; allowed: one each")
+        square = (residual * residual) @ self._membership
+        integral = log_sigma_integral(square, self._sizes, self.sd_floor, self.sd_ceiling)
+        constant = 0.5 * self.groups.size * _LOG_2PI + self._sizes.size * math.log(
+            math.log(self.sd_ceiling / self.sd_floor)
+        )
+        return np.asarray(integral.sum(axis=1) - constant)
+
+    def pooled(self, readings: FloatArray, predicted: FloatArray) -> PooledSigma:
+        """Learn one sigma from the residuals of all data sets, for predicting a new one."""
+        residual = residuals(readings, predicted)
+        return PooledSigma((residual**2).sum(axis=1), residual.shape[1], self.sd_floor, self.sd_ceiling)
+
+
+@dataclass(frozen=True, eq=False)
+class PooledSigma:
+    """Believe in one sigma for a new scan, learnt by each hypothesis from all residuals so far.
+
+    Parameters
+    ----------
+    square
+        Sum of squared residuals of each hypothesis, (n_samples,).
+    n
+        Number of residuals.
+    sd_floor, sd_ceiling
+        Bounds of sigma's prior, 1/sigma between them.
+    """
+
+    square: FloatArray
+    n: int
+    sd_floor: float
+    sd_ceiling: float
+
+    def __post_init__(self) -> None:
+        _require_bounds(self.sd_floor, self.sd_ceiling)
+        object.__setattr__(self, "square", frozen(self.square))
+
+    def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Log density of each new reading by itself, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+        square = self.square[:, None]
+        more = log_sigma_integral(
+            square + residuals(readings, predicted) ** 2, self.n + 1, self.sd_floor, self.sd_ceiling
+        )
+        return np.asarray(more - self._log_norm()[:, None] - 0.5 * _LOG_2PI)
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Log density of a new scan as a whole (one sigma for all of it), -> (n_samples,)."""
+        residual = residuals(readings, predicted)
+        n_new = residual.shape[1]
+        square = self.square + (residual**2).sum(axis=1)
+        more = log_sigma_integral(square, self.n + n_new, self.sd_floor, self.sd_ceiling)
+        return np.asarray(more - self._log_norm() - 0.5 * n_new * _LOG_2PI)
+
+    def sd(self) -> FloatArray:
+        """Root of the posterior mean of sigma^2: the predictive sd of a reading's noise, (n_samples,)."""
+        if self.n > 2:
+            fewer = log_sigma_integral(self.square, self.n - 2, self.sd_floor, self.sd_ceiling)
+            return np.asarray(np.exp(0.5 * (fewer - self._log_norm())))
+        grid = np.linspace(math.log(self.sd_floor), math.log(self.sd_ceiling), 4001)
+        height = -self.n * grid - self.square[:, None] / 2.0 * np.exp(-2.0 * grid)
+        return np.asarray(np.exp(0.5 * (logsumexp(height + 2.0 * grid, axis=1) - logsumexp(height, axis=1))))
+
+    def _log_norm(self) -> FloatArray:
+        if self.n == 0:
+            return np.full(self.square.shape, math.log(math.log(self.sd_ceiling / self.sd_floor)))
+        return log_sigma_integral(self.square, self.n, self.sd_floor, self.sd_ceiling)
+
+
+def _require_bounds(sd_floor: float, sd_ceiling: float) -> None:
+    if not 0 < sd_floor < sd_ceiling < math.inf:
+        raise ParameterError("(sd_floor, sd_ceiling)", (sd_floor, sd_ceiling), "0 < floor < ceiling, finite")

@@ -1,0 +1,40 @@
+"""Choose the next place: at random among the best that the arm can reach."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, require_finite
+from probewise.errors import ReachError, ShapeError
+
+__all__ = ["TIE", "best_places", "choose"]
+
+TIE = 1e-9
+"""Utilities closer than this count as equal: the same counts added in another order differ by rounding."""
+
+
+def best_places(utility: FloatArray, reachable: BoolArray) -> BoolArray:
+    """Mark the reachable places within `TIE` of the highest reachable utility, all arrays (n_places,).
+
+    Raises
+    ------
+    ReachError
+        If no place is reachable.
+    """
+    if utility.shape != reachable.shape or utility.ndim != 1:
+        raise ShapeError(f"utility {utility.shape} and reachable {reachable.shape}; allowed: both (n_places,)")
+    if not reachable.any():
+        raise ReachError(
+            "reachable places",
+            0,
+            f"at least one of the {reachable.size} places of the field; "
+            "is the field where the arm stands, and is its reach in millimetres?",
+        )
+    require_finite("utility", utility[reachable])
+    best = reachable & (utility >= utility[reachable].max() - TIE)
+    return np.asarray(best)
+
+
+def choose(utility: FloatArray, reachable: BoolArray, *, rng: np.random.Generator) -> int:
+    """Draw the index of the next place at random among the best (paper, the machine learning system)."""
+    return int(rng.choice(np.flatnonzero(best_places(utility, reachable))))

@@ -1,0 +1,130 @@
+"""Break replications among posterior samples by Metropolis-Hastings steps (paper, machine learning system)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError, ShapeError
+from probewise.nested.evaluate import Evaluator, Samplable
+
+__all__ = ["DiversifyTally", "diversify"]
+
+_N_PRIOR_DRAWS = 200
+_BLOCK = 100
+
+
+@dataclass(frozen=True)
+class DiversifyTally:
+    """Count what the steps did.
+
+    `acceptance`: share of accepted proposals. `n_distinct`: different samples at the end.
+    `mixing`: mean squared displacement over its value for independent samples, averaged over the
+    parameters; near 1 when the samples have forgotten where they began.
+    """
+
+    n_steps: int
+    n_calls: int
+    acceptance: float
+    n_distinct: int
+    mixing: float
+
+
+def diversify(
+    theta: FloatArray, problem: Samplable, *, rng: np.random.Generator, n_steps: int = 1000
+) -> tuple[FloatArray, DiversifyTally]:
+    """Walk every sample through the posterior, all of them together.
+
+    Every step proposes one of three symmetric moves to each sample: a Gaussian with the cloud's
+    covariance, a difference of two samples of the cloud (which leads between modes), or a change
+    of one parameter on the scale of its prior; the step's length is drawn anew over orders of
+    magnitude. The proposals come from the cloud as it was given, so that they do not depend on
+    where a chain has gone and the posterior is left invariant.
+
+    Parameters
+    ----------
+    theta
+        Posterior samples, replications allowed, (n_samples, n_params).
+    problem
+        Prior and likelihood.
+    rng
+        Source of randomness.
+    n_steps
+        Metropolis-Hastings steps of each sample; the paper takes about 1000.
+
+    Returns
+    -------
+    theta, tally
+        The samples after their steps, (n_samples, n_params), and what the steps did.
+
+    Raises
+    ------
+    ParameterError
+        If a sample is impossible to begin with.
+    """
+    start = np.array(theta, dtype=np.float64)
+    evaluate = Evaluator(problem)
+    if start.ndim != 2 or start.shape[1] != len(evaluate.names) or len(start) == 0:
+        raise ShapeError(f"theta has shape {start.shape}; allowed: (n_samples, {len(evaluate.names)})")
+    if n_steps < 0:
+        raise ParameterError("n_steps", n_steps, "0 or more")
+    n_samples, n_params = start.shape
+    if n_params == 0 or n_steps == 0:
+        return start, DiversifyTally(0, 0, 0.0, len(np.unique(start, axis=0)), 0.0)
+    prior = problem.prior
+    height = prior.log_prob(start) + evaluate.log_likelihood(start)
+    if not np.isfinite(height).all():
+        at = int(np.flatnonzero(~np.isfinite(height))[0])
+        raise ParameterError(f"theta[{at}]", start[at].tolist(), "a sample with posterior density above zero")
+    prior_sd = prior.from_unit_cube(rng.random((_N_PRIOR_DRAWS, n_params))).std(axis=0)
+    now = start.copy()
+    n_accepted = 0
+    for displacement, threshold in _steps(start, prior_sd, n_steps, rng):
+        proposed = now + displacement
+        proposed_height = prior.log_prob(proposed)
+        # The likelihood is not asked outside the prior, where a model may have no answer.
+        inside = np.flatnonzero(np.isfinite(proposed_height))
+        if inside.size == 0:
+            continue
+        proposed_height[inside] += evaluate.log_likelihood(proposed[inside])
+        accept = threshold < proposed_height - height
+        now[accept], height[accept] = proposed[accept], proposed_height[accept]
+        n_accepted += int(accept.sum())
+    spread = now.var(axis=0) + start.var(axis=0) + (now.mean(axis=0) - start.mean(axis=0)) ** 2
+    moved = ((now - start) ** 2).mean(axis=0)
+    mixing = float(np.mean(np.divide(moved, spread, out=np.zeros(n_params), where=spread > 0)))
+    n_distinct = len(np.unique(now, axis=0))
+    return now, DiversifyTally(n_steps, evaluate.n_calls, n_accepted / (n_steps * n_samples), n_distinct, mixing)
+
+
+def _steps(
+    cloud: FloatArray, prior_sd: FloatArray, n_steps: int, rng: np.random.Generator
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield for every step the displacement of each sample, (n_samples, n_params), and log of a uniform number."""
+    n_samples, n_params = cloud.shape
+    covariance = np.atleast_2d(np.cov(cloud, rowvar=False)) if n_samples > 1 else np.zeros((n_params, n_params))
+    values, vectors = np.linalg.eigh(covariance / np.outer(prior_sd, prior_sd))
+    root = prior_sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    best = 2.38 / np.sqrt(n_params)  # Roberts, Gelman & Gilks 1997, for a Gaussian of known covariance
+    for first in range(0, n_steps, _BLOCK):
+        n = min(_BLOCK, n_steps - first)
+        scale = 10.0 ** (-2.0 * rng.random((n, n_samples)) ** 2)
+        move = rng.standard_normal((n, n_samples, n_params)) @ root.T
+        move *= (best * scale)[..., None]
+        kind = rng.random((n, n_samples))
+        follow = np.nonzero((kind > 0.4) & (kind <= 0.75))
+        if n_samples > 1:
+            a = rng.integers(n_samples, size=follow[0].size)
+            b = (a + rng.integers(1, n_samples, size=follow[0].size)) % n_samples
+            # A full difference carries a sample from one mode to the other.
+            length = np.where(rng.random(follow[0].size) < 0.3, 1.0, best / np.sqrt(2.0) * scale[follow])
+            move[follow] = length[:, None] * (cloud[a] - cloud[b])
+        single = np.nonzero(kind > 0.75)
+        column = rng.integers(n_params, size=single[0].size)
+        move[single] = 0.0
+        change = rng.standard_normal(single[0].size) * 10.0 ** (-4.0 * rng.random(single[0].size))
+        move[(*single, column)] = prior_sd[column] * change
+        yield from zip(move, np.log(rng.random((n, n_samples))), strict=True)

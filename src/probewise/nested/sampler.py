@@ -1,0 +1,330 @@
+"""Run nested sampling: remove the worst live points, count the volume lost, draw new ones above them (Skilling 2006)."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise._version import __version__
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
+from probewise.nested.evidence import insertion_p_value, integrate, log_volumes
+from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
+from probewise.nested.result import NestedResult
+from probewise.nested.stop import RemainingEvidence, State, StopRule
+
+__all__ = ["Dead", "Live", "run", "step"]
+
+# Draw from the whole prior while a point costs fewer evaluations than a chain would.
+_PRIOR_VOLUME = 0.05
+# Below this probability of a run's insertion ranks the result is called doubtful: one false alarm in 10 000 runs.
+_DOUBTFUL_P_VALUE = 1e-4
+_FEW_EFFECTIVE = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Live:
+    """Hold the live points, the likelihood level each was born above (n_live,), and the log volume they fill."""
+
+    points: Points
+    log_birth: FloatArray
+    log_volume: float
+
+
+@dataclass(frozen=True, eq=False)
+class Dead:
+    """Hold the points that one round removed, worst first, and how their successors came in.
+
+    `n_at_death`: points alive when each died, itself included. `rank`, `n_ranked`: how many of
+    the `n_ranked` points alive at a successor's insertion were worse than it.
+    """
+
+    points: Points
+    log_birth: FloatArray
+    n_at_death: IntArray
+    rank: IntArray
+    n_ranked: IntArray
+
+
+def step(
+    live: Live, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
+) -> tuple[Live, Dead, Tally]:
+    """Replace the `n_replaced` worst points by new ones above the best of them.
+
+    The points die one after another, so that the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ...,
+    counted exactly; their successors are drawn together.
+    """
+    n_live = len(live.points)
+    order = live.points.order()
+    doomed, spared = order[:n_replaced], order[n_replaced:]
+    last = doomed[-1]
+    bound = Bound(float(live.points.log_likelihood[last]), float(live.points.label[last]))
+    survivors = live.points.take(spared)
+    start = survivors.take(rng.permutation(len(spared))[:n_replaced])
+    new, tally = move.draw(start, bound, survivors.u, evaluate, rng)
+    points = Points.join(survivors, new)
+    place = np.empty(n_live, dtype=np.int64)
+    place[points.order()] = np.arange(n_live)
+    worse = place[None, :] < place[len(spared) :, None]
+    n_ranked = len(spared) + np.arange(n_replaced)
+    rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
+    n_at_death = n_live - np.arange(n_replaced)
+    dead = Dead(live.points.take(doomed), live.log_birth[doomed], n_at_death, rank, n_ranked)
+    births = np.concatenate([live.log_birth[spared], np.full(n_replaced, bound.log_likelihood)])
+    log_volume = float(log_volumes(n_at_death, live.log_volume)[-1])
+    return Live(points, births, log_volume), dead, tally
+
+
+def run(
+    problem: Samplable,
+    *,
+    rng: np.random.Generator,
+    n_live: int = 300,
+    stop: StopRule | None = None,
+    move: Move | None = None,
+    n_replaced: int | None = None,
+    progress: Callable[[State], None] | None = None,
+    max_calls: int | None = None,
+) -> NestedResult:
+    """Compute the evidence of a problem and draw from its posterior (paper, section on SSF estimation).
+
+    Parameters
+    ----------
+    problem
+        Prior and likelihood; the likelihood is asked in batches.
+    rng
+        Source of randomness; its state is stored in the result.
+    n_live
+        Live points: the error of log Z falls as its root, the cost rises in proportion.
+    stop
+        When to stop; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
+    move
+        How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior
+        is alive, points are drawn from the prior itself.
+    n_replaced
+        Points replaced in one round; default a quarter of `n_live`.
+    progress
+        Called with a `State` after every round.
+    max_calls
+        Likelihood evaluations after which the run ends early with what it has.
+
+    Returns
+    -------
+    NestedResult
+        With a warning, stored in it too, where it should not be trusted blindly.
+
+    Raises
+    ------
+    ParameterError
+        If an option is out of range.
+    NotConvergedError
+        If the likelihood fails (`partial` holds the result so far, if there is one), or every
+        hypothesis drawn from the prior is impossible.
+    """
+    evaluate = Evaluator(problem)
+    n_params = len(evaluate.names)
+    least = max(2 * n_params, 10)
+    if n_live < least:
+        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
+    if n_replaced is None:
+        n_replaced = max(1, n_live // 4)
+    elif not 1 <= n_replaced <= n_live // 2:
+        raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
+    if max_calls is not None and max_calls < n_live:
+        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
+    rule = RemainingEvidence() if stop is None else stop
+    seed_state = json.dumps(_plain(rng.bit_generator.state))
+    if n_params == 0:
+        return _without_parameters(evaluate, n_live, seed_state)
+    moving: Move = SliceMove() if move is None else move
+    live, log_start_error, notes = _first_points(evaluate, moving, n_live, max_calls, rng)
+    log_start = live.log_volume
+    dead: list[Dead] = []
+    log_z, n_stuck, last_cost = -math.inf, 0, 0
+
+    def finish(reason: str, doubts: tuple[str, ...]) -> NestedResult:
+        return _result(
+            evaluate, live, dead, (log_start, log_start_error), n_live, reason, doubts, seed_state, rng.spawn(1)[0]
+        )
+
+    try:
+        while True:
+            if max_calls is not None and evaluate.n_calls + last_cost > max_calls:
+                reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
+                notes = (*notes, f"{reason}; log Z lacks what a full run would have found")
+                break
+            volume = math.exp(live.log_volume - log_start)
+            whole = math.exp(live.log_volume)
+            if whole > _PRIOR_VOLUME:
+                live, gone, tally = step(live, PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng)
+            else:
+                live, gone, tally = step(live, moving, evaluate, n_replaced=n_replaced, rng=rng)
+                moving = moving.adapted(tally)
+                n_stuck += tally.n_stuck
+            last_cost = tally.n_evaluated
+            edges = math.log(volume) + log_start + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
+            log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + gone.points.log_likelihood
+            before = float(logsumexp(np.concatenate([[log_z], log_mass[:-1]])))
+            log_z = float(np.logaddexp(before, log_mass[-1]))
+            dead.append(gone)
+            best = float(live.points.log_likelihood.max())
+            state = State(
+                n_dead=len(dead) * n_replaced,
+                n_calls=evaluate.n_calls,
+                log_z=log_z,
+                log_z_remaining=best + live.log_volume,
+                last_change=log_z - before,
+                log_volume=live.log_volume,
+                best_log_likelihood=best,
+            )
+            if progress is not None:
+                progress(state)
+            verdict = rule(state)
+            if verdict is not None:
+                reason = verdict
+                break
+    except NotConvergedError as error:
+        if dead:
+            error.partial = finish("the likelihood failed", (*notes, f"the likelihood failed: {error}"))
+        raise
+    if n_stuck:
+        notes = (*notes, f"{n_stuck} of {len(dead) * n_replaced} chains could not leave their start")
+    result = finish(reason, notes)
+    for note in result.warnings:
+        warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
+    return result
+
+
+def _first_points(
+    evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator
+) -> tuple[Live, float, tuple[str, ...]]:
+    """Draw live points from the possible part of the prior; also the error of its log volume, and notes.
+
+    Impossible hypotheses (zero likelihood) are counted and thrown away: the share m / n of
+    possible ones is where the volume starts. Where they are rare, chains fill up what is missing.
+    """
+    most = max(100 * n_live, 20_000) if max_calls is None else min(max(100 * n_live, 20_000), max_calls)
+    n_params = len(evaluate.names)
+    parts: list[Points] = []
+    found = drawn = 0
+    while found < n_live and drawn < most:
+        share = max(found, 0.5) / drawn if drawn else 1.0
+        batch = min(int(1.1 * (n_live - found) / share) + 1 if drawn else n_live, 4 * n_live, most - drawn)
+        tried = evaluate(rng.random((batch, n_params)), rng)
+        possible = np.flatnonzero(np.isfinite(tried.log_likelihood))
+        if found + possible.size > n_live:
+            possible = possible[: n_live - found]
+            drawn += int(possible[-1]) + 1
+        else:
+            drawn += batch
+        parts.append(tried.take(possible))
+        found += possible.size
+    points = Points.join(*parts)
+    if found == 0:
+        raise NotConvergedError(
+            f"none of {drawn} hypotheses drawn from the prior of ({', '.join(evaluate.names)}) could have given "
+            "these readings (all have zero likelihood): the hypothesis space excludes what was measured; "
+            "widen the priors, or question the readings or the noise level"
+        )
+    notes: tuple[str, ...] = ()
+    log_volume, error = math.log(found / drawn), math.sqrt((1.0 - found / drawn) / found)
+    if found < n_live:
+        notes = (f"only {found} of {drawn} hypotheses drawn from the prior are possible",)
+        bound = Bound(-math.inf, 1.0)
+        start = points.take(rng.integers(found, size=n_live - found))
+        cloud = points.u if found > n_params else np.concatenate([points.u, rng.random((n_live, n_params))])
+        more, _ = move.draw(start, bound, cloud, evaluate, rng)
+        points = Points.join(points, more)
+    return Live(points, np.full(n_live, -np.inf), log_volume), error, notes
+
+
+def _result(
+    evaluate: Evaluator,
+    live: Live,
+    dead: list[Dead],
+    log_start: tuple[float, float],
+    n_live: int,
+    reason: str,
+    notes: tuple[str, ...],
+    seed_state: str,
+    rng: np.random.Generator,
+) -> NestedResult:
+    """Let the live points die where they are and sum up."""
+    order = live.points.order()
+    points = Points.join(*(d.points for d in dead), live.points.take(order))
+    n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(n_live, 0, -1)])
+    evidence = integrate(
+        points.log_likelihood, n_at_death, rng=rng, log_start=log_start[0], log_start_error=log_start[1]
+    )
+    empty = np.empty(0, dtype=np.int64)
+    rank = np.concatenate([empty, *(d.rank for d in dead)])
+    n_ranked = np.concatenate([empty, *(d.n_ranked for d in dead)])
+    p_value = insertion_p_value(rank, n_ranked, rng=rng)
+    if p_value < _DOUBTFUL_P_VALUE:
+        notes = (
+            *notes,
+            f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
+            "use more steps_per_param or more n_live",
+        )
+    if evidence.n_eff < _FEW_EFFECTIVE:
+        notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")
+    return NestedResult(
+        names=evaluate.names,
+        theta=points.theta,
+        log_likelihood=points.log_likelihood,
+        log_weight=evidence.log_weight,
+        log_birth=np.concatenate([*(d.log_birth for d in dead), live.log_birth[order]]),
+        log_z=evidence.log_z,
+        log_z_error=evidence.log_z_error,
+        information=evidence.information,
+        n_eff=evidence.n_eff,
+        n_calls=evaluate.n_calls,
+        n_live=n_live,
+        stop_reason=reason,
+        insertion_rank=rank,
+        insertion_p_value=p_value,
+        seed_state=seed_state,
+        version=__version__,
+        warnings=notes,
+    )
+
+
+def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
+    """Evaluate the single hypothesis of a problem without free parameters."""
+    theta = np.empty((1, 0))
+    log_likelihood = evaluate.log_likelihood(theta)
+    if not np.isfinite(log_likelihood[0]):
+        raise NotConvergedError("the only hypothesis has zero likelihood: it excludes what was measured")
+    return NestedResult(
+        names=(),
+        theta=theta,
+        log_likelihood=log_likelihood,
+        log_weight=np.zeros(1),
+        log_birth=np.full(1, -np.inf),
+        log_z=float(log_likelihood[0]),
+        log_z_error=0.0,
+        information=0.0,
+        n_eff=1.0,
+        n_calls=1,
+        n_live=n_live,
+        stop_reason="no free parameters: the likelihood is the evidence",
+        insertion_rank=np.empty(0, dtype=np.int64),
+        insertion_p_value=1.0,
+        seed_state=seed_state,
+        version=__version__,
+        warnings=(),
+    )
+
+
+def _plain(value: object) -> object:
+    """Turn a generator's state into what JSON can hold."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

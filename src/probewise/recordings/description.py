@@ -1,0 +1,294 @@
+"""NAME.json: what the readings of NAME.csv are readings of."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from probewise.errors import FileError, ParameterError
+from probewise.recordings.images import read_image
+from probewise.recordings.patterns import (
+    Disc,
+    HalfPlane,
+    Image,
+    Pattern,
+    Polygon,
+    Quadrant,
+    Ramp,
+    Stripes,
+    Uniform,
+)
+from probewise.recordings.plan import Instrumentation
+from probewise.recordings.table import LARGEST, read_text
+
+__all__ = ["Description", "degrees_of", "description_text", "read_description"]
+
+FORMAT = "recording/1"
+
+
+@dataclass(frozen=True)
+class Description:
+    """A description as read: the instrumentation, the patterns by name, what was not used."""
+
+    instrumentation: Instrumentation
+    patterns: Mapping[str, Pattern]
+    notes: tuple[str, ...] = ()
+
+
+def degrees_of(angle_rad: float) -> float:
+    """Convert to degrees such that reading them back gives the same radians, in the fewest digits.
+
+    Radians are what the package works with and degrees what its files hold; a plain conversion
+    there and back can move an angle by a rounding error.
+    """
+    plain = math.degrees(angle_rad)
+    candidates = [round(plain, digits) for digits in range(16)]
+    candidates += [plain, math.nextafter(plain, math.inf), math.nextafter(plain, -math.inf)]
+    return next((c for c in candidates if math.radians(c) == angle_rad), plain)
+
+
+class _Fields:
+    """One JSON object, its fields checked one by one; every message says where the field stands."""
+
+    def __init__(self, path: Path, where: str, content: object) -> None:
+        if not isinstance(content, dict):
+            raise FileError(path, f"{where} is {_shown(content)}", "an object {...}")
+        self.path, self.where, self.content = path, where, content
+        self.used: set[str] = set()
+
+    def fail(self, name: str, value: object, allowed: str) -> FileError:
+        return FileError(self.path, f"{self.where}.{name} is {_shown(value)}".lstrip("."), allowed)
+
+    def get(self, name: str, allowed: str) -> Any:
+        self.used.add(name)
+        if name not in self.content:
+            raise FileError(self.path, f"{self.where}.{name} is missing".lstrip("."), allowed)
+        return self.content[name]
+
+    def has(self, name: str) -> bool:
+        self.used.add(name)
+        return self.content.get(name) is not None
+
+    def number(self, name: str, allowed: str = "a finite number", ok: Callable[[float], bool] | None = None) -> float:
+        value = self.get(name, allowed)
+        if not _is_number(value) or (ok is not None and not ok(float(value))):
+            raise self.fail(name, value, allowed)
+        return float(value)
+
+    def positive(self, name: str) -> float:
+        return self.number(name, "a number greater than 0", lambda v: v > 0)
+
+    def pair(self, name: str) -> tuple[float, float]:
+        allowed = "two finite numbers [x, y]"
+        value = self.get(name, allowed)
+        if not _is_pair(value):
+            raise self.fail(name, value, allowed)
+        return float(value[0]), float(value[1])
+
+    def text(self, name: str, allowed: str = "a text") -> str:
+        value = self.get(name, allowed)
+        if not isinstance(value, str):
+            raise self.fail(name, value, allowed)
+        return value
+
+    def levels(self) -> tuple[float, float]:
+        inside = self.number("inside") if "inside" in self.content else 1.0
+        outside = self.number("outside") if "outside" in self.content else 0.0
+        return inside, outside
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(_is_number(v) for v in value)
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _uniform(f: _Fields) -> Pattern:
+    return Uniform(f.number("albedo"))
+
+
+def _half_plane(f: _Fields) -> Pattern:
+    return HalfPlane(math.radians(f.number("normal_deg")), f.number("offset_mm"), *f.levels())
+
+
+def _quadrant(f: _Fields) -> Pattern:
+    direction = f.pair("direction")
+    if any(abs(d) != 1 for d in direction):
+        raise f.fail("direction", f.content["direction"], "[1, 1], [1, -1], [-1, 1] or [-1, -1]")
+    return Quadrant(f.pair("corner_mm"), (int(direction[0]), int(direction[1])), *f.levels())
+
+
+def _disc(f: _Fields) -> Pattern:
+    return Disc(f.pair("center_mm"), f.positive("radius_mm"), *f.levels())
+
+
+def _polygon(f: _Fields) -> Pattern:
+    allowed = "a list of at least three corners [x, y]"
+    vertices = f.get("vertices_mm", allowed)
+    if not isinstance(vertices, list) or len(vertices) < 3 or not all(_is_pair(v) for v in vertices):
+        raise f.fail("vertices_mm", vertices, allowed)
+    return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.levels())
+
+
+def _stripes(f: _Fields) -> Pattern:
+    duty = f.number("duty", "a number from 0 to 1", lambda v: 0 <= v <= 1)
+    return Stripes(
+        math.radians(f.number("normal_deg")), f.positive("period_mm"), duty, f.number("phase_mm"), *f.levels()
+    )
+
+
+def _ramp(f: _Fields) -> Pattern:
+    return Ramp(math.radians(f.number("normal_deg")), f.number("per_mm"))
+
+
+def _image(f: _Fields) -> Pattern:
+    name = f.text("file", "the name of a PNG or .npy file in the same folder")
+    # A recording must not make its reader open files anywhere else on the disk.
+    if not name or name in (".", "..") or PurePosixPath(name).name != name or PureWindowsPath(name).name != name:
+        raise f.fail("file", name, "the name of a PNG or .npy file in the same folder, without a path")
+    return Image(read_image(f.path.parent / name), f.positive("pixel_mm"), f.pair("origin_mm"), name)
+
+
+_KINDS: dict[str, Callable[[_Fields], Pattern]] = {
+    "uniform": _uniform,
+    "half_plane": _half_plane,
+    "quadrant": _quadrant,
+    "disc": _disc,
+    "polygon": _polygon,
+    "stripes": _stripes,
+    "ramp": _ramp,
+    "image": _image,
+}
+_KIND_OF = {
+    Uniform: "uniform",
+    HalfPlane: "half_plane",
+    Quadrant: "quadrant",
+    Disc: "disc",
+    Polygon: "polygon",
+    Stripes: "stripes",
+    Ramp: "ramp",
+    Image: "image",
+}
+
+
+def read_description(path: Path) -> Description:
+    """Read NAME.json.
+
+    Raises
+    ------
+    FileError
+        If it is missing, does not parse, or a field is missing or not what it should be.
+    """
+    text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
+    try:
+        content = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        found = f"does not parse as JSON: {error.msg} at character {error.colno}"
+        raise FileError(path, found, "strict JSON", row=error.lineno) from error
+    except (ValueError, RecursionError) as error:
+        raise FileError(path, f"does not parse as JSON: {error}", "strict JSON, each name once") from error
+    top = _Fields(path, "", content)
+    if top.text("format", f'"{FORMAT}"') != FORMAT:
+        raise top.fail("format", content["format"], f'"{FORMAT}"')
+    patterns: dict[str, Pattern] = {}
+    notes: list[str] = []
+    listed = top.get("patterns", "at least one pattern by name")
+    for name, fields_of_it in _Fields(path, "patterns", listed).content.items():
+        f = _Fields(path, f"patterns.{name}", fields_of_it)
+        kind = f.text("kind", f"one of {', '.join(_KINDS)}")
+        if kind not in _KINDS:
+            raise f.fail("kind", kind, f"one of {', '.join(_KINDS)}")
+        patterns[name] = _KINDS[kind](f)
+        unused = [key for key in fields_of_it if key not in f.used | {"inside", "outside"}]
+        if unused:
+            notes.append(f"pattern {name}: {', '.join(unused)} not used, no field of kind {kind}")
+    if not patterns:
+        raise FileError(path, "patterns is empty", "at least one pattern by name")
+    return Description(_instrumentation(top), patterns, tuple(notes))
+
+
+def _instrumentation(top: _Fields) -> Instrumentation:
+    reading = _Fields(top.path, "reading", top.content.get("reading", {}))
+    sensor = _Fields(top.path, "sensor", top.content.get("sensor", {}))
+    low = reading.number("min") if reading.has("min") else None
+    high = reading.number("max") if reading.has("max") else None
+    if low is not None and high is not None and low >= high:
+        raise reading.fail("max", high, f"greater than reading.min, {low:g}")
+    controls = top.content.get("controls", [])
+    if not isinstance(controls, list) or not all(isinstance(name, str) for name in controls):
+        raise top.fail("controls", controls, "a list of texts")
+    return Instrumentation(
+        unit=reading.text("unit") if reading.has("unit") else "",
+        min=low,
+        max=high,
+        step=reading.positive("step") if reading.has("step") else None,
+        sensor=sensor.text("name") if sensor.has("name") else "",
+        height_mm=sensor.positive("height_mm") if sensor.has("height_mm") else None,
+        controls=tuple(controls),
+        description=top.text("description") if top.has("description") else "",
+    )
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in out:
+            raise ValueError(f"the name {name!r} comes twice")
+        out[name] = value
+    return out
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:
+    """Write NAME.json, numbers in full precision.
+
+    Raises
+    ------
+    ParameterError
+        If a pattern is of a kind that the format does not have.
+    """
+    inst = instrumentation
+    reading = {"unit": inst.unit, "min": inst.min, "max": inst.max, "step": inst.step}
+    sensor = {"name": inst.sensor, "height_mm": inst.height_mm}
+    content: dict[str, object] = {
+        "format": FORMAT,
+        "reading": {key: value for key, value in reading.items() if value is not None},
+        "sensor": {key: value for key, value in sensor.items() if value is not None},
+        "patterns": {name: _pattern_fields(pattern) for name, pattern in patterns.items()},
+    }
+    if inst.controls:
+        content["controls"] = list(inst.controls)
+    if inst.description:
+        content["description"] = inst.description
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _pattern_fields(pattern: Pattern) -> dict[str, object]:
+    if type(pattern) not in _KIND_OF:
+        raise ParameterError("pattern", type(pattern).__name__, f"one of {', '.join(_KINDS)}")
+    out: dict[str, object] = {"kind": _KIND_OF[type(pattern)]}
+    for field in fields(pattern):
+        value = getattr(pattern, field.name)
+        if isinstance(value, np.ndarray):
+            continue  # an image's pixels stand in their own file
+        if field.name.endswith("_rad"):
+            out[field.name.removesuffix("_rad") + "_deg"] = degrees_of(value)
+        elif field.name not in ("inside", "outside") or value != field.default:
+            out[field.name] = value
+    return out

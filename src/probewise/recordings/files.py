@@ -1,0 +1,274 @@
+"""Recordings and plans on disk: NAME.csv with the rows, NAME.json beside it with what they are readings of."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import FileError, ParameterError
+from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
+from probewise.recordings.description import Description, degrees_of, description_text, read_description
+from probewise.recordings.images import image_bytes
+from probewise.recordings.patterns import Image
+from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.table import LARGEST, Table, csv_text, is_number, number_text, read_table
+
+__all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recording", "write_plan", "write_recording"]
+
+_KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
+_LARGEST_PLACE_MM = 1e9
+PathLike = str | os.PathLike[str]
+
+
+def read_recording(path: PathLike) -> Recording:
+    """Read a recording, NAME.csv with NAME.json beside it.
+
+    Missing readings become NaN, readings outside the declared range keep their value; both are
+    counted in the notes and not `usable`.
+
+    Raises
+    ------
+    FileError
+        If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
+    """
+    plan, readings, notes = _read(Path(path))
+    if readings is None:
+        found = "no such column: this is a plan"
+        raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
+    recording = Recording(plan, readings, str(path))
+    n_missing = int(np.isnan(readings).sum())
+    n_outside = len(recording) - n_missing - int(recording.usable.sum())
+    inst = plan.instrumentation
+    if n_missing:
+        notes.append(f"{_count(n_missing)} missing, left out")
+    if n_outside:
+        notes.append(f"{_count(n_outside)} outside {_range(inst.min, inst.max)}, left out")
+    if not recording.usable.any():
+        found = "there is no reading at all" if not n_outside else "no reading is within the declared range"
+        raise FileError(path, found, f"at least one number in {_range(inst.min, inst.max)}", column="reading")
+    return replace(recording, notes=tuple(notes))
+
+
+def read_plan(path: PathLike) -> Plan:
+    """Read a plan; a recording is accepted too, its readings play no part.
+
+    Raises
+    ------
+    FileError
+        If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
+    """
+    return _read(Path(path))[0]
+
+
+def read_plan_and_readings(path: PathLike) -> tuple[Plan, FloatArray | None]:
+    """Read a plan or a recording, whichever it is: the plan, and the readings (n_points,) or None.
+
+    Raises
+    ------
+    FileError
+        If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
+    """
+    plan, readings, _ = _read(Path(path))
+    return plan, readings
+
+
+def write_recording(recording: Recording, path: PathLike) -> None:
+    """Write NAME.csv and NAME.json (and the images it shows), each at once or not at all, in full precision.
+
+    Raises
+    ------
+    ParameterError
+        If the recording holds what the format cannot say (an unknown pattern, a name with line ends).
+    FileError
+        If the files cannot be written.
+    """
+    inst = recording.plan.instrumentation
+    largest = math.inf if inst.min is not None and inst.max is not None else LARGEST
+    readings = _cells("readings", recording.readings, largest)
+    _write(recording.plan, Path(path), plan_columns(recording.plan) | {"reading": readings})
+
+
+def write_plan(plan: Plan, path: PathLike) -> None:
+    """Write a plan as NAME.csv and NAME.json (and the images it shows), each at once or not at all.
+
+    Raises
+    ------
+    ParameterError
+        If the plan holds what the format cannot say (an unknown pattern, a name with line ends).
+    FileError
+        If the files cannot be written.
+    """
+    _write(plan, Path(path), plan_columns(plan))
+
+
+def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
+    """Write out the rows of a plan as cells by column, in full precision.
+
+    Raises
+    ------
+    ParameterError
+        If the plan holds what the format cannot say.
+    """
+    for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
+        if name != name.strip() or not name.isprintable():
+            raise ParameterError("name", name, "a printable text without blanks around it")
+    clash = [name for name in plan.covariates if name in (*_KNOWN, "")]
+    if clash:
+        raise ParameterError("covariate", clash[0], "a name that is no column of the format")
+    if np.any(np.diff(plan.scan) < 0):
+        raise ParameterError("scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in order of taking")
+    names = _distinct_neighbours(plan)
+    columns: dict[str, Sequence[str]] = {
+        "scan": [names[k] for k in plan.scan],
+        "pattern": [plan.pattern_names[k] for k in plan.pattern],
+        "x_mm": _cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
+        "y_mm": _cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
+        "orientation_deg": [number_text(degrees_of(float(v))) for v in plan.orientation_rad],
+        "time_s": _cells("time_s", plan.time_s),
+    }
+    return columns | {name: _cells(name, values) for name, values in plan.covariates.items()}
+
+
+def _cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]:
+    bad = np.isinf(values) | (np.abs(values) > largest)
+    if bad.any():
+        raise ParameterError(name, float(values[bad][0]), f"finite numbers of magnitude up to {largest:g}")
+    return [number_text(value) for value in values]
+
+
+def _distinct_neighbours(plan: Plan) -> dict[int, str]:
+    """Name the scans that have rows so that two following one another never look like one."""
+    names: dict[int, str] = {}
+    last = ""
+    for k in np.unique(plan.scan):
+        name = plan.scan_names[k]
+        if names and name == last:
+            name += " (again)"
+        names[int(k)] = last = name
+    return names
+
+
+def _write(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
+    if path.suffix.lower() == ".json":
+        raise ParameterError("path", str(path), "the name of the CSV; the JSON goes beside it")
+    used = {name for name, _ in plan.rows_by_pattern()}
+    unknown = sorted(used - set(plan.patterns))
+    if unknown:
+        raise ParameterError("pattern", unknown[0], "a pattern that plan.patterns describes")
+    text = description_text(plan.instrumentation, plan.patterns)
+    images = [p for p in plan.patterns.values() if isinstance(p, Image)]
+    contents = [(path.parent / image.file, image_bytes(image.albedo, Path(image.file).suffix)) for image in images]
+    # The CSV comes last: where it stands, everything that it needs stands too.
+    for image_path, content in contents:
+        write_bytes_atomically(image_path, content)
+    write_text_atomically(path.with_suffix(".json"), text)
+    write_text_atomically(path, csv_text(columns))
+
+
+def _read(path: Path) -> tuple[Plan, FloatArray | None, list[str]]:
+    if path.suffix.lower() == ".json":
+        raise FileError(path, "this is a description", "the name of the CSV beside it")
+    table = read_table(path)
+    table.require("x_mm", "y_mm")
+    if not len(table):
+        raise FileError(path, "there is no reading at all, only a header", "one row a reading")
+    description = read_description(path.with_suffix(".json"))
+    notes = list(description.notes)
+    scan, scan_names = _scans(table)
+    time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
+    back = np.flatnonzero(np.diff(time_s) < 0)
+    if back.size:
+        notes.append(f"time_s runs backwards at row {table.rows[int(back[0]) + 1]}")
+    orientation_deg = table.numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
+    plan = Plan(
+        x_mm=table.numbers("x_mm", largest=_LARGEST_PLACE_MM),
+        y_mm=table.numbers("y_mm", largest=_LARGEST_PLACE_MM),
+        orientation_rad=np.array([np.radians(v) for v in orientation_deg]),
+        time_s=time_s,
+        scan=scan,
+        scan_names=scan_names,
+        pattern=_patterns(table, description),
+        pattern_names=tuple(description.patterns),
+        patterns=description.patterns,
+        covariates=_covariates(table, notes),
+        instrumentation=description.instrumentation,
+    )
+    readings = _readings(table, description) if "reading" in table.columns else None
+    return plan, readings, notes
+
+
+def _readings(table: Table, description: Description) -> FloatArray:
+    inst = description.instrumentation
+    # With a range declared, a huge number is merely outside it; without one it would spoil every sum.
+    bounded = inst.min is not None and inst.max is not None
+    return table.numbers("reading", missing=True, largest=None if bounded else LARGEST)
+
+
+def _scans(table: Table) -> tuple[IntArray, tuple[str, ...]]:
+    """Count scans up at every change of name: one that returns later is a new scan."""
+    if "scan" not in table.columns:
+        return np.zeros(len(table), dtype=np.int64), ("scan",)
+    cells = table.columns["scan"]
+    starts = [k for k in range(len(cells)) if k == 0 or cells[k] != cells[k - 1]]
+    scan = np.zeros(len(cells), dtype=np.int64)
+    scan[starts[1:]] = 1
+    return np.cumsum(scan), tuple(cells[k] for k in starts)
+
+
+def _patterns(table: Table, description: Description) -> IntArray:
+    names = list(description.patterns)
+    known = ", ".join(repr(name) for name in names)
+    json_name = table.path.with_suffix(".json").name
+    if "pattern" not in table.columns:
+        if len(names) > 1:
+            raise FileError(
+                table.path, f"no such column, and {json_name} has {len(names)} patterns",
+                f"a column that names one of {known} in each row", row=1, column="pattern",
+            )  # fmt: skip
+        return np.zeros(len(table), dtype=np.int64)
+    code = {name: k for k, name in enumerate(names)}
+    cells = table.columns["pattern"]
+    for k, cell in enumerate(cells):
+        if cell not in code:
+            raise FileError(
+                table.path, f"the pattern {cell!r} is not in {json_name}", f"one of {known}",
+                row=table.rows[k], column="pattern",
+            )  # fmt: skip
+    return np.array([code[cell] for cell in cells], dtype=np.int64)
+
+
+def _covariates(table: Table, notes: list[str]) -> dict[str, FloatArray]:
+    """Keep every other numeric column; a column counts as numeric where most of what it holds are numbers."""
+    out: dict[str, FloatArray] = {}
+    for name, cells in table.columns.items():
+        if name in _KNOWN:
+            continue
+        filled = [cell for cell in cells if cell and cell.lower() != "nan"]
+        n_numbers = sum(is_number(cell) for cell in filled)
+        if not name:
+            notes.append("a column without a name, ignored")
+        elif not filled:
+            notes.append(f"column {name} is empty, ignored")
+        elif 2 * n_numbers <= len(filled):
+            notes.append(f"column {name} is text, ignored")
+        else:
+            out[name] = table.numbers(name, missing=True)
+    return out
+
+
+def _count(n: int) -> str:
+    return "1 reading" if n == 1 else f"{n} readings"
+
+
+def _range(low: float | None, high: float | None) -> str:
+    if low is None and high is None:
+        return "any range"
+    if low is None:
+        return f"the range up to {high:g}"
+    return f"{low:g} to {high:g}" if high is not None else f"the range from {low:g}"

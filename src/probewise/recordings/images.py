@@ -1,0 +1,177 @@
+"""Pictures as albedo: 8-bit PNG (decoded here, so that reading a recording needs no plotting library) and .npy."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import FloatArray
+from probewise.errors import FileError, ParameterError
+from probewise.recordings.table import read_bytes
+
+__all__ = ["image_bytes", "read_image"]
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
+_ALLOWED = "a PNG of 8 bits a channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
+_LARGEST_PIXELS = 100_000_000
+Bytes8 = NDArray[np.uint8]
+
+
+def read_image(path: Path) -> FloatArray:
+    """Read a picture as albedo 0 to 1, shape (n_rows, n_columns), first row on top.
+
+    Grey values 0 to 255 are linear in albedo; colours count by the mean of their channels; what is
+    transparent reflects nothing, as outside the picture.
+
+    Raises
+    ------
+    FileError
+        If it is no such picture, damaged, or has values outside 0 to 255.
+    """
+    content = read_bytes(path, _ALLOWED)
+    if path.suffix.lower() == ".npy":
+        return _from_npy(path, content)
+    if not content.startswith(_SIGNATURE):
+        raise FileError(path, "the file does not begin as a PNG does", _ALLOWED)
+    return _from_png(path, content)
+
+
+def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
+    """Encode albedo (n_rows, n_columns) as the file that `read_image` reads back: '.npy' or '.png'.
+
+    Raises
+    ------
+    ParameterError
+        If `suffix` is another, or '.png' is asked for and the albedo is not in steps of 1/255.
+    """
+    values = albedo * 255.0
+    if suffix.lower() == ".npy":
+        out = io.BytesIO()
+        np.save(out, values, allow_pickle=False)
+        return out.getvalue()
+    if suffix.lower() != ".png":
+        raise ParameterError("image file suffix", suffix, "'.png' or '.npy'")
+    grey = np.rint(values)
+    if np.abs(grey - values).max(initial=0.0) > 1e-9 or grey.min(initial=0) < 0 or grey.max(initial=0) > 255:
+        raise ParameterError(
+            "image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255 from 0 to 1"
+        )
+    n_rows, n_columns = grey.shape
+    lines = np.zeros((n_rows, n_columns + 1), dtype=np.uint8)  # a leading 0 on each line: no filter
+    lines[:, 1:] = grey
+    header = struct.pack(">IIBBBBB", n_columns, n_rows, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
+    return _SIGNATURE + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+def _from_npy(path: Path, content: bytes) -> FloatArray:
+    try:
+        values = np.load(io.BytesIO(content), allow_pickle=False)
+    except (ValueError, OSError, EOFError, SyntaxError) as error:
+        raise FileError(path, f"not readable as .npy ({error})", "a two-dimensional array of numbers") from error
+    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind not in "uif" or values.size == 0:
+        found = f"{getattr(values, 'dtype', type(values).__name__)} of shape {getattr(values, 'shape', None)}"
+        raise FileError(path, found, "a two-dimensional array of numbers")
+    albedo = values.astype(np.float64)
+    bad = ~((albedo >= 0) & (albedo <= 255))
+    if bad.any():
+        row, column = (int(k) for k in np.argwhere(bad)[0])
+        raise FileError(path, f"pixel [{row}, {column}] is {albedo[row, column]}", "0 to 255")
+    return albedo / 255.0
+
+
+def _from_png(path: Path, content: bytes) -> FloatArray:
+    chunks = _chunks(path, content)
+    width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
+    if depth != 8 or colour not in _CHANNELS or interlace or not 0 < width * height <= _LARGEST_PIXELS:
+        found = f"{width} x {height} pixels, {depth} bits, colour type {colour}, interlace {interlace}"
+        raise FileError(path, found, f"{_ALLOWED}, at most {_LARGEST_PIXELS} pixels")
+    n_channels = _CHANNELS[colour]
+    expected = height * (1 + width * n_channels)
+    try:
+        # Never unpack more than the header announces: a small file can hold gigabytes.
+        raw = zlib.decompressobj().decompress(chunks.get(b"IDAT", b""), expected + 1)
+    except zlib.error as error:
+        raise FileError(path, f"the pixel data are damaged ({error})", _ALLOWED) from error
+    if len(raw) != expected:
+        raise FileError(path, f"{len(raw)} bytes of pixel data", f"{expected} bytes for {width} x {height} pixels")
+    pixels = _unfiltered(path, np.frombuffer(raw, dtype=np.uint8).reshape(height, -1), n_channels)
+    return _albedo(path, pixels.reshape(height, width, n_channels), colour, chunks)
+
+
+def _chunks(path: Path, content: bytes) -> dict[bytes, bytes]:
+    chunks: dict[bytes, bytes] = {}
+    at = len(_SIGNATURE)
+    while at < len(content):
+        length = int.from_bytes(content[at : at + 4], "big")
+        kind, data = content[at + 4 : at + 8], content[at + 8 : at + 8 + length]
+        check = content[at + 8 + length : at + 12 + length]
+        if len(check) != 4 or zlib.crc32(kind + data) != int.from_bytes(check, "big"):
+            raise FileError(path, f"the PNG is damaged or cut short at byte {at}", _ALLOWED)
+        chunks[kind] = chunks.get(kind, b"") + data
+        at += 12 + length
+    if len(chunks.get(b"IHDR", b"")) != 13:
+        raise FileError(path, "the PNG has no header", _ALLOWED)
+    return chunks
+
+
+def _unfiltered(path: Path, lines: Bytes8, n_channels: int) -> Bytes8:
+    """Undo the PNG line filters (PNG specification, section 9); arithmetic is modulo 256."""
+    out = np.zeros((len(lines), lines.shape[1] - 1), dtype=np.uint8)
+    above = np.zeros(lines.shape[1] - 1, dtype=np.uint8)
+    for k, line in enumerate(lines):
+        kind, data = int(line[0]), line[1:]
+        if kind == 0:
+            row = data
+        elif kind == 1:
+            row = np.cumsum(data.reshape(-1, n_channels), axis=0, dtype=np.uint8).ravel()
+        elif kind == 2:
+            row = data + above
+        elif kind in (3, 4):
+            row = _unfiltered_by_neighbours(kind, data, above, n_channels)
+        else:
+            raise FileError(path, f"line {k} has filter {kind}", "filters 0 to 4")
+        out[k] = above = row
+    return out
+
+
+def _unfiltered_by_neighbours(kind: int, data: Bytes8, above: Bytes8, n_channels: int) -> Bytes8:
+    """Undo the filters Average (3) and Paeth (4), each byte needing the one before it."""
+    row = bytearray(len(data))
+    line, up = data.tobytes(), above.tobytes()
+    for k, byte in enumerate(line):
+        a = row[k - n_channels] if k >= n_channels else 0
+        b = up[k]
+        if kind == 3:
+            guess = (a + b) // 2
+        else:
+            c = up[k - n_channels] if k >= n_channels else 0
+            to_a, to_b, to_c = abs(b - c), abs(a - c), abs(a + b - 2 * c)
+            guess = a if to_a <= to_b and to_a <= to_c else b if to_b <= to_c else c
+        row[k] = (byte + guess) & 255
+    return np.frombuffer(bytes(row), dtype=np.uint8)
+
+
+def _albedo(path: Path, pixels: Bytes8, colour: int, chunks: dict[bytes, bytes]) -> FloatArray:
+    if colour == 3:
+        table = np.frombuffer(chunks.get(b"PLTE", b""), dtype=np.uint8)
+        if table.size == 0 or table.size % 3 or int(pixels.max()) >= table.size // 3:
+            raise FileError(path, "the palette is missing or too short for the pixels", _ALLOWED)
+        values = table.reshape(-1, 3).mean(axis=1)
+        alpha = np.full(len(values), 255.0)
+        given = np.frombuffer(chunks.get(b"tRNS", b""), dtype=np.uint8)[: len(values)]
+        alpha[: len(given)] = given
+        return np.asarray((values * alpha)[pixels[..., 0]] / 255.0**2, dtype=np.float64)
+    if b"tRNS" in chunks:
+        raise FileError(path, "one colour is declared transparent", "a PNG without that, or with an alpha channel")
+    n_colours = 1 if colour in (0, 4) else 3
+    values = pixels[..., :n_colours].mean(axis=-1, dtype=np.float64) / 255.0
+    return np.asarray(values * (pixels[..., -1] / 255.0) if colour in (4, 6) else values, dtype=np.float64)

@@ -1,0 +1,166 @@
+"""Plans ready to carry out: the paper's calibration plan and a two-way plan that sees more of what can be wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Quadrant, Uniform
+from probewise.recordings.plan import Instrumentation, Plan
+
+__all__ = ["jittered", "paper_plan", "two_way_plan"]
+
+LEGO = Instrumentation(
+    unit="LEGO",
+    min=0.0,
+    max=100.0,
+    sensor="LEGO 9844 light sensor",
+    height_mm=14.0,
+    controls=("orientation_deg",),
+)
+PATTERNS: dict[str, Pattern] = {
+    "boundary": HalfPlane(0.0, 0.0),  # paper, S_BW
+    "quadrant_a": Quadrant((0.0, 0.0), (1, 1)),  # paper, S_a to S_d
+    "quadrant_b": Quadrant((0.0, 0.0), (-1, 1)),
+    "quadrant_c": Quadrant((4.0, 4.0), (1, 1)),
+    "quadrant_d": Quadrant((-4.0, 4.0), (-1, 1)),
+    "white": Uniform(1.0),
+    "black": Uniform(0.0),
+    "disc": Disc((0.0, 0.0), 40.0),
+}
+ORIENTATIONS_DEG = (0, 90, 180, 270)
+QUADRANTS = ("quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d")
+_FULL_BATTERY_MV, _DRAIN_MV_PER_S = 8300.0, 0.12
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """One scan: places (n, 2), the patterns (one, or one a reading), orientation, seconds a reading, seconds before."""
+
+    name: str
+    places_mm: FloatArray
+    patterns: Sequence[str]
+    orientation_deg: float
+    reading_s: float
+    before_s: float
+
+
+def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
+    """Lay out the paper's 408 readings (section "Data Collection for SSF Estimation").
+
+    Four scans across the black-and-white boundary from -50 to 50 mm in steps of 1 mm with the sensor
+    at 0, 90, 180 and 270 degrees, `edge_0` to `edge_270`, then one reading on each of the four
+    quadrant patterns at 0 degrees, `quadrants`.
+
+    Parameters
+    ----------
+    reading_s
+        Seconds from one reading to the next, the paper's arm: about 1.2.
+    break_s
+        Seconds to turn the sensor between scans, or to change the pattern.
+    """
+    line = _line(-50, 50, 1)
+    scans = [_Scan(f"edge_{deg}", line, ("boundary",), deg, reading_s, break_s) for deg in ORIENTATIONS_DEG]
+    scans.append(_Scan("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s, break_s))
+    return _plan(scans)
+
+
+def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
+    """Lay out 961 readings that tell lag from backlash and gain from offset.
+
+    For each orientation: the boundary out and back (the way back at double speed for 180 and 270
+    degrees, since lag depends on speed and backlash does not), plain white and plain black every 8 mm.
+    Then the four quadrants, and a scan along Y across a disc, the only one that moves in Y.
+
+    Parameters
+    ----------
+    reading_s
+        Seconds from one reading to the next.
+    break_s
+        Seconds to turn the sensor between scans, or to change the pattern.
+    """
+    out, flat = _line(-50, 50, 1), _line(-40, 40, 8)
+    scans: list[_Scan] = []
+    for deg in ORIENTATIONS_DEG:
+        back_s = reading_s / 2 if deg >= 180 else reading_s
+        scans += [
+            _Scan(f"edge_{deg}_out", out, ("boundary",), deg, reading_s, break_s),
+            _Scan(f"edge_{deg}_back", out[::-1], ("boundary",), deg, back_s, break_s),
+            _Scan(f"white_{deg}", flat, ("white",), deg, reading_s, break_s),
+            _Scan(f"black_{deg}", flat, ("black",), deg, reading_s, break_s),
+        ]
+    along_y = _line(60, -60, -2)[:, ::-1] + [-5.0, 0.0]
+    scans.append(_Scan("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s, break_s))
+    scans.append(_Scan("disc_y", along_y, ("disc",), 0, reading_s, break_s))
+    return _plan(scans)
+
+
+def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
+    """Take the plan's times as an arm does, never quite on the beat, and its battery as a meter shows it.
+
+    Parameters
+    ----------
+    plan
+        A plan in order of time.
+    rng
+        Where the randomness comes from.
+    share
+        Every interval changes by up to this share of it, 0 to 1.
+
+    Raises
+    ------
+    ParameterError
+        If `share` is outside 0 to 1.
+    """
+    if not 0 <= share <= 1:
+        raise ParameterError("share", share, "0 to 1")
+    intervals = np.diff(plan.time_s, prepend=0.0)
+    time_s = np.round(np.cumsum(intervals * rng.uniform(1 - share, 1 + share, len(plan))), 3).astype(np.float64)
+    covariates = dict(plan.covariates)
+    if "battery_mv" in covariates:
+        covariates["battery_mv"] = np.round(_battery_mv(time_s) + rng.normal(0.0, 4.0, len(plan)))
+    return replace(plan, time_s=time_s, covariates=covariates)
+
+
+def _line(first: int, last: int, step: int) -> FloatArray:
+    x_mm = np.arange(first, last + np.sign(step), step, dtype=np.float64)
+    return np.stack([x_mm, np.zeros_like(x_mm)], axis=-1)
+
+
+def _battery_mv(time_s: FloatArray) -> FloatArray:
+    return _FULL_BATTERY_MV - _DRAIN_MV_PER_S * time_s
+
+
+def _plan(scans: Sequence[_Scan]) -> Plan:
+    intervals = [np.full(len(s.places_mm), s.reading_s) for s in scans]
+    for scan, interval in zip(scans[1:], intervals[1:], strict=True):
+        interval[0] = scan.before_s
+    time_s = np.round(np.cumsum(np.concatenate(intervals)), 3)
+    places = np.concatenate([s.places_mm for s in scans])
+    counts = [len(s.places_mm) for s in scans]
+    # A scan over one pattern names it once.
+    named = [
+        name
+        for scan, n in zip(scans, counts, strict=True)
+        for name in (scan.patterns if len(scan.patterns) == n else [scan.patterns[0]] * n)
+    ]
+    patterns = {name: pattern for name, pattern in PATTERNS.items() if name in named}
+    codes = {name: k for k, name in enumerate(patterns)}
+    return Plan(
+        x_mm=places[:, 0],
+        y_mm=places[:, 1],
+        orientation_rad=np.repeat([math.radians(s.orientation_deg) for s in scans], counts),
+        time_s=time_s,
+        scan=np.repeat(np.arange(len(scans)), counts),
+        scan_names=tuple(s.name for s in scans),
+        pattern=np.array([codes[name] for name in named]),
+        pattern_names=tuple(patterns),
+        patterns=patterns,
+        covariates={"battery_mv": np.round(_battery_mv(time_s))},
+        instrumentation=LEGO,
+    )

@@ -1,0 +1,82 @@
+"""Predictions of a plan or a recording, and their file."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen, require_finite
+from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.recordings.atomic import write_text_atomically
+from probewise.recordings.files import plan_columns
+from probewise.recordings.plan import Plan
+from probewise.recordings.table import csv_text, number_text, read_table
+
+__all__ = ["Prediction", "read_prediction", "write_prediction"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What each row's reading is expected to be; all arrays have shape (n_points,).
+
+    `sd` is that of one new reading, noise and parameter uncertainty included. `log_density` is the
+    natural logarithm of the predictive density of that row's reading alone, per unit of the reading;
+    NaN where the reading is missing or out of range, and everywhere for a plan.
+    """
+
+    plan: Plan
+    mean: FloatArray
+    sd: FloatArray
+    log_density: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "sd", "log_density"):
+            values = frozen(getattr(self, name))
+            if values.shape != (len(self.plan),):
+                raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(self.plan)},), as the plan")
+            if name != "log_density":
+                require_finite(name, values)
+            elif np.isinf(values).any():
+                raise ParameterError(
+                    name, float(values[np.isinf(values)][0]), "finite numbers, or NaN without a reading"
+                )
+            object.__setattr__(self, name, values)
+        if np.any(self.sd <= 0):
+            raise ParameterError("sd", float(self.sd.min()), "greater than 0")
+
+    def __len__(self) -> int:
+        return len(self.plan)
+
+
+def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:
+    """Write the plan's rows in their order, none dropped, with `mean`, `sd` and `log_density`, in full precision.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    columns = plan_columns(prediction.plan)
+    for name in ("mean", "sd", "log_density"):
+        columns[name] = [number_text(value) for value in getattr(prediction, name)]
+    write_text_atomically(path, csv_text(columns))
+
+
+def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Read back `mean`, `sd` and `log_density` (NaN where empty), each of shape (n_points,).
+
+    Raises
+    ------
+    FileError
+        If the file is missing, or a cell is not such a number.
+    """
+    table = read_table(Path(path))
+    table.require("mean", "sd", "log_density")
+    mean, sd = table.numbers("mean"), table.numbers("sd")
+    if np.any(sd <= 0):
+        k = int(np.argmax(sd <= 0))
+        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.rows[k], column="sd")
+    return mean, sd, table.numbers("log_density", missing=True)

@@ -1,0 +1,30 @@
+"""The recordings that come with the package."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from probewise.errors import ParameterError
+
+__all__ = ["SHIPPED", "shipped"]
+
+SHIPPED = ("paper", "drifting")
+
+
+def shipped(name: str) -> Path:
+    """Find a recording that comes with the package, its JSON beside it.
+
+    `paper`: the paper's 404 readings over the black-and-white boundary and four over the quadrants.
+    `drifting`: 961 readings, scans out and back, with one effect that a plain sensor model leaves out;
+    the effect was drawn from a seed, and the name does not give it away.
+    Both are simulated (world/shipped.py).
+
+    Raises
+    ------
+    ParameterError
+        If there is no recording of that name.
+    """
+    if name not in SHIPPED:
+        raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
+    return Path(str(resources.files("probewise"))) / "data" / f"{name}.csv"

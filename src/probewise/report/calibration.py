@@ -1,0 +1,176 @@
+"""The page of a calibration: which SSF the recording asks for, and how well it predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from probewise.calibration import Calibration, FittedSensor
+from probewise.recordings import Prediction, Recording
+from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.plots import (
+    calibration_check,
+    png,
+    predicted_against_recorded,
+    readings_by_orientation,
+    spatial_sensitivity,
+    ssf_by_order,
+)
+from probewise.report.words import count, number, signed
+
+__all__ = ["answer", "evidence_table", "figures", "parameter_table", "sections", "write_page"]
+
+
+def answer(sensor: FittedSensor) -> str:
+    """Say in one sentence what the calibration found."""
+    n = sensor.n_gaussians
+    said = f"The recording asks for {count(n, 'Gaussian')}"
+    others = sorted((o for o in sensor.orders if o.n_gaussians != n), key=lambda o: -o.log_z)
+    if others:
+        chosen = next(o for o in sensor.orders if o.n_gaussians == n)
+        lead = chosen.log_z - others[0].log_z
+        said += f", ahead of {others[0].n_gaussians} by {number(lead, 1)} in ln Z"
+    center_x, center_y, widths = field_shape(sensor)
+    return (
+        f"{said}: centred at ({signed(center_x, 1)}, {signed(center_y, 1)}) mm on the sensor, "
+        f"{number(widths[0], 1)} by {number(widths[1], 1)} mm (sd), "
+        f"noise {number(float(sensor.noise_sd.mean()), 2)} {sensor.instrumentation.unit} units a reading."
+    )
+
+
+def field_shape(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
+    """Centre (mm) and the sds (mm) along the long and the short axis of the mean SSF field."""
+    u, v = sensor.field.mean_mm
+    short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0))
+    return float(u), float(v), (float(long), float(short))
+
+
+def figures(calibration: Calibration, recording: Recording, prediction: Prediction) -> dict[str, bytes]:
+    """Draw the figures of a calibration: PNG by file name."""
+    drawn = {
+        "readings.png": png(readings_by_orientation(recording)),
+        "predicted.png": png(predicted_against_recorded(recording, prediction.mean, prediction.sd)),
+        "residuals.png": png(calibration_check(recording, prediction.mean, prediction.sd)),
+        "ssf.png": png(spatial_sensitivity(calibration.sensor.field)),
+    }
+    drawn["ssf_by_order.png"] = png(
+        ssf_by_order(
+            calibration.fields,
+            {o.n_gaussians: o.log_z for o in calibration.orders},
+            {o.n_gaussians: o.log_z_error for o in calibration.orders},
+        )
+    )
+    return drawn
+
+
+def sections(
+    sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
+) -> list[Section]:
+    """Build everything below the answer."""
+    ok = recording.usable
+    z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
+    return [
+        Section(
+            "Which number of Gaussians",
+            (
+                figure(
+                    drawn["ssf_by_order.png"],
+                    "Mean SSF of each number of Gaussians, in the sensor frame seen from above; lines at a half and a "
+                    "tenth of the peak, the cross at the package's centre.",
+                ),
+                evidence_table(sensor),
+            ),
+        ),
+        Section(
+            "Readings",
+            (
+                figure(drawn["readings.png"], "Readings as recorded, a symbol for each orientation of the sensor."),
+                *_notes(recording.notes),
+            ),
+        ),
+        Section(
+            "Predicted against recorded",
+            (
+                figure(
+                    drawn["predicted.png"],
+                    "Recorded (red) and predicted (black, with the band that should hold 95 % of new readings).",
+                ),
+                paragraph(
+                    f"Chi-square a reading is {number(float(np.mean(z**2)), 3)} over {count(int(ok.sum()), 'reading')} "
+                    "(near 1 where the model and its noise are right; the same readings were fitted, so a little below)."
+                ),
+                figure(drawn["residuals.png"], "Standardised residuals in the order of taking."),
+            ),
+        ),
+        Section("Parameters", (parameter_table(sensor), *_notes(sensor.notes))),
+        Section(
+            "What was believed before",
+            (
+                table(
+                    ("parameter", "unit", "prior", "why"),
+                    ((p.parameter, p.unit, p.distribution, p.reason) for p in sensor.priors),
+                ),
+            ),
+        ),
+        Section(
+            "This run",
+            (
+                definition_list(
+                    (
+                        ("recording", sensor.source or "unnamed"),
+                        ("its fingerprint", sensor.fingerprint),
+                        ("seed", str(seed)),
+                        ("version", f"probewise {sensor.version}"),
+                    )
+                ),
+            ),
+        ),
+    ]
+
+
+def evidence_table(sensor: FittedSensor) -> Markup:
+    """Build the paper's table: evidence and parameters by number of Gaussians."""
+    best = max((o.log_z for o in sensor.orders), default=0.0)
+    return table(
+        ("Gaussians", "ln Z", "below the best", "parameters (with I_min, I_max)"),
+        (
+            (
+                str(o.n_gaussians),
+                f"{number(o.log_z, 2)} ± {number(o.log_z_error, 2)}",
+                number(best - o.log_z, 2),
+                f"{o.n_ssf_parameters} ({o.n_parameters})",
+            )
+            for o in sensor.orders
+        ),
+        caption="Natural log of the evidence with its standard error.",
+    )
+
+
+def parameter_table(sensor: FittedSensor) -> Markup:
+    """Build the table of posterior means, sds and 95 % intervals."""
+    mean, sd, interval = sensor.mean(), sensor.sd(), sensor.interval()
+    return table(
+        ("parameter", "unit", "mean", "sd", "95 % interval"),
+        (
+            (n, sensor.unit(n), f"{mean[n]:.5g}", f"{sd[n]:.3g}", f"{interval[n][0]:.5g} to {interval[n][1]:.5g}")
+            for n in sensor.names
+        ),
+        caption="Posterior of the chosen model. The covariance of Gaussian n is half the inverse of [[A, C], [C, B]].",
+    )
+
+
+def write_page(
+    calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
+) -> str:
+    """Write the whole page."""
+    return page(
+        f"Calibration of {calibration.sensor.source or 'a sensor'}",
+        answer=answer(calibration.sensor),
+        key_figure=figure(drawn["ssf.png"], "Spatial sensitivity function: the weight of each point below the sensor."),
+        sections=sections(calibration.sensor, recording, prediction, drawn, seed=seed),
+    )
+
+
+def _notes(notes: tuple[str, ...]) -> tuple[Markup, ...]:
+    return tuple(paragraph(f"Note: {note}.") for note in notes)

@@ -1,0 +1,135 @@
+"""What the sensor model predicts against what was recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.recordings import Recording
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, VERMILLION, AxesGrid, axes_or_new, grid_of_axes, tidy
+from probewise.report.plots.readings import Track, along_label, tracks
+
+__all__ = ["calibration_check", "predicted_against_recorded", "residuals_against"]
+
+MAX_PANELS = 8
+
+
+def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: FloatArray) -> AxesGrid:
+    """Draw recorded (red) and predicted (black, with its 95 % band) readings, a panel each scan (paper, last MoG figure).
+
+    Parameters
+    ----------
+    recording
+        What was recorded.
+    mean, sd
+        Predicted reading of each row and the sd of one new reading, shape (n_points,).
+    """
+    found, alone = tracks(recording.plan)
+    shown = [found[i] for i in _spread(len(found), MAX_PANELS - bool(alone.size))]
+    n_panels = max(len(shown) + bool(alone.size), 1)
+    n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
+    n_rows = -(-n_panels // n_columns)
+    axes = grid_of_axes(n_rows, n_columns, size_in=(4.0 * n_columns, 2.9 * n_rows), sharey=True)
+    unit = recording.plan.instrumentation.unit
+    for ax, track in zip(axes.flat, shown, strict=False):
+        _draw_track(ax, recording, track, mean, sd)
+        tidy(ax, x="", y="", title=track.label)
+    if alone.size:
+        ax = axes.flat[len(shown)]
+        _draw_alone(ax, recording, alone, mean, sd)
+        tidy(ax, x="", y="", title="single readings")
+    for ax in list(axes.flat)[n_panels:]:
+        ax.set_visible(False)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"reading ({unit} units)")
+    for k in range(max(n_panels - n_columns, 0), len(shown)):
+        axes.flat[k].set_xlabel(along_label(shown).replace(", white side positive", ""))
+    axes.flat[0].legend(frameon=False, fontsize="small")
+    return axes
+
+
+def _spread(n: int, most: int) -> IntArray:
+    """Indices of at most `most` out of n, evenly spread."""
+    return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).round().astype(np.int64))[:n]
+
+
+def _draw_track(ax: Axes, recording: Recording, track: Track, mean: FloatArray, sd: FloatArray) -> None:
+    order = np.argsort(track.along_mm, kind="stable")
+    rows, along = track.rows[order], track.along_mm[order]
+    ok = recording.usable[rows]
+    ax.fill_between(along, mean[rows] - 1.96 * sd[rows], mean[rows] + 1.96 * sd[rows], color=GREY, alpha=0.35, lw=0)
+    ax.plot(along[ok], recording.readings[rows][ok], ".", color=VERMILLION, markersize=3.5, label="recorded")
+    ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted, 95 %")
+
+
+def _draw_alone(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray, sd: FloatArray) -> None:
+    at = np.arange(len(rows))
+    ax.errorbar(at, mean[rows], yerr=1.96 * sd[rows], fmt="_", color=BLACK, capsize=4, markersize=12)
+    ok = recording.usable[rows]
+    ax.plot(at[ok], recording.readings[rows][ok], "o", color=VERMILLION, markersize=5)
+    names = [recording.plan.pattern_names[recording.plan.pattern[r]].replace("_", " ") for r in rows]
+    if len(rows) <= 8:
+        ax.set_xticks(at, names, rotation=30, ha="right", fontsize="small")
+    ax.margins(x=0.15)
+
+
+def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
+    """Draw standardised residuals in the order of taking; 95 % should lie between the lines.
+
+    Parameters
+    ----------
+    recording, mean, sd
+        As for `predicted_against_recorded`.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(7.2, 2.8))
+    ok = np.flatnonzero(recording.usable)
+    ax.plot(ok + 1, (recording.readings[ok] - mean[ok]) / sd[ok], ".", color=BLUE, markersize=3)
+    for level in (-1.96, 0.0, 1.96):
+        ax.axhline(level, color=GREY, linewidth=0.8, linestyle="-" if level == 0 else "--")
+    return tidy(ax, x="reading number", y="(recorded − predicted) / sd")
+
+
+def residuals_against(
+    covariate: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    *,
+    label: str,
+    unit: str,
+    span: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw residuals against a covariate, before and after the repair, with their running means.
+
+    Parameters
+    ----------
+    covariate, before, after
+        Shape (n_points,): the covariate, and recorded minus predicted reading by the null and the repaired model.
+    label, unit
+        What the covariate is, with its unit; the unit of a reading.
+    span
+        Where the mismatch was found, shaded.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(7.2, 3.2))
+    if span is not None:
+        ax.axvspan(*span, color=GREY, alpha=0.2, lw=0)
+    for residual, colour, name in ((before, VERMILLION, "model as calibrated"), (after, BLUE, "repaired model")):
+        ok = np.isfinite(residual) & np.isfinite(covariate)
+        ax.plot(covariate[ok], residual[ok], ".", color=colour, markersize=2.5, alpha=0.45)
+        center, average = _running_mean(covariate[ok], residual[ok])
+        ax.plot(center, average, color=colour, linewidth=2.0, label=name)
+    ax.axhline(0, color=BLACK, linewidth=0.7)
+    ax.legend(frameon=False, fontsize="small")
+    return tidy(ax, x=label, y=f"recorded − predicted ({unit} units)")
+
+
+def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means of groups of about one twentieth of the points, neighbours in x."""
+    order = np.argsort(x, kind="stable")
+    groups = np.array_split(order, max(1, min(20, len(x) // 4)))
+    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

@@ -1,0 +1,64 @@
+"""How fast the robot learns: parameter sd and information against the number of readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import FloatArray
+from probewise.report.plots.canvas import BLACK, CYCLE, axes_or_new, tidy
+
+__all__ = ["information_gained", "posterior_widths"]
+
+
+def posterior_widths(
+    widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None
+) -> Axes:
+    """Draw the widest parameter's posterior sd after each reading, and the precision asked for.
+
+    Parameters
+    ----------
+    widths_mm
+        By name of the run: largest posterior sd after each reading, shape (n_readings,).
+    target_mm
+        The stopping rule: 4 mm, half the spacing of LEGO holes (paper, section 3.2).
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(6.4, 3.6))
+    for (name, sd), colour in zip(widths_mm.items(), CYCLE, strict=False):
+        number = np.arange(1, len(sd) + 1)
+        ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {len(sd)} readings")
+    ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
+    ax.annotate(f"{target_mm:g} mm", (1, target_mm), xytext=(2, -11), textcoords="offset points", fontsize="small")
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.legend(frameon=False, fontsize="small")
+    return tidy(ax, x="number of readings", y="widest posterior sd (mm)")
+
+
+def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
+    """Draw bits gained so far after each reading.
+
+    Parameters
+    ----------
+    bits
+        By name of the run: prior minus posterior differential entropy after each reading, shape (n_readings,), in bits.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(6.4, 3.6))
+    for (name, gained), colour in zip(bits.items(), CYCLE, strict=False):
+        per_reading = gained[-1] / len(gained) if len(gained) else 0.0
+        ax.plot(
+            np.arange(len(gained) + 1),
+            np.r_[0.0, gained],
+            marker="o",
+            markersize=3.5,
+            color=colour,
+            label=f"{name}: {per_reading:.2f} bits a reading",
+        )
+    ax.legend(frameon=False, fontsize="small")
+    return tidy(ax, x="number of readings", y="information about the shape (bits)")

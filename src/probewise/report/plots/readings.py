@@ -1,0 +1,117 @@
+"""Readings as they were taken: the paper's figure of four orientations, for any recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.recordings import Plan, Recording
+from probewise.recordings.patterns import HalfPlane
+from probewise.report.plots.canvas import CYCLE, axes_or_new, tidy
+
+__all__ = ["Track", "readings_by_orientation", "tracks"]
+
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+MAX_NAMED = 8  # more tracks than that are drawn without a legend
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Rows of a plan that lie along one line over one pattern: what a curve can be drawn through.
+
+    `along_mm`, shape (n_rows,): signed distance from a half-plane's edge, else the way along
+    the scan from its middle.
+    """
+
+    label: str
+    rows: IntArray
+    along_mm: FloatArray
+    from_edge: bool
+
+
+def tracks(plan: Plan) -> tuple[list[Track], IntArray]:
+    """Split a plan into lines that can be drawn, and the rows that stand alone.
+
+    Returns
+    -------
+    The tracks, one a scan and pattern with at least three places; and the other row numbers.
+    """
+    found: list[Track] = []
+    single: list[IntArray] = []
+    for scan_rows in plan.rows_by_scan():
+        for code in np.unique(plan.pattern[scan_rows]):
+            rows = scan_rows[plan.pattern[scan_rows] == code]
+            pattern = plan.patterns.get(plan.pattern_names[code])
+            along = _along(plan, rows, pattern)
+            if np.unique(np.round(along, 6)).size < 3:
+                single.append(rows)
+                continue
+            found.append(Track(_label(plan, rows), rows, along, isinstance(pattern, HalfPlane)))
+    names = [t.label for t in found]
+    if len(set(names)) < len(names):  # several scans at one orientation: the scan's name tells them apart
+        found = [
+            Track(f"{t.label} ({plan.scan_names[plan.scan[t.rows[0]]]})", t.rows, t.along_mm, t.from_edge)
+            for t in found
+        ]
+    return found, np.concatenate(single) if single else np.empty(0, dtype=np.int64)
+
+
+def _along(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
+    x, y = plan.x_mm[rows], plan.y_mm[rows]
+    if isinstance(pattern, HalfPlane):
+        return np.asarray(x * np.cos(pattern.normal_rad) + y * np.sin(pattern.normal_rad) - pattern.offset_mm)
+    dx, dy = x - x.mean(), y - y.mean()
+    angle = 0.5 * np.arctan2(2 * (dx @ dy), dx @ dx - dy @ dy)  # the line the places scatter along
+    return np.asarray(dx * np.cos(angle) + dy * np.sin(angle))
+
+
+def _label(plan: Plan, rows: IntArray) -> str:
+    degrees = np.unique(np.round(np.degrees(plan.orientation_rad[rows]), 1) % 360)
+    label = f"{degrees[0]:g}°" if degrees.size == 1 else plan.scan_names[plan.scan[rows[0]]]
+    if len(plan.rows_by_pattern()) > 1 and not isinstance(
+        plan.patterns.get(plan.pattern_names[plan.pattern[rows[0]]]), HalfPlane
+    ):
+        label += f" over {plan.pattern_names[plan.pattern[rows[0]]]}"
+    return label
+
+
+def along_label(found: Sequence[Track]) -> str:
+    """Say what the tracks' horizontal axis is."""
+    if all(t.from_edge for t in found):
+        return "distance from the edge, white side positive (mm)"
+    return "place along the scan (mm)"
+
+
+def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> Axes:
+    """Draw readings against distance from the edge, a symbol for each orientation (paper, figure of the data).
+
+    Parameters
+    ----------
+    recording
+        Rows over half-planes are drawn by signed distance from the edge, others by their way along the scan.
+        Rows that stand alone (the quadrants) are drawn by `predicted_against_recorded` only.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax)
+    found, _ = tracks(recording.plan)
+    for k, track in enumerate(found):
+        ok = recording.usable[track.rows]
+        ax.plot(
+            track.along_mm[ok],
+            recording.readings[track.rows][ok],
+            linestyle="none",
+            marker=MARKERS[k % len(MARKERS)],
+            markersize=4 if len(found) <= MAX_NAMED else 2,
+            markerfacecolor="none",
+            markeredgewidth=1.0,
+            color=CYCLE[k % len(CYCLE)],
+            label=track.label,
+        )
+    if 0 < len(found) <= MAX_NAMED:
+        ax.legend(title="orientation", frameon=False, fontsize="small", title_fontsize="small")
+    return tidy(ax, x=along_label(found), y=f"reading ({recording.plan.instrumentation.unit} units)")

@@ -1,0 +1,113 @@
+"""The robot's view of the playing field: entropy map, hypotheses, readings, the next place (the paper's picture)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+from probewise._arrays import FloatArray
+from probewise.report.plots.canvas import BLACK, COPPER, SKY, axes_or_new
+
+__all__ = ["playing_field"]
+
+LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
+NEXT_GREEN = "#00e08a"  # the palette's green, lighter: the next place must stand out on copper
+OUTLINE_BLUE = "#3fa7ff"  # likewise; the paper's hypotheses are blue
+
+
+def playing_field(
+    utility: FloatArray,
+    x_mm: FloatArray,
+    y_mm: FloatArray,
+    *,
+    outlines_mm: Sequence[FloatArray] = (),
+    places_mm: FloatArray | None = None,
+    readings: FloatArray | None = None,
+    levels: tuple[float, float] = (1.0, 100.0),
+    next_mm: tuple[float, float] | None = None,
+    truth_mm: FloatArray | None = None,
+    title: str = "",
+    utility_label: str = "entropy (bits)",
+    utility_max: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the field as the machine learning system sees it (paper, figures of the entropy map).
+
+    Parameters
+    ----------
+    utility
+        Expected information of a reading at each place, shape (n_y, n_x), in bits; NaN where the arm cannot reach.
+    x_mm, y_mm
+        Places of the columns and rows, shapes (n_x,) and (n_y,).
+    outlines_mm
+        Outline of each sampled hypothesis, shape (n_vertices, 2) each.
+    places_mm, readings
+        Where readings were taken, shape (n_readings, 2), and what they were, (n_readings,).
+    levels
+        Reading of black and of white, for the brightness of the squares.
+    next_mm
+        The place chosen next.
+    truth_mm
+        Outline of what really lies there, drawn dashed; left out where nobody knows.
+    title, utility_label
+        Text of the figure and of its colour bar.
+    utility_max
+        Upper end of the colour scale, so that figures can be compared; the map's own maximum without.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(8.2, 5.0))
+    dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
+    ax.set_facecolor("#d9d9d9")  # out of reach
+    top = utility_max if utility_max is not None else max(float(np.nanmax(utility)), 1e-9)
+    image = ax.imshow(
+        np.ma.masked_invalid(utility),
+        origin="lower",
+        extent=(x_mm[0] - dx, x_mm[-1] + dx, y_mm[0] - dy, y_mm[-1] + dy),
+        cmap=COPPER,
+        vmin=0.0,
+        vmax=top,
+        interpolation="nearest",
+    )
+    ax.figure.colorbar(image, ax=ax, label=utility_label, shrink=0.8, pad=0.015)
+    if len(outlines_mm):
+        ax.add_collection(LineCollection(list(outlines_mm), colors=OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
+    if truth_mm is not None:
+        ax.plot(truth_mm[:, 0], truth_mm[:, 1], color="white", linewidth=1.4, linestyle=(0, (5, 3)))
+    if places_mm is not None and readings is not None and len(places_mm):
+        low, high = levels
+        shade = np.clip((np.asarray(readings) - low) / max(high - low, 1e-9), 0, 1)
+        face = np.repeat(shade[:, None], 3, axis=1)
+        edge = [SKY if s < 0.5 else BLACK for s in shade]
+        ax.scatter(
+            places_mm[:, 0], places_mm[:, 1], s=34, marker="s", c=face, edgecolors=edge, linewidths=0.9, zorder=3
+        )
+    if next_mm is not None:
+        ax.scatter(*next_mm, s=52, marker="s", c=NEXT_GREEN, edgecolors=BLACK, linewidths=1.0, zorder=4)
+    ax.set_xlim(x_mm[0] - dx, x_mm[-1] + dx)
+    ax.set_ylim(y_mm[0] - dy, y_mm[-1] + dy)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x (mm)")
+    ax.set_ylabel("y (mm)")
+    _add_lego_scale(ax)
+    if title:
+        ax.set_title(title, fontsize="medium", loc="left")
+    return ax
+
+
+def _add_lego_scale(ax: Axes) -> None:
+    """Add the paper's coordinates, LEGO distance units, on top."""
+    lego = ax.secondary_xaxis("top", functions=(_to_lego, _from_lego))
+    lego.set_xlabel("LEGO distance units (8 mm)", fontsize="small")
+    lego.tick_params(labelsize="small")
+
+
+def _to_lego(mm: FloatArray) -> FloatArray:
+    return np.asarray(mm) / LEGO_UNIT_MM
+
+
+def _from_lego(units: FloatArray) -> FloatArray:
+    return np.asarray(units) * LEGO_UNIT_MM

@@ -1,0 +1,88 @@
+"""The spatial sensitivity function seen from above, and the evidence for each number of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import FloatArray
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_new, grid_of_axes, tidy
+from probewise.sensor import SSFField
+
+__all__ = ["log_evidences", "spatial_sensitivity", "ssf_by_order"]
+
+
+def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str = "") -> Axes:
+    """Draw an SSF in the sensor frame: shade, and the lines at 1/2 and 1/10 of its peak.
+
+    The cross marks the mechanical origin of the sensor package.
+    """
+    ax = axes_or_new(ax, size_in=(4.2, 4.0))
+    values = np.asarray(field.values)
+    x, y = field.u_mm, field.v_mm
+    half = field.pixel_mm / 2
+    ax.imshow(
+        values,
+        origin="lower",
+        extent=(x[0] - half, x[-1] + half, y[0] - half, y[-1] + half),
+        cmap="cividis",
+        interpolation="nearest",
+    )
+    peak = float(values.max())
+    ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
+    ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
+    reach = _reach(values, x, y)
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(-reach, reach)
+    ax.set_aspect("equal")
+    ax.spines[["top", "right"]].set_visible(True)
+    return tidy(ax, x="x' (mm)", y="y' (mm)", title=title)
+
+
+def _reach(values: FloatArray, x: FloatArray, y: FloatArray) -> float:
+    """Half width of a square about the origin that holds all that matters, in whole 5 mm."""
+    matters = values > 0.01 * values.max()
+    far = max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max())
+    return float(5 * np.ceil(1.1 * far / 5))
+
+
+def ssf_by_order(
+    fields: Mapping[int, SSFField], log_z: Mapping[int, float], log_z_error: Mapping[int, float]
+) -> AxesGrid:
+    """Draw the mean SSF of each number of Gaussians with its log-evidence (paper, figure of the four MoG models).
+
+    Parameters
+    ----------
+    fields, log_z, log_z_error
+        By number of Gaussians: mean field, natural log of the evidence and its standard error.
+    """
+    orders = sorted(fields)
+    n_columns = 2 if len(orders) in (2, 4) else len(orders)
+    n_rows = -(-len(orders) // n_columns)
+    axes = grid_of_axes(n_rows, n_columns, size_in=(3.7 * n_columns, 3.7 * n_rows))
+    best = max(orders, key=lambda n: log_z[n])
+    for ax, n in zip(axes.flat, orders, strict=False):
+        name = "1 Gaussian" if n == 1 else f"{n} Gaussians"
+        mark = ", most probable" if n == best and len(orders) > 1 else ""
+        spatial_sensitivity(fields[n], ax=ax, title=f"{name}{mark}\nln Z = {log_z[n]:.1f} ± {log_z_error[n]:.1f}")
+    widest = max(ax.get_xlim()[1] for ax in list(axes.flat)[: len(orders)])
+    for ax in list(axes.flat)[: len(orders)]:
+        ax.set_xlim(-widest, widest)
+        ax.set_ylim(-widest, widest)
+    return axes
+
+
+def log_evidences(
+    orders: Sequence[int], log_z: Sequence[float], log_z_error: Sequence[float], *, ax: Axes | None = None
+) -> Axes:
+    """Draw log-evidence below the best model's, with its error, for each number of Gaussians."""
+    ax = axes_or_new(ax, size_in=(4.6, 3.4))
+    below = np.asarray(log_z) - np.max(log_z)
+    colours = [BLUE if b == 0 else GREY for b in below]
+    ax.bar(np.arange(len(orders)), below, color=colours, width=0.6)
+    ax.errorbar(np.arange(len(orders)), below, yerr=log_z_error, linestyle="none", color=BLACK, capsize=4)
+    ax.axhline(0, color=BLACK, linewidth=0.8)
+    ax.set_xticks(np.arange(len(orders)), [str(n) for n in orders])
+    return tidy(ax, x="number of Gaussians", y="ln Z below the best")

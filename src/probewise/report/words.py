@@ -1,0 +1,29 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["count", "number", "probability", "signed"]
+
+
+def number(value: float, digits: int) -> str:
+    """Write with a fixed number of decimals and a true minus sign; a dash where there is no number."""
+    return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
+
+
+def signed(value: float, digits: int) -> str:
+    """Write a coordinate; what rounds to zero has no sign."""
+    return number(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
+
+
+def count(n: int, noun: str) -> str:
+    """Write a count with its noun, plural where it must be."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def probability(p: float) -> str:
+    """Write a probability; near 0 and 1 say so rather than round to them."""
+    if p < 0.001:
+        return "< 0.001"
+    return "> 0.999" if p > 0.999 else f"{p:.3f}"

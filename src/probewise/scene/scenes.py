@@ -1,0 +1,80 @@
+"""Scenes: what lies under the sensor, known from a recording or hypothesised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.priors import Empty, Prior
+from probewise.recordings.patterns import Pattern
+from probewise.scene.albedo import Region, Shape
+from probewise.scene.patterns import region_of
+
+__all__ = ["HypothesisScene", "KnownScene"]
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """Patterns that are known, by name: no free parameters."""
+
+    patterns: Mapping[str, Pattern]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """No free parameters."""
+        return ()
+
+    @property
+    def prior(self) -> Prior:
+        """The prior of no parameters."""
+        return Empty()
+
+    def regions(self, theta: FloatArray) -> Mapping[str, Region]:
+        """Region by pattern name; theta (n_samples, 0) plays no part."""
+        return self._built
+
+    @cached_property
+    def _built(self) -> Mapping[str, Region]:
+        return {name: region_of(pattern) for name, pattern in self.patterns.items()}
+
+
+@dataclass(frozen=True)
+class HypothesisScene:
+    """One shape of unknown parameters under every reading, whatever its pattern's name."""
+
+    shape: Shape
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The shape's parameters."""
+        return self.shape.prior.names
+
+    @property
+    def prior(self) -> Prior:
+        """The shape's prior."""
+        return self.shape.prior
+
+    def regions(self, theta: FloatArray) -> Mapping[str, Region]:
+        """Give the shape's region, theta (n_samples, n_params), under any pattern name."""
+        return _SameForAll(self.shape.region(theta))
+
+
+@dataclass(frozen=True, eq=False)
+class _SameForAll(Mapping[str, Region]):
+    """A mapping that answers every name with one region; it lists the name "hypothesis"."""
+
+    region: Region
+
+    def __getitem__(self, name: str) -> Region:
+        if not isinstance(name, str):
+            raise ParameterError("pattern name", name, "a text")
+        return self.region
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("hypothesis",))
+
+    def __len__(self) -> int:
+        return 1

@@ -1,0 +1,360 @@
+"""Shapes that may lie on the field: each a prior over named parameters and the region they make.
+
+A new shape is one short class: a frozen dataclass with `prior` and `region`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError, ShapeError
+from probewise.priors import Prior, Product, Uniform
+from probewise.scene.albedo import Region, Shape
+from probewise.scene.regions import EllipseRegion, MixtureOfRegions, PolygonRegion, UniformRegion, disc_region
+
+__all__ = ["AnyOf", "Circle", "Ellipse", "Field", "Placed", "Rectangle", "RegularPolygon"]
+
+Bounds = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Field:
+    """The playing field, mm: from (0, 0) to (width, height)."""
+
+    width_mm: float = 1048.0
+    height_mm: float = 520.0
+
+    def __post_init__(self) -> None:
+        for name in ("width_mm", "height_mm"):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise ParameterError(name, value, "greater than 0, finite")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Prior of a shape somewhere on a field: x_mm, y_mm, then the shape's own parameters.
+
+    The own parameters follow `own`; the centre is spread evenly over the field or, given
+    `extent` (own parameters (n_samples, n_own) -> half width and half height (n_samples, 2)),
+    over those centres that leave the whole shape inside the field.
+    """
+
+    field: Field
+    own: Prior
+    extent: Callable[[FloatArray], FloatArray] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x_mm, y_mm and the shape's own."""
+        return ("x_mm", "y_mm", *self.own.names)
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map the unit cube to parameters, both (n_samples, n_params)."""
+        if u.ndim != 2 or u.shape[1] != len(self.names):
+            raise ShapeError(f"parameters have shape {u.shape}; allowed: (n_samples, {len(self.names)})")
+        own = self.own.from_unit_cube(u[:, 2:])
+        low, high = self._room(own)
+        return np.concatenate([low + (high - low) * u[:, :2], own], axis=1)
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Natural log of the density, (n_samples,); -inf outside the support."""
+        own = self.own.log_prob(theta[:, 2:])
+        low, high = self._room(theta[:, 2:])
+        inside = ((theta[:, :2] >= low) & (theta[:, :2] <= high)).all(axis=1)
+        room = np.where(inside, np.prod(np.maximum(high - low, 1e-300), axis=1), 1.0)
+        return np.where(inside & np.isfinite(own), own - np.log(room), -np.inf)
+
+    def _room(self, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+        size = np.array([self.field.width_mm, self.field.height_mm])
+        margin = np.zeros((len(own), 2)) if self.extent is None else self.extent(own)
+        return margin, size - margin
+
+
+def _require_bounds(name: str, bounds: Bounds) -> None:
+    low, high = bounds
+    if not 0 < low < high < math.inf:
+        raise ParameterError(name, bounds, "0 < low < high, finite")
+
+
+def _require_room(shape: str, reach_mm: float, field: Field) -> None:
+    if 2 * reach_mm >= min(field.width_mm, field.height_mm):
+        raise ParameterError(
+            f"{shape}(inside=True)",
+            f"up to {2 * reach_mm:g} mm wide",
+            f"less than the field's {field.width_mm:g} x {field.height_mm:g} mm (or inside=False)",
+        )
+
+
+def _round_extent(own: FloatArray) -> FloatArray:
+    return np.repeat(own[:, :1], 2, axis=1)
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A disc of unknown place and radius (paper, eq. 1): x_mm, y_mm, radius_mm.
+
+    `inside=True` keeps the whole circle on the field.
+    """
+
+    field: Field = Field()
+    radius_mm: Bounds = (20.0, 150.0)
+    inside: bool = False
+
+    def __post_init__(self) -> None:
+        _require_bounds("radius_mm", self.radius_mm)
+        if self.inside:
+            _require_room("Circle", self.radius_mm[1], self.field)
+
+    @cached_property
+    def prior(self) -> Placed:
+        """Even over centre and radius."""
+        return Placed(
+            self.field, Product({"radius_mm": Uniform(*self.radius_mm)}), _round_extent if self.inside else None
+        )
+
+    def region(self, theta: FloatArray) -> EllipseRegion:
+        """Build a disc for each hypothesis, theta (n_samples, 3)."""
+        return disc_region(theta[:, :2], theta[:, 2])
+
+
+@dataclass(frozen=True)
+class _EllipseOwn:
+    """Semi-major axis even, semi-minor even below it, angle even over half a turn."""
+
+    bounds_mm: Bounds
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("semi_major_mm", "semi_minor_mm", "angle_rad")
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        low, high = self.bounds_mm
+        major = low + (high - low) * u[:, 0]
+        return np.stack([major, low + (major - low) * u[:, 1], np.pi * u[:, 2]], axis=1)
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        low, high = self.bounds_mm
+        major, minor, angle = theta.T
+        inside = (low < major) & (major <= high) & (low <= minor) & (minor <= major) & (angle >= 0) & (angle <= np.pi)
+        room = np.where(inside, (high - low) * np.pi * (major - low), 1.0)
+        return np.where(inside, -np.log(room), -np.inf)
+
+
+def _ellipse_extent(own: FloatArray) -> FloatArray:
+    major, minor, angle = own.T
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.stack([np.hypot(major * cosine, minor * sine), np.hypot(major * sine, minor * cosine)], axis=1)
+
+
+@dataclass(frozen=True)
+class Ellipse:
+    """An ellipse: x_mm, y_mm, semi_major_mm, semi_minor_mm, angle_rad of the major axis, 0 to pi."""
+
+    field: Field = Field()
+    semi_axes_mm: Bounds = (20.0, 150.0)
+    inside: bool = False
+
+    def __post_init__(self) -> None:
+        _require_bounds("semi_axes_mm", self.semi_axes_mm)
+        if self.inside:
+            _require_room("Ellipse", self.semi_axes_mm[1], self.field)
+
+    @cached_property
+    def prior(self) -> Placed:
+        """Even over centre, major axis and angle; the minor axis even below the major."""
+        return Placed(self.field, _EllipseOwn(self.semi_axes_mm), _ellipse_extent if self.inside else None)
+
+    def region(self, theta: FloatArray) -> EllipseRegion:
+        """Build an ellipse for each hypothesis, theta (n_samples, 5)."""
+        return EllipseRegion(theta[:, :2], theta[:, 2:4], theta[:, 4])
+
+
+def _rectangle_extent(own: FloatArray) -> FloatArray:
+    width, height, angle = own.T
+    cosine, sine = np.abs(np.cos(angle)), np.abs(np.sin(angle))
+    return 0.5 * np.stack([width * cosine + height * sine, width * sine + height * cosine], axis=1)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle: x_mm, y_mm of its centre, width_mm, height_mm, angle_rad of its width, 0 to pi/2.
+
+    Width and height may each be the longer; a quarter of a turn then names every rectangle once.
+    """
+
+    field: Field = Field()
+    sides_mm: Bounds = (40.0, 300.0)
+    inside: bool = False
+
+    def __post_init__(self) -> None:
+        _require_bounds("sides_mm", self.sides_mm)
+        if self.inside:
+            _require_room("Rectangle", self.sides_mm[1] / math.sqrt(2), self.field)
+
+    @cached_property
+    def prior(self) -> Placed:
+        """Even over all five parameters."""
+        side = Uniform(*self.sides_mm)
+        own = Product({"width_mm": side, "height_mm": side, "angle_rad": Uniform(0.0, np.pi / 2)})
+        return Placed(self.field, own, _rectangle_extent if self.inside else None)
+
+    def region(self, theta: FloatArray) -> PolygonRegion:
+        """Build a rectangle for each hypothesis, theta (n_samples, 5)."""
+        corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+        return _turned_polygon(theta[:, :2], corners * theta[:, None, 2:4], theta[:, 4])
+
+
+@dataclass(frozen=True)
+class RegularPolygon:
+    """A regular polygon of `n_sides`: x_mm, y_mm, radius_mm of its corners, angle_rad of the first."""
+
+    n_sides: int
+    field: Field = Field()
+    radius_mm: Bounds = (30.0, 150.0)
+    inside: bool = False
+
+    def __post_init__(self) -> None:
+        if self.n_sides < 3:
+            raise ParameterError("n_sides", self.n_sides, "3 or more")
+        _require_bounds("radius_mm", self.radius_mm)
+        if self.inside:
+            _require_room("RegularPolygon", self.radius_mm[1], self.field)
+
+    @cached_property
+    def prior(self) -> Placed:
+        """Even over centre, radius, and angle up to the polygon's symmetry."""
+        own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
+        return Placed(self.field, own, self._extent if self.inside else None)
+
+    def region(self, theta: FloatArray) -> PolygonRegion:
+        """Build a polygon for each hypothesis, theta (n_samples, 4)."""
+        corners = self._corners() * theta[:, None, 2:3]
+        return _turned_polygon(theta[:, :2], corners, theta[:, 3])
+
+    def _corners(self) -> FloatArray:
+        t = 2 * np.pi * np.arange(self.n_sides) / self.n_sides
+        return np.stack([np.cos(t), np.sin(t)], axis=-1)
+
+    def _extent(self, own: FloatArray) -> FloatArray:
+        # The circle round it: a polygon needs a little less on some sides, and the centre stays
+        # the middle of the room that is left.
+        return _round_extent(own)
+
+
+def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: FloatArray) -> PolygonRegion:
+    """Polygons with corners (n_samples, n_vertices, 2), anticlockwise about the centre."""
+    cosine, sine = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
+    x = center_mm[:, :1] + cosine * corners_mm[..., 0] - sine * corners_mm[..., 1]
+    y = center_mm[:, 1:] + sine * corners_mm[..., 0] + cosine * corners_mm[..., 1]
+    return PolygonRegion.simple(np.stack([x, y], axis=-1))
+
+
+@dataclass(frozen=True)
+class _AnyOfPrior:
+    """Product space: which shape, the shared centre, then the own parameters of every shape.
+
+    The parameters of the shapes that are not taken follow their own priors, so evidences and
+    the share of each shape stay right.
+    """
+
+    shapes: Mapping[str, Shape]
+    weights: tuple[float, ...]
+    shared: tuple[str, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        own = (f"{key}.{n}" for key, shape in self.shapes.items() for n in shape.prior.names if n not in self.shared)
+        return ("shape", *self.shared, *own)
+
+    @cached_property
+    def columns(self) -> list[IntArray]:
+        """Columns of theta that hold the parameters of each shape, in the shape's order."""
+        return [
+            np.array([self.names.index(n if n in self.shared else f"{key}.{n}") for n in shape.prior.names], dtype=int)
+            for key, shape in self.shapes.items()
+        ]
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        if u.ndim != 2 or u.shape[1] != len(self.names):
+            raise ShapeError(f"parameters have shape {u.shape}; allowed: (n_samples, {len(self.names)})")
+        ends = np.concatenate([[0.0], np.cumsum(self.weights)])
+        theta = np.empty_like(u)
+        theta[:, 0] = np.interp(u[:, 0], ends, np.arange(len(ends)))
+        which = self.which(theta)
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
+            values = shape.prior.from_unit_cube(u[:, columns])
+            # Every shape fills its own columns; the shared ones are filled by the shape that is taken.
+            own = columns > len(self.shared)
+            theta[:, columns[own]] = values[:, own]
+            taken = which == k
+            theta[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
+        return theta
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        which = self.which(theta)
+        inside = (theta[:, 0] >= 0) & (theta[:, 0] <= len(self.shapes))
+        total = np.where(inside, np.log(np.asarray(self.weights))[which], -np.inf)
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
+            values = theta[:, columns]
+            taken = shape.prior.log_prob(values)
+            idle = shape.prior.own.log_prob(values[:, 2:]) if isinstance(shape.prior, Placed) and self.shared else taken
+            total = total + np.where(which == k, taken, idle)
+        return total
+
+    def which(self, theta: FloatArray) -> IntArray:
+        """Index of the shape that each hypothesis takes, (n_samples,)."""
+        return np.clip(np.floor(theta[:, 0]), 0, len(self.shapes) - 1).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class AnyOf:
+    """One of several shapes, which and where unknown (the paper's "set of shapes").
+
+    Parameters: `shape`, whose floor is the index of the shape (continuous, so that a sampler
+    moves through it like any other: even over [k, k + 1) for shape k, with probability
+    `weights[k]`); x_mm, y_mm of the centre, shared where every shape has a `Placed` prior; then
+    each shape's own as "rectangle.width_mm".
+    """
+
+    shapes: Mapping[str, Shape]
+    weights: tuple[float, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if not self.shapes:
+            raise ParameterError("shapes", dict(self.shapes), "one shape or more, by name")
+        weights = self.weights or (1.0,) * len(self.shapes)
+        if len(weights) != len(self.shapes) or not all(0 < w < math.inf for w in weights):
+            raise ParameterError("weights", self.weights, f"{len(self.shapes)} numbers greater than 0")
+        object.__setattr__(self, "weights", tuple(w / sum(weights) for w in weights))
+
+    @cached_property
+    def prior(self) -> _AnyOfPrior:
+        """Product of which, where, and the parameters of every shape."""
+        placed = all(isinstance(shape.prior, Placed) for shape in self.shapes.values())
+        return _AnyOfPrior(self.shapes, self.weights, ("x_mm", "y_mm") if placed else ())
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the shapes, by index."""
+        return tuple(self.shapes)
+
+    def which(self, theta: FloatArray) -> IntArray:
+        """Index of the shape of each hypothesis, (n_samples,)."""
+        return self.prior.which(theta)
+
+    def region(self, theta: FloatArray) -> MixtureOfRegions:
+        """Build for each hypothesis the region of the shape it takes."""
+        which = self.which(theta)
+        parts: list[Region] = []
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns, strict=True)):
+            rows = np.flatnonzero(which == k)
+            # A shape that no hypothesis takes has no region; an empty field stands in its place.
+            parts.append(shape.region(theta[np.ix_(rows, columns)]) if rows.size else UniformRegion(np.zeros(1)))
+        return MixtureOfRegions(which, tuple(parts))

@@ -1,0 +1,70 @@
+"""The paper's sum over a discrete SSF matrix (paper, eq. discrete R), for any field and any region.
+
+The second of the two independent routes to the response; it shares nothing with the closed
+forms of `probewise.sensor.gaussian` but the region's geometry. The albedo of a pixel is its
+covered share, so the error falls as the pixel squared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ShapeError
+from probewise.scene.albedo import Region
+from probewise.sensor.ssf import SSFField
+from probewise.sensor.stages import Poses
+
+__all__ = ["seen_discrete"]
+
+_PIXELS_AT_ONCE = 2**16
+
+
+def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
+    """Sum the SSF field over the covered share of every pixel.
+
+    Parameters
+    ----------
+    region
+        Albedo field of each hypothesis (n_regions of them, n_samples or 1).
+    field
+        The discrete SSF in the sensor frame; its pixels turn with the sensor.
+    poses
+        Where the sensor stands; arrays broadcast to (n_samples, n_points).
+
+    Returns
+    -------
+    Response R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
+
+    Raises
+    ------
+    ShapeError
+        If poses and region hold different numbers of hypotheses, neither of them 1.
+    """
+    x, y, turn = np.broadcast_arrays(poses.x_mm, poses.y_mm, poses.orientation_rad)
+    n_poses, n_points = x.shape
+    if n_poses not in (1, region.n_regions) and region.n_regions != 1:
+        raise ShapeError(f"poses of {n_poses} hypotheses over {region.n_regions} regions; allowed: as many, or 1")
+    if n_poses > 1:
+        # Poses of its own for each hypothesis: every (hypothesis, reading) pair is a place of its own.
+        out = np.empty((n_poses, n_points))
+        for i in range(n_poses):
+            one = Poses(x[i : i + 1], y[i : i + 1], turn[i : i + 1])
+            found = seen_discrete(region, field, one)
+            out[i] = found[i if len(found) > 1 else 0]
+        return out
+    values = field.values.ravel()
+    kept = np.abs(values) > 1e-12 * np.abs(values).max()
+    offsets, weights = field.centers_mm[kept], values[kept]
+    out = np.empty((region.n_regions, n_points))
+    block = max(1, _PIXELS_AT_ONCE // (len(weights) * region.n_regions))
+    for start in range(0, n_points, block):
+        rows = slice(start, start + block)
+        cosine, sine = np.cos(turn[0, rows])[:, None], np.sin(turn[0, rows])[:, None]
+        lab_x = x[0, rows, None] + cosine * offsets[:, 0] - sine * offsets[:, 1]
+        lab_y = y[0, rows, None] + sine * offsets[:, 0] + cosine * offsets[:, 1]
+        centers = np.stack([lab_x.ravel(), lab_y.ravel()], axis=-1)
+        turns = np.repeat(turn[0, rows], len(weights))
+        covered = region.coverage(centers, field.pixel_mm, turns)
+        out[:, rows] = covered.reshape(len(covered), -1, len(weights)) @ weights
+    return out

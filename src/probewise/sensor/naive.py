@@ -1,0 +1,43 @@
+"""The paper's naive sensor: white or black by the point under its centre (paper, "The Naive Likelihood")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.recordings.plan import Plan
+from probewise.scene.albedo import Scene
+from probewise.sensor.chain import Levels
+from probewise.sensor.stages import require_columns
+
+__all__ = ["NaiveSensor"]
+
+
+@dataclass(frozen=True)
+class NaiveSensor:
+    """Predict the bright level where the point under the sensor is white, the dark one elsewhere.
+
+    White is an albedo of 0.5 or more. Columns of theta: the levels', then the scene's.
+    """
+
+    levels: Levels
+    scene: Scene
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return (*self.levels.names, *self.scene.names)
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        require_columns(theta, self.names)
+        n_levels = len(self.levels.names)
+        i_min, i_max = self.levels.values(theta[:, :n_levels])
+        regions = self.scene.regions(theta[:, n_levels:])
+        out = np.empty((len(theta), len(plan)))
+        points = np.stack([plan.x_mm, plan.y_mm], axis=-1)
+        for name, rows in plan.rows_by_pattern():
+            out[:, rows] = np.where(regions[name].albedo(points[rows]) >= 0.5, i_max, i_min)
+        return out

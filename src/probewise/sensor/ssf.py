@@ -1,0 +1,368 @@
+"""The spatial sensitivity function (SSF): mixtures of Gaussians and discrete fields (paper, eq. Ssf)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen, require_finite
+from probewise.errors import ParameterError, ShapeError
+from probewise.sensor.stages import Footprint
+
+__all__ = [
+    "FieldSSF",
+    "FixedMixture",
+    "FreeMixture",
+    "SSFField",
+    "SSFModel",
+    "field_of",
+    "footprint_of",
+    "mean_mixture",
+    "mixture_names",
+    "mixture_of_field",
+    "total_variation",
+]
+
+
+def mixture_names(n_gaussians: int) -> tuple[str, ...]:
+    """Name the paper's parameters in order: a_1, u_1, v_1, A_1, B_1, C_1, a_2, ..."""
+    if n_gaussians < 1:
+        raise ParameterError("n_gaussians", n_gaussians, "1 or more")
+    return tuple(f"{letter}_{n}" for n in range(1, n_gaussians + 1) for letter in "auvABC")
+
+
+def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
+    """Turn the paper's parameters into weights, means and covariances (paper, eq. Ssf).
+
+    The exponent A x^2 + B y^2 + 2 C x y belongs to the covariance 1/2 inv([[A, C], [C, B]]);
+    its mass is a pi / sqrt(AB - C^2).
+
+    Parameters
+    ----------
+    theta
+        Columns a_n, u_n, v_n (mm), A_n, B_n, C_n (1/mm^2), shape (n_samples, 6 n_gaussians).
+
+    Returns
+    -------
+    Footprint with arrays (n_samples, 1, n_gaussians).
+
+    Raises
+    ------
+    ParameterError
+        If AB - C^2 is not positive, or no Gaussian has a positive amplitude.
+    """
+    if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:
+        raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (n_samples, {6 * n_gaussians})")
+    a, u, v, aa, bb, cc = np.moveaxis(theta.reshape(len(theta), 1, n_gaussians, 6), -1, 0)
+    determinant = aa * bb - cc * cc
+    if not ((determinant > 0) & (aa > 0)).all():
+        raise ParameterError("A B - C^2", float(determinant.min()), "greater than 0, with A > 0 and B > 0")
+    mass = a / np.sqrt(determinant)
+    total = mass.sum(axis=-1, keepdims=True)
+    if not (total > 0).all() or not (a >= 0).all():
+        raise ParameterError("a", float(a.min()), "0 or more, one of them greater")
+    half = 0.5 / determinant
+    return Footprint(mass / total, u, v, half * bb, half * aa, -half * cc)
+
+
+class SSFModel(Protocol):
+    """An SSF as the chain takes it: named parameters and the footprint they make."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        ...
+
+    def footprint(self, theta: FloatArray) -> Footprint:
+        """Mixture of Gaussians in the sensor frame, theta (n_samples, n_params)."""
+        ...
+
+
+@dataclass(frozen=True)
+class FreeMixture:
+    """A mixture of `n_gaussians` whose parameters are to be estimated."""
+
+    n_gaussians: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The paper's a_1 to C_N."""
+        return mixture_names(self.n_gaussians)
+
+    def footprint(self, theta: FloatArray) -> Footprint:
+        """Mixture of each hypothesis, theta (n_samples, 6 n_gaussians)."""
+        return footprint_of(theta, self.n_gaussians)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedMixture:
+    """A mixture that is known: weights (n,), means (n, 2) mm, covariances (n, 2, 2) mm^2, sensor frame."""
+
+    weights: FloatArray
+    means_mm: FloatArray
+    covs_mm2: FloatArray
+
+    def __post_init__(self) -> None:
+        n = np.size(self.weights)
+        for name, shape in (("weights", (n,)), ("means_mm", (n, 2)), ("covs_mm2", (n, 2, 2))):
+            values = frozen(getattr(self, name))
+            if values.shape != shape or n == 0:
+                raise ShapeError(f"{name} has shape {values.shape}; allowed: {shape}, one Gaussian or more")
+            require_finite(name, values)
+            object.__setattr__(self, name, values)
+        if (self.weights < 0).any() or not self.weights.sum() > 0:
+            raise ParameterError("weights", self.weights.tolist(), "0 or more, one of them greater")
+        object.__setattr__(self, "weights", frozen(self.weights / self.weights.sum()))
+        if not (np.linalg.eigvalsh(self.covs_mm2) > 0).all():
+            raise ParameterError("covs_mm2", self.covs_mm2.tolist(), "positive definite matrices")
+
+    @classmethod
+    def from_parameters(cls, theta: FloatArray) -> FixedMixture:
+        """Take one row of the paper's parameters a_1 to C_N, shape (6 n_gaussians,)."""
+        theta = np.asarray(theta, dtype=np.float64)
+        if theta.ndim != 1 or theta.size == 0 or theta.size % 6:
+            raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (6 n_gaussians,)")
+        foot = footprint_of(theta[None], theta.size // 6)
+        means = np.stack([foot.u_mm[0, 0], foot.v_mm[0, 0]], axis=-1)
+        rows = np.stack([foot.var_u, foot.cov_uv, foot.cov_uv, foot.var_v], axis=-1)[0, 0]
+        return cls(foot.weight[0, 0], means, rows.reshape(-1, 2, 2))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """No free parameters."""
+        return ()
+
+    @property
+    def mean_mm(self) -> FloatArray:
+        """Mean of the whole mixture, (2,)."""
+        return np.asarray(self.weights @ self.means_mm)
+
+    @property
+    def cov_mm2(self) -> FloatArray:
+        """Covariance of the whole mixture by the law of total covariance, (2, 2)."""
+        off = self.means_mm - self.mean_mm
+        return np.asarray(np.einsum("n,nij->ij", self.weights, self.covs_mm2 + off[:, :, None] * off[:, None, :]))
+
+    def footprint(self, theta: FloatArray) -> Footprint:
+        """Give the mixture, arrays (1, 1, n_gaussians); theta (n_samples, 0) plays no part."""
+        return self._footprint
+
+    @cached_property
+    def _footprint(self) -> Footprint:
+        covs = self.covs_mm2[None, None]
+        means = self.means_mm[None, None]
+        return Footprint(
+            self.weights[None, None], means[..., 0], means[..., 1], covs[..., 0, 0], covs[..., 1, 1], covs[..., 0, 1]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SSFField:
+    """An SSF on square pixels: any SSF field (paper, the discrete SSF matrix).
+
+    `values` (n_y, n_x) are the share of each pixel, normalised to sum one on construction (not
+    necessarily positive); row 0 is the lowest v', column 0 the lowest u'. `origin_mm` is the
+    centre (u', v') of pixel [0, 0] in the sensor frame.
+    """
+
+    values: FloatArray
+    pixel_mm: float
+    origin_mm: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values, dtype=np.float64)
+        if values.ndim != 2 or values.size == 0:
+            raise ShapeError(f"SSF field has shape {values.shape}; allowed: (n_y, n_x), not empty")
+        require_finite("SSF field", values)
+        if not 0 < self.pixel_mm < math.inf:
+            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
+        if not values.sum() > 0:
+            raise ParameterError("sum of the SSF field", float(values.sum()), "greater than 0")
+        object.__setattr__(self, "values", frozen(values / values.sum()))
+
+    @property
+    def u_mm(self) -> FloatArray:
+        """Pixel centres along u', (n_x,)."""
+        return np.array(self.origin_mm[0] + self.pixel_mm * np.arange(self.values.shape[1]), dtype=np.float64)
+
+    @property
+    def v_mm(self) -> FloatArray:
+        """Pixel centres along v', (n_y,)."""
+        return np.array(self.origin_mm[1] + self.pixel_mm * np.arange(self.values.shape[0]), dtype=np.float64)
+
+    @cached_property
+    def centers_mm(self) -> FloatArray:
+        """Pixel centres in the order of values.ravel(), (n_pixels, 2)."""
+        u, v = np.meshgrid(self.u_mm, self.v_mm)
+        return np.stack([u.ravel(), v.ravel()], axis=-1)
+
+    @cached_property
+    def mean_mm(self) -> FloatArray:
+        """Mean position, (2,)."""
+        return np.asarray(self.values.ravel() @ self.centers_mm)
+
+    @cached_property
+    def cov_mm2(self) -> FloatArray:
+        """Covariance of the positions of pixel centres, (2, 2)."""
+        off = self.centers_mm - self.mean_mm
+        return np.asarray((self.values.ravel()[:, None] * off).T @ off)
+
+
+@dataclass(frozen=True)
+class FieldSSF:
+    """A discrete SSF field as the chain's SSF: responses are the paper's sum over its pixels."""
+
+    field: SSFField
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """No free parameters."""
+        return ()
+
+    def footprint(self, theta: FloatArray) -> Footprint:
+        """Give the single Gaussian with the field's mean and covariance."""
+        return mixture_of_field(self.field).footprint(theta)
+
+
+def field_of(
+    footprint: Footprint, *, u_mm: FloatArray, v_mm: FloatArray, weights: FloatArray | None = None
+) -> SSFField:
+    """Sample an SSF at pixel centres; average the fields over the samples (of fields, not of parameters).
+
+    Parameters
+    ----------
+    footprint
+        Mixtures with arrays (n_samples, 1, n_gaussians).
+    u_mm, v_mm
+        Evenly spaced pixel centres with one spacing for both axes, (n_x,) and (n_y,).
+    weights
+        Weight of each sample in the mean, (n_samples,); equal when None.
+
+    Returns
+    -------
+    The mean field (paper, "logWt-weighted average of the sampled SSF fields").
+    """
+    if len(u_mm) < 2 or len(v_mm) < 2:
+        raise ShapeError("u_mm and v_mm need two pixels or more each")
+    pixel = float(u_mm[1] - u_mm[0])
+    if not (np.allclose(np.diff(u_mm), pixel) and np.allclose(np.diff(v_mm), pixel) and pixel > 0):
+        raise ParameterError(
+            "u_mm, v_mm", (u_mm[:2].tolist(), v_mm[:2].tolist()), "evenly spaced, one spacing for both"
+        )
+    n_samples = max(a.shape[0] for a in (footprint.weight, footprint.u_mm, footprint.var_u))
+    shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
+    arrays = np.broadcast_arrays(
+        footprint.weight, footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv
+    )
+    w, mu, mv, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
+    w = w * np.repeat(shares, arrays[0].shape[2])
+    total = np.zeros((len(v_mm), len(u_mm)))
+    for n in np.flatnonzero(w > 0):
+        # v given u, so that each Gaussian costs one exponential over the grid.
+        slope = cov[n] / var_u[n]
+        var_free = var_v[n] - slope * cov[n]
+        off_u = u_mm - mu[n]
+        across = v_mm[:, None] - mv[n] - slope * off_u
+        height = w[n] / (2 * np.pi * np.sqrt(var_u[n] * var_free))
+        total += height * np.exp(-0.5 * (off_u**2 / var_u[n] + across**2 / var_free))
+    return SSFField(total, pixel, (float(u_mm[0]), float(v_mm[0])))
+
+
+def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1) -> FixedMixture:
+    """Summarise sampled mixtures, arrays (n_samples, 1, n), by one of `n_gaussians`.
+
+    The mean over samples of mixtures is a large mixture; its components are merged by the law
+    of total covariance, so mean and covariance of the mean field are kept exactly.
+    """
+    arrays = np.broadcast_arrays(
+        footprint.weight, footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv
+    )
+    n_samples, _, n = arrays[0].shape
+    shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
+    w, u, v, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
+    covs = np.stack([var_u, cov, cov, var_v], axis=-1).reshape(-1, 2, 2)
+    return _merged(w * np.repeat(shares, n), np.stack([u, v], axis=-1), covs, n_gaussians)
+
+
+def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
+    """Match a field by a mixture, so that closed forms can stand in for the sum over its pixels.
+
+    Mean and covariance are the field's. How far the two differ says `total_variation`: no
+    response differs by more.
+    """
+    values = np.maximum(field.values.ravel(), 0.0)
+    kept = values > 1e-9 * values.max()
+    covs = np.zeros((int(kept.sum()), 2, 2))
+    return _merged(values[kept], field.centers_mm[kept], covs, n_gaussians)
+
+
+def total_variation(mixture: FixedMixture, field: SSFField) -> float:
+    """Half the summed difference of a mixture and a field: the largest difference of any response.
+
+    Both are compared on the field's pixels; a mixture's share outside them counts in full.
+    """
+    sampled = _density(mixture, field.centers_mm) * field.pixel_mm**2
+    missing = max(0.0, 1.0 - float(sampled.sum()))
+    return 0.5 * (float(np.abs(sampled - field.values.ravel()).sum()) + missing)
+
+
+def _density(mixture: FixedMixture, points: FloatArray) -> FloatArray:
+    total = np.zeros(len(points))
+    for w, mean, cov in zip(mixture.weights, mixture.means_mm, mixture.covs_mm2, strict=True):
+        off = points - mean
+        quadratic = np.einsum("ni,ij,nj->n", off, np.linalg.inv(cov), off)
+        total += w * np.exp(-0.5 * quadratic) / (2 * np.pi * np.sqrt(np.linalg.det(cov)))
+    return total
+
+
+def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
+    """Merge weighted Gaussians (or points, covariance zero) to a few, by expectation-maximisation."""
+    if n_gaussians < 1:
+        raise ParameterError("n_gaussians", n_gaussians, "1 or more")
+    w = w / w.sum()
+
+    def moments(share: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        mass = float(share.sum())
+        mean = share @ means / mass
+        off = means - mean
+        cov = np.einsum("n,nij->ij", share, covs) / mass + (share[:, None] * off).T @ off / mass
+        return mass, mean, cov
+
+    _, mean, cov = moments(w)
+    if n_gaussians == 1:
+        return FixedMixture(np.ones(1), mean[None], cov[None])
+    # Start from concentric Gaussians, narrow to wide, moved a little apart along the main axis.
+    main = np.linalg.eigh(cov)[1][:, 1] * np.sqrt(np.linalg.eigvalsh(cov)[1])
+    spread = np.linspace(-1, 1, n_gaussians)
+    weights = np.full(n_gaussians, 1 / n_gaussians)
+    centers = mean + 0.5 * spread[:, None] * main
+    shapes = cov * np.geomspace(0.4, 2.0, n_gaussians)[:, None, None]
+    floor = 1e-6 * np.trace(cov) * np.eye(2)
+    last = -np.inf
+    for _ in range(500):
+        log_p = np.empty((len(w), n_gaussians))
+        for k in range(n_gaussians):
+            inverse = np.linalg.inv(shapes[k])
+            off = means - centers[k]
+            quadratic = np.einsum("ni,ij,nj->n", off, inverse, off) + np.einsum("ij,nji->n", inverse, covs)
+            log_p[:, k] = np.log(weights[k]) - 0.5 * (quadratic + np.log(np.linalg.det(shapes[k])))
+        top = log_p.max(axis=1, keepdims=True)
+        p = np.exp(log_p - top)
+        total = p.sum(axis=1, keepdims=True)
+        score = float(w @ (top + np.log(total))[:, 0])
+        shares = w[:, None] * p / total
+        alive = shares.sum(axis=0) > 1e-9
+        shares = shares[:, alive]
+        n_gaussians = int(alive.sum())
+        fitted = [moments(shares[:, k]) for k in range(n_gaussians)]
+        weights = np.array([f[0] for f in fitted])
+        centers = np.array([f[1] for f in fitted])
+        shapes = np.array([f[2] for f in fitted]) + floor
+        if score - last < 1e-10:
+            break
+        last = score
+    return FixedMixture(weights, centers, shapes - floor)

@@ -1,0 +1,103 @@
+"""The recordings that ship with the package, made again from their seeds, and the truth behind them.
+
+`python -m probewise.world.shipped FOLDER` writes both into a folder, bit for bit as they ship.
+No diagnosis may read this module: it knows the answers.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from probewise.errors import ParameterError
+from probewise.recordings.files import write_recording
+from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plans import jittered, paper_plan, two_way_plan
+from probewise.recordings.shipping import SHIPPED
+from probewise.world.concealed import (
+    AmbientGradient,
+    Backlash,
+    Concealed,
+    CorrelatedNoise,
+    GainDrift,
+    Nonlinearity,
+    Saturation,
+)
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+__all__ = ["BLOB", "CANDIDATES", "SEEDS", "Made", "main", "make"]
+
+BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)
+"""The true SSF of both: one Gaussian, shifted towards the photodiode and wider along x'."""
+
+BLACK, WHITE, NOISE_SD = 10.0, 60.0, 0.6
+
+SEEDS = {"paper": 408, "drifting": 9844}
+
+CANDIDATES: tuple[Concealed, ...] = (
+    AmbientGradient(0.02, -0.02),
+    Backlash(0.53),
+    CorrelatedNoise(0.5),
+    GainDrift(0.044, 400.0),
+    Nonlinearity(1.1),
+    Saturation(57.5),
+)
+"""What `drifting` may conceal; each at a size lambda of about 20 there (diagnosis, size of an effect)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A recording and the world that it comes from."""
+
+    recording: Recording
+    world: World
+
+
+def make(name: str) -> Made:
+    """Make a shipped recording again.
+
+    Readings are rounded to 0.001, far below the noise, so that the last bits of a computer's
+    arithmetic do not matter.
+
+    Raises
+    ------
+    ParameterError
+        If there is no recording of that name.
+    """
+    if name not in SHIPPED:
+        raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
+    choice, times, noise = np.random.default_rng(SEEDS[name]).spawn(3)
+    world = World(gaussian_spot([BLOB]), black=BLACK, white=WHITE, noise_sd=NOISE_SD)
+    if name == "paper":
+        plan = _described(
+            paper_plan(), "Simulated readings over the black-and-white boundary and four quadrants, as in the paper"
+        )
+    else:
+        plan = _described(
+            two_way_plan(), "Simulated readings, scans out and back; something is not as a plain sensor has it"
+        )
+        world = replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
+    recording = world.simulate(jittered(plan, rng=times), rng=noise)
+    return Made(replace(recording, readings=np.round(recording.readings, 3)), world)
+
+
+def _described(plan: Plan, description: str) -> Plan:
+    return replace(plan, instrumentation=replace(plan.instrumentation, description=description))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the shipped recordings into the folder named on the command line."""
+    parser = argparse.ArgumentParser(description="Make the shipped recordings again.")
+    parser.add_argument("folder", type=Path, help="an existing folder")
+    folder: Path = parser.parse_args(arguments).folder
+    for name in SHIPPED:
+        write_recording(make(name).recording, folder / f"{name}.csv")
+
+
+if __name__ == "__main__":
+    main()

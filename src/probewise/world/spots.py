@@ -1,0 +1,175 @@
+"""Where a world's sensor looks: spatial sensitivities as fine rasters of weights in the sensor frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen, require_finite
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["Blob", "Spot", "gaussian_spot", "raster_spot", "ridge_spot", "tailed_spot"]
+
+Density = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """Hold the share of the light that each pixel of the footprint contributes.
+
+    Parameters
+    ----------
+    weights
+        Share by pixel, shape (n_v, n_u), first row at the smallest v; scaled here to sum to one.
+    pixel_mm
+        Side of a pixel.
+    corner_mm
+        Sensor-frame place (u, v) of the outer corner of the first pixel.
+    """
+
+    weights: FloatArray
+    pixel_mm: float
+    corner_mm: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        weights = np.asarray(self.weights, dtype=np.float64)
+        if weights.ndim != 2:
+            raise ShapeError(f"weights have shape {weights.shape}; allowed: (n_v, n_u)")
+        require_finite("weights", weights)
+        if weights.min() < 0 or weights.sum() <= 0:
+            raise ParameterError("weights", float(weights.min()), "0 or more, not all of them 0")
+        if not self.pixel_mm > 0:
+            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
+        object.__setattr__(self, "weights", frozen(weights / weights.sum()))
+
+    def edges_mm(self) -> tuple[FloatArray, FloatArray]:
+        """Return where the pixels begin and end in u, shape (n_u + 1,), and in v, shape (n_v + 1,)."""
+        n_v, n_u = self.weights.shape
+        u_mm, v_mm = self.corner_mm
+        return u_mm + self.pixel_mm * np.arange(n_u + 1), v_mm + self.pixel_mm * np.arange(n_v + 1)
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean (u, v) in mm, shape (2,), and the covariance in mm^2, shape (2, 2)."""
+        u_edges, v_edges = self.edges_mm()
+        u, v = np.meshgrid(u_edges[:-1] + self.pixel_mm / 2, v_edges[:-1] + self.pixel_mm / 2)
+        points = np.stack([u.ravel(), v.ravel()])
+        mean = points @ self.weights.ravel()
+        apart = points - mean[:, None]
+        # Light within a pixel is spread over it: a square adds its own variance.
+        return mean, (apart * self.weights.ravel()) @ apart.T + np.eye(2) * self.pixel_mm**2 / 12
+
+
+@dataclass(frozen=True)
+class Blob:
+    """One Gaussian of a spot: share of the light, centre and standard deviations (mm), correlation of u and v."""
+
+    share: float
+    center_mm: tuple[float, float]
+    sd_mm: tuple[float, float]
+    correlation: float = 0.0
+
+
+def raster_spot(
+    density: Density, half_width_mm: float, *, center_mm: tuple[float, float] = (0.0, 0.0), pixel_mm: float = 0.25
+) -> Spot:
+    """Lay any density over a square of pixels, rows and columns that carry next to nothing cut off.
+
+    Parameters
+    ----------
+    density
+        Sensitivity at points (u, v), arrays of one shape; any scale, 0 or more.
+    half_width_mm
+        Half the side of the square.
+    center_mm
+        Its centre in the sensor frame.
+    pixel_mm
+        Side of a pixel.
+    """
+    n = math.ceil(half_width_mm / pixel_mm)
+    centers = (np.arange(-n, n) + 0.5) * pixel_mm
+    u, v = np.meshgrid(center_mm[0] + centers, center_mm[1] + centers)
+    weights = density(u, v)
+    # At most 1e-6 of the light is lost on each side: far below the 1e-3 of the span that is promised.
+    rows, columns = (_core(weights.sum(axis=axis)) for axis in (1, 0))
+    corner = (center_mm[0] + (columns.start - n) * pixel_mm, center_mm[1] + (rows.start - n) * pixel_mm)
+    return Spot(weights[rows, columns], pixel_mm, corner)
+
+
+def _core(profile: FloatArray, lost: float = 1e-6) -> slice:
+    below = np.cumsum(profile) / profile.sum()
+    return slice(int(np.searchsorted(below, lost)), int(np.searchsorted(below, 1 - lost)) + 1)
+
+
+def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
+    """Make a spot of one or several Gaussians."""
+    low = [min(b.center_mm[k] - 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
+    high = [max(b.center_mm[k] + 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
+
+    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+        out = np.zeros_like(u)
+        for b in blobs:
+            p, q = (u - b.center_mm[0]) / b.sd_mm[0], (v - b.center_mm[1]) / b.sd_mm[1]
+            rest = 1 - b.correlation**2
+            out += (
+                b.share
+                * np.exp(-(p * p - 2 * b.correlation * p * q + q * q) / (2 * rest))
+                / (b.sd_mm[0] * b.sd_mm[1] * math.sqrt(rest))
+            )
+        return out
+
+    center = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
+    half_width = max(high[0] - low[0], high[1] - low[1]) / 2
+    return raster_spot(density, half_width, center_mm=center, pixel_mm=pixel_mm)
+
+
+def ridge_spot(
+    radius_mm: float = 9.0,
+    *,
+    center_mm: tuple[float, float] = (0.0, 1.5),
+    lobes: float = 0.35,
+    ridge_mm: float = -3.0,
+    ridge_width_mm: float = 1.2,
+    shadow: float = 0.6,
+    pixel_mm: float = 0.25,
+) -> Spot:
+    """Make a cosine disc with two lobes and the shadow of a ridge across it: no mixture of Gaussians.
+
+    The photodiode sees a disc that fades as cos^2 to its rim, stronger along u by `lobes`; the plastic
+    ridge between diode and LED takes `shadow` of the light along the line v = centre + `ridge_mm`.
+    """
+
+    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+        p, q = u - center_mm[0], v - center_mm[1]
+        r = np.hypot(p, q)
+        disc = np.where(r < radius_mm, np.cos(np.minimum(r / radius_mm, 1.0) * math.pi / 2) ** 2, 0.0)
+        lobed = 1 + lobes * (p * p - q * q) / np.maximum(r * r, 1e-12)
+        return np.asarray(disc * lobed * (1 - shadow / (1 + ((q - ridge_mm) / ridge_width_mm) ** 4)))
+
+    return raster_spot(density, radius_mm + pixel_mm, center_mm=center_mm, pixel_mm=pixel_mm)
+
+
+def tailed_spot(
+    core_mm: tuple[float, float] = (3.0, 1.8),
+    *,
+    center_mm: tuple[float, float] = (0.0, 1.5),
+    skew: float = 0.4,
+    pixel_mm: float = 0.25,
+) -> Spot:
+    """Make a skewed spot with exponential tails, exp(-r) in stretched axes: no mixture of Gaussians.
+
+    `core_mm` are the lengths of decay along u and v; `skew`, 0 to below 1, lengthens the tail towards
+    +u and shortens it towards -u.
+    """
+    if not 0 <= skew < 1:
+        raise ParameterError("skew", skew, "0 to below 1")
+
+    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+        p, q = (u - center_mm[0]) / core_mm[0], (v - center_mm[1]) / core_mm[1]
+        stretched = p / (1 + skew * np.tanh(p))
+        return np.asarray(np.exp(1 - np.sqrt(1 + stretched**2 + q**2)))
+
+    half_width = 14 * max(core_mm[0] * (1 + skew), core_mm[1])
+    return raster_spot(density, half_width, center_mm=center_mm, pixel_mm=pixel_mm)

@@ -1,0 +1,162 @@
+"""The simulated arm as an instrument: reach, clock, scale."""
+
+import math
+
+import numpy as np
+import pytest
+
+from probewise.arm import Instrument, LegoScale, Pose, Reach, SimulatedArm, Speed
+from probewise.errors import ParameterError, ReachError, ShapeError
+
+GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 131), np.linspace(0, 520, 65)), axis=-1).reshape(-1, 2)
+HERE = Pose(500.0, 200.0)
+
+
+def flat(value):
+    return lambda pose, time_s, height_mm: value
+
+
+def test_the_arm_reaches_all_but_the_two_far_corners():
+    """Paper, Fig. entropy-map: dark jagged edges at the bottom, where the arm does not reach."""
+    held = Reach().holds(GRID)
+    assert 0.95 < held.mean() < 0.99
+    missed = GRID[~held]
+    assert missed[:, 1].max() < 120
+    assert set(np.sign(missed[:, 0] - 524)) == {-1, 1}
+    assert held[(abs(GRID[:, 0] - 524) < 380)].all()
+
+
+def test_a_longer_arm_reaches_everywhere():
+    assert Reach.everywhere().holds(GRID).all()
+
+
+def test_reach_agrees_with_trigonometry():
+    reach = Reach(axis_beyond_mm=100.0, nearest_mm=150.0, farthest_mm=400.0)
+    for angle in np.linspace(-math.pi + 0.3, -0.3, 9):
+        for away, expected in ((149.9, False), (150.1, True), (399.9, True), (400.1, False)):
+            place = np.array([[524 + away * math.cos(angle), 620 + away * math.sin(angle)]])
+            on_field = 0 <= place[0, 1] <= 520
+            assert reach.holds(place)[0] == (expected and on_field)
+
+
+def test_places_off_the_field_are_out_of_reach():
+    places = np.array([[524.0, 521.0], [-1.0, 400.0], [np.nan, 100.0], [np.inf, 100.0], [524.0, 300.0]])
+    np.testing.assert_array_equal(SimulatedArm(flat(1.0)).reachable(places), [False, False, False, False, True])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"axis_beyond_mm": 900.0}, {"field_mm": (100.0, 50.0), "nearest_mm": 300.0}],
+)
+def test_a_field_that_the_arm_cannot_reach_at_all_is_refused(changes):
+    with pytest.raises(ReachError, match="move the arm"):
+        Reach(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"field_mm": (0.0, 1.0)}, {"farthest_mm": np.inf}, {"nearest_mm": -1.0}, {"nearest_mm": 800.0}],
+)
+def test_a_reach_without_sense_is_refused(changes):
+    with pytest.raises(ParameterError):
+        Reach(**changes)
+
+
+@pytest.mark.parametrize("pose", [Pose(0.0, 0.0), Pose(-5.0, 300.0), Pose(np.nan, 1.0), Pose(500.0, 200.0, np.inf)])
+def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(pose):
+    arm = SimulatedArm(flat(50.0))
+    before = arm.pose, arm.time_s
+    with pytest.raises(ReachError, match=r"40 to 700 mm from the arm's axis at \(524, 580\)"):
+        arm.measure(pose)
+    assert (arm.pose, arm.time_s) == before
+
+
+def test_the_clock_is_advanced_by_travel_and_reading():
+    arm = SimulatedArm(flat(50.0), speed=Speed(move_mm_s=50.0, read_s=2.0), start_s=100.0)
+    first = arm.measure(HERE)
+    second = arm.measure(Pose(530.0, 240.0))
+    third = arm.measure(Pose(530.0, 240.0))
+    assert second.time_s - first.time_s == pytest.approx(50 / 50 + 2)
+    assert third.time_s - second.time_s == pytest.approx(2.0)
+    assert first.time_s > 102
+    assert arm.time_s == third.time_s
+
+
+def test_travel_time_is_what_the_clock_then_shows():
+    arm = SimulatedArm(flat(50.0))
+    arm.measure(HERE)
+    places = np.array([[300.0, 200.0], [500.0, 400.0]])
+    promised = arm.travel_s(arm.pose, places)
+    assert promised.shape == (2,)
+    before = arm.time_s
+    arm.measure(Pose(500.0, 400.0))
+    assert arm.time_s - before == pytest.approx(promised[1])
+
+
+def test_the_sensor_is_lowered_to_14_mm_and_told_when_and_where():
+    calls = []
+
+    def light(pose, time_s, height_mm):
+        calls.append((pose, time_s, height_mm))
+        return 33.0
+
+    reading = SimulatedArm(light).measure(HERE)
+    assert calls == [(HERE, reading.time_s, 14.0)]
+    assert reading.pose == HERE
+    assert reading.covariates == {"height_mm": 14.0}
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [(33.4, 33), (33.6, 34), (0.2, 1), (-4, 1), (120.0, 100), (np.inf, 100)]
+)
+def test_readings_are_whole_lego_units_from_1_to_100(value, expected):
+    """Paper, "Robotic Arm Test Bed": a scale of 1 to 100."""
+    assert SimulatedArm(flat(value)).measure(HERE).value == expected
+
+
+def test_the_scale_can_be_finer_or_none():
+    assert SimulatedArm(flat(33.37), scale=LegoScale(step=0.25)).measure(HERE).value == 33.25
+    assert SimulatedArm(flat(133.37), scale=LegoScale(step=None)).measure(HERE).value == 100
+    assert SimulatedArm(flat(133.37), scale=None).measure(HERE).value == 133.37
+    assert math.isnan(SimulatedArm(flat(math.nan)).measure(HERE).value)
+    assert LegoScale(0.0, 10.0, 3.0).convert(10.0) == 9.0
+    assert LegoScale(0.0, 11.0, 3.0).convert(11.0) == 11.0
+
+
+def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
+    arm: Instrument = SimulatedArm(flat(50.0))
+    home = arm.pose
+    with arm as entered:
+        assert entered is arm
+        arm.measure(HERE)
+    assert arm.pose == home
+
+    def fail() -> None:
+        with arm:
+            arm.measure(HERE)
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert arm.pose == home
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Speed(move_mm_s=0.0),
+        lambda: Speed(read_s=-1.0),
+        lambda: LegoScale(low=100.0),
+        lambda: LegoScale(step=0.0),
+        lambda: SimulatedArm(flat(1.0), height_mm=0.0),
+    ],
+    ids=["no speed", "negative time", "no range", "no step", "no height"],
+)
+def test_an_arm_without_sense_is_refused(make):
+    with pytest.raises(ParameterError):
+        make()
+
+
+def test_places_must_be_pairs():
+    with pytest.raises(ShapeError, match="n_places, 2"):
+        SimulatedArm(flat(1.0)).reachable(np.zeros(3))

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.calibration import SSFPrior, default_prior, scan_geometry
+from probewise.errors import ParameterError
+from probewise.priors import LogUniform, Uniform
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan
+
+
+def _recording(plan: Plan, readings: np.ndarray) -> Recording:
+    return Recording(plan, readings)
+
+
+def _edge_recording(scale_mm: float = 1.0) -> Recording:
+    plan = paper_plan()
+    plan = replace(plan, x_mm=plan.x_mm * scale_mm)
+    return _recording(plan, 10 + 50 / (1 + np.exp(-plan.x_mm / scale_mm / 4)))
+
+
+def test_the_density_integrates_to_one_over_a_single_gaussian() -> None:
+    """Importance sampling from a wider box, an independent route to the normalisation."""
+    prior = SSFPrior(1, Uniform(-2, 2), LogUniform(0.1, 3), Uniform(0, 1), Uniform(4, 5))
+    rng = np.random.default_rng(1)
+    n = 400_000
+    low = np.array([0, -2, -2, 0.1, 0.1, -3, 0, 4])
+    high = np.array([1, 2, 2, 3, 3, 3, 1, 5])
+    box = rng.uniform(low, high, (n, 8))
+    weight = np.exp(prior.log_prob(box)) * np.prod(high - low)
+    assert abs(weight.mean() - 1) < 5 * weight.std() / math.sqrt(n)
+
+
+def test_every_draw_is_positive_definite_and_inside_the_support() -> None:
+    prior = default_prior(_edge_recording(), 3)
+    theta = prior.from_unit_cube(np.random.default_rng(2).random((2000, 20)))
+    for n in range(3):
+        a, b, c = theta[:, 6 * n + 3], theta[:, 6 * n + 4], theta[:, 6 * n + 5]
+        assert (a * b - c * c > 0).all()
+    assert np.isfinite(prior.log_prob(theta)).all()
+    assert prior.log_prob(theta + 1e6).max() == -np.inf
+
+
+def test_swapping_two_gaussians_leaves_the_prior_density_unchanged() -> None:
+    prior = default_prior(_edge_recording(), 2)
+    theta = prior.from_unit_cube(np.random.default_rng(3).random((50, 14)))
+    swapped = np.concatenate([theta[:, 6:12], theta[:, :6], theta[:, 12:]], axis=1)
+    np.testing.assert_allclose(prior.log_prob(swapped), prior.log_prob(theta), rtol=1e-12)
+
+
+def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span() -> None:
+    g = scan_geometry(_edge_recording())
+    assert (g.step_mm, g.span_mm, g.albedo_low, g.albedo_high, g.inverted) == (1.0, 100.0, 0.0, 1.0, False)
+    prior = default_prior(_edge_recording(), 1)
+    assert isinstance(prior.precision, LogUniform)
+    assert 1 / math.sqrt(2 * prior.precision.high) == pytest.approx(0.5)
+    assert 1 / math.sqrt(2 * prior.precision.low) == pytest.approx(25.0)
+    assert len(prior.describe()) == 6
+
+
+def test_the_prior_scales_with_the_recording() -> None:
+    near, far = default_prior(_edge_recording(), 1), default_prior(_edge_recording(0.05), 1)
+    u = np.random.default_rng(4).random((100, 8))
+    theta, small = near.from_unit_cube(u), far.from_unit_cube(u)
+    np.testing.assert_allclose(small[:, 1:3], 0.05 * theta[:, 1:3])
+    np.testing.assert_allclose(small[:, 3:6], theta[:, 3:6] / 0.05**2)
+    np.testing.assert_allclose(small[:, 6:], theta[:, 6:], rtol=1e-6)
+
+
+def test_levels_are_scaled_from_grey_patterns_to_black_and_white() -> None:
+    plan = paper_plan()
+    grey = dict.fromkeys(plan.pattern_names, HalfPlane(0.0, 0.0, inside=0.8, outside=0.3))
+    plan = replace(plan, patterns=grey)
+    prior = default_prior(_recording(plan, np.where(plan.x_mm > 0, 90.0, 40.0)), 1)
+    assert isinstance(prior.i_min, Uniform)
+    assert isinstance(prior.i_max, Uniform)
+    assert (prior.i_min.low + prior.i_min.high) / 2 == pytest.approx(10.0)
+    assert (prior.i_max.low + prior.i_max.high) / 2 == pytest.approx(110.0)
+
+
+def test_a_sensor_that_reads_high_on_black_gets_levels_the_other_way_round() -> None:
+    plan = paper_plan()
+    prior = default_prior(_recording(plan, np.where(plan.x_mm > 0, 10.0, 60.0)), 1)
+    assert isinstance(prior.i_min, Uniform)
+    assert isinstance(prior.i_max, Uniform)
+    assert prior.i_min.low < 60 < prior.i_min.high
+    assert prior.i_max.low < 10 < prior.i_max.high
+
+
+def test_readings_that_are_all_equal_are_refused() -> None:
+    plan = paper_plan()
+    with pytest.raises(ParameterError, match="all 408 usable readings equal 7"):
+        default_prior(_recording(plan, np.full(len(plan), 7.0)), 1)
+
+
+def test_a_recording_without_usable_readings_is_refused() -> None:
+    plan = paper_plan()
+    with pytest.raises(ParameterError, match="none usable"):
+        default_prior(_recording(plan, np.full(len(plan), np.nan)), 1)
+
+
+def test_a_sensor_that_never_moves_is_refused() -> None:
+    plan = paper_plan().take(np.arange(404, 408))
+    with pytest.raises(ParameterError, match="one place"):
+        default_prior(_recording(plan, np.array([20.0, 21.0, 12.0, 11.0])), 1)
+
+
+def test_scans_that_stay_on_one_side_of_the_edge_are_refused() -> None:
+    plan = paper_plan().take(np.arange(20))
+    with pytest.raises(ParameterError, match="both sides"):
+        default_prior(_recording(plan, np.linspace(10, 11, 20)), 1)

@@ -1,0 +1,159 @@
+"""The entropy of predicted readings, against counting by hand and the paper's partition."""
+
+import time
+from collections import Counter
+from dataclasses import dataclass
+from math import log2
+
+import numpy as np
+import pytest
+
+from probewise.errors import ParameterError, ReachError, ShapeError
+from probewise.inquiry import Grid, Prospect, ReadingEntropy, choose, entropy_map, label_entropy
+
+
+@dataclass(frozen=True)
+class PointSensor:
+    """Reads 10 outside and 60 inside a circle: the naive model."""
+
+    names: tuple[str, ...] = ("x_mm", "y_mm", "radius_mm")
+
+    def predict(self, theta, plan):
+        away = np.hypot(plan.x_mm - theta[:, 0:1], plan.y_mm - theta[:, 1:2])
+        return np.where(away <= theta[:, 2:3], 60.0, 10.0)
+
+
+def circles(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.uniform(200, 800, n), rng.uniform(100, 400, n), rng.uniform(20, 150, n)], axis=1)
+
+
+def counted_entropy(column):
+    """Count with a Counter, sum p log2 p."""
+    shares = [count / len(column) for count in Counter(column).values()]
+    return -sum(p * log2(p) for p in shares)
+
+
+def test_the_entropy_is_that_of_counting_each_place_by_itself():
+    predicted = np.random.default_rng(1).normal(30.0, 4.0, (50, 40))
+    expected = [counted_entropy(np.rint(column).tolist()) for column in predicted.T]
+    np.testing.assert_allclose(ReadingEntropy()(Prospect(predicted, np.array(1.0))), expected, atol=1e-12)
+
+
+def test_wider_bins_hold_more_and_tell_less():
+    prospect = Prospect(np.random.default_rng(2).normal(30.0, 8.0, (50, 30)), np.array(1.0))
+    wide = ReadingEntropy(bin_width=5.0)(prospect)
+    assert (wide <= ReadingEntropy()(prospect) + 1e-12).all()
+    expected = [counted_entropy(np.rint(column / 5.0).tolist()) for column in prospect.predicted.T]
+    np.testing.assert_allclose(wide, expected, atol=1e-12)
+
+
+def test_hypotheses_that_agree_leave_nothing_to_learn():
+    assert (label_entropy(np.full((50, 7), 3.0)) == 0.0).all()
+
+
+def test_hypotheses_that_all_differ_promise_log2_of_their_number():
+    labels = np.repeat(np.arange(32.0)[:, None], 3, axis=1)
+    np.testing.assert_allclose(label_entropy(labels), 5.0)
+
+
+def test_the_naive_map_is_the_partition_by_the_number_of_circles_that_hold_the_place():
+    """Paper, conclusion: the entropy depends on the number of circles that contain the place alone."""
+    theta, grid = circles(50), Grid()
+    result = entropy_map(
+        PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool), noise_sd=1.0
+    )
+    x, y = grid.places_mm.T
+    holds = np.zeros(grid.n_places, int)
+    for cx, cy, r in theta:
+        holds += (x - cx) ** 2 + (y - cy) ** 2 <= r**2
+    p = np.clip(np.arange(51) / 50, 1e-300, 1)
+    q = np.clip(1 - p, 1e-300, 1)
+    binary = np.where((p < 1e-9) | (q < 1e-9), 0.0, -p * np.log2(p) - q * np.log2(q))
+    np.testing.assert_allclose(result.values, binary[holds], atol=1e-12)
+    assert result.values.max() <= 1.0
+
+
+def test_half_of_the_circles_make_the_best_place_worth_one_bit():
+    theta = np.array([[300.0, 200.0, 50.0]] * 25 + [[700.0, 200.0, 50.0]] * 25)
+    grid = Grid()
+    result = entropy_map(
+        PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool), noise_sd=1.0
+    )
+    assert result.highest == pytest.approx(1.0, abs=1e-12)
+    best = grid.places_mm[result.best]
+    inside = (np.hypot(*(best - [300, 200]).T) <= 50) | (np.hypot(*(best - [700, 200]).T) <= 50)
+    assert inside.all()
+    assert inside.sum() > 200
+
+
+def test_the_next_place_is_drawn_evenly_among_those_that_tie():
+    """Four places within the tie of 1e-9, 4000 draws: chi-square below its 1e-6 quantile."""
+    utility = np.array([0.3, 1.0, 1.0 - 5e-10, 0.9, 1.0, 1.0, 1.0 - 1e-6])
+    reachable = np.ones(7, bool)
+    rng = np.random.default_rng(3)
+    counts = np.bincount([choose(utility, reachable, rng=rng) for _ in range(4000)], minlength=7)
+    assert set(np.flatnonzero(counts)) == {1, 2, 4, 5}
+    assert ((counts[[1, 2, 4, 5]] - 1000) ** 2 / 1000).sum() < 30.7
+
+
+def test_only_places_within_reach_are_chosen_or_asked():
+    grid = Grid()
+    reachable = grid.places_mm[:, 0] > 900.0
+    seen = []
+
+    @dataclass(frozen=True)
+    class Watched(PointSensor):
+        def predict(self, theta, plan):
+            seen.append(plan.x_mm.min())
+            return super().predict(theta, plan)
+
+    result = entropy_map(Watched(), circles(50), grid, grid.plan("field"), reachable=reachable, noise_sd=1.0)
+    assert min(seen) > 900.0
+    assert result.choose(rng=np.random.default_rng(4))[0] > 900.0
+    assert (result.values[~reachable] == 0).all()
+    assert np.isnan(result.image).sum() == (~reachable).sum()
+
+
+def test_a_field_out_of_reach_is_an_error_that_says_so():
+    grid = Grid(n_x=5, n_y=4)
+    with pytest.raises(ReachError, match=r"reachable places is 0; allowed: at least one of the 20 places"):
+        entropy_map(PointSensor(), circles(5), grid, grid.plan("f"), reachable=np.zeros(20, bool), noise_sd=1.0)
+
+
+def test_predictions_that_are_not_finite_are_refused():
+    with pytest.raises(ParameterError, match="finite"):
+        Prospect(np.array([[1.0, np.nan]]), np.array(1.0))
+
+
+def test_the_map_of_50_circles_over_8515_places_is_fast():
+    """Aim: a tenth of a second; three times that leaves room for a busy machine."""
+    labels = np.rint(np.random.default_rng(5).normal(30, 10, (50, 8515)))
+    start = time.perf_counter()
+    label_entropy(labels)
+    assert time.perf_counter() - start < 0.3
+
+
+def test_the_grid_is_the_papers_field_row_by_row():
+    grid = Grid()
+    assert grid.n_places == 131 * 65
+    np.testing.assert_allclose(grid.x_mm, np.linspace(0, 1048, 131))
+    np.testing.assert_allclose(grid.y_mm, np.linspace(0, 520, 65))
+    assert grid.image(grid.places_mm[:, 0])[3, 7] == pytest.approx(grid.x_mm[7])
+    assert grid.image(grid.places_mm[:, 1])[3, 7] == pytest.approx(grid.y_mm[3])
+
+
+def test_the_places_of_a_plan_are_alternatives_without_a_direction():
+    """A lag or a backlash must not carry from one possible reading to the next."""
+    assert (Grid(n_x=3, n_y=3).plan("field").direction == 0).all()
+
+
+@pytest.mark.parametrize("change", [{"width_mm": 0.0}, {"n_x": 1}, {"height_mm": float("nan")}])
+def test_a_grid_without_extent_is_refused(change):
+    with pytest.raises(ParameterError):
+        Grid(**change)
+
+
+def test_values_of_another_grid_are_refused():
+    with pytest.raises(ShapeError):
+        Grid().image(np.zeros(5))

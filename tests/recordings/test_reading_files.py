@@ -1,0 +1,252 @@
+"""The recording format, rule by rule, and what a file that breaks one is answered."""
+
+import json
+
+import numpy as np
+import pytest
+
+from probewise.errors import FileError
+from probewise.recordings import (
+    Disc,
+    HalfPlane,
+    Polygon,
+    Quadrant,
+    Ramp,
+    Stripes,
+    Uniform,
+    read_plan,
+    read_prediction,
+    read_recording,
+)
+
+WHITE = {"white": {"kind": "uniform", "albedo": 1}}
+TWO = {**WHITE, "edge": {"kind": "half_plane", "normal_deg": 90, "offset_mm": 2}}
+
+
+def put(folder, csv, patterns=WHITE, **more):
+    content = {"format": "recording/1", "reading": {"unit": "LEGO", "min": 0, "max": 100}, "patterns": patterns, **more}
+    (folder / "rec.csv").write_bytes(csv if isinstance(csv, bytes) else csv.encode())
+    (folder / "rec.json").write_text(json.dumps(content))
+    return folder / "rec.csv"
+
+
+def test_what_is_not_said_is_taken_by_default(tmp_path):
+    recording = read_recording(put(tmp_path, "reading,x_mm,y_mm\n1,2,3\n4,5,6\n7,8,9\n"))
+    plan = recording.plan
+    np.testing.assert_array_equal(plan.orientation_rad, 0)
+    np.testing.assert_array_equal(plan.scan, 0)
+    np.testing.assert_array_equal(np.diff(plan.time_s), 1)
+    assert plan.pattern_names == ("white",)
+    assert recording.notes == ()
+    assert plan.instrumentation.step is None
+    assert plan.instrumentation.controls == ()
+
+
+def test_byte_order_mark_crlf_quotes_blanks_and_empty_lines_are_accepted(tmp_path):
+    csv = b'\xef\xbb\xbfx_mm, y_mm ,reading,scan\r\n1,2,3.5,"a, b"\r\n\r\n 4 ,5,+6e0,"a, b"\r\n'
+    recording = read_recording(put(tmp_path, csv))
+    np.testing.assert_array_equal(recording.readings, [3.5, 6])
+    assert recording.plan.scan_names == ("a, b",)
+
+
+def test_orientation_stands_in_degrees_and_is_held_in_radians(tmp_path):
+    plan = read_plan(put(tmp_path, "x_mm,y_mm,orientation_deg\n0,0,90\n0,0,-45\n"))
+    np.testing.assert_array_equal(plan.orientation_rad, [np.pi / 2, -np.pi / 4])
+
+
+def test_a_scan_name_that_returns_is_a_new_scan(tmp_path):
+    plan = read_plan(put(tmp_path, "x_mm,y_mm,scan\n0,0,a\n1,0,a\n0,0,b\n3,0,a\n"))
+    np.testing.assert_array_equal(plan.scan, [0, 0, 1, 2])
+    assert plan.scan_names == ("a", "b", "a")
+
+
+def test_missing_and_out_of_range_readings_are_counted_and_left_out(tmp_path):
+    recording = read_recording(put(tmp_path, "x_mm,y_mm,reading\n0,0,\n0,0,NaN\n0,0,101\n0,0,50\n0,0,0\n0,0,1e200\n"))
+    np.testing.assert_array_equal(recording.usable, [False, False, False, True, True, False])
+    assert recording.notes == ("2 readings missing, left out", "2 readings outside 0 to 100, left out")
+    assert recording.readings[2] == 101
+
+
+def test_other_numbers_are_covariates_and_other_texts_are_noted(tmp_path):
+    csv = "x_mm,y_mm,reading,battery_mv,who,height_mm,blank\n0,0,1,8300,Ann,14,\n0,0,2,nan,Bob,28,\n0,0,2,,,28,\n"
+    recording = read_recording(put(tmp_path, csv))
+    assert list(recording.plan.covariates) == ["battery_mv", "height_mm"]
+    np.testing.assert_array_equal(recording.plan.covariates["battery_mv"], [8300, np.nan, np.nan])
+    assert recording.notes == ("column who is text, ignored", "column blank is empty, ignored")
+
+
+def test_every_pattern_kind_is_read(tmp_path):
+    level = {"inside": 0.25, "outside": 0.75}
+    kinds = {
+        "u": {"kind": "uniform", "albedo": 0.5},
+        "h": {"kind": "half_plane", "normal_deg": 90, "offset_mm": 2, **level},
+        "q": {"kind": "quadrant", "corner_mm": [1, 2], "direction": [1, -1]},
+        "d": {"kind": "disc", "center_mm": [1, 2], "radius_mm": 3, **level},
+        "p": {"kind": "polygon", "vertices_mm": [[0, 0], [1, 0], [0, 1]]},
+        "s": {"kind": "stripes", "normal_deg": 0, "period_mm": 4, "duty": 0.5, "phase_mm": 1},
+        "r": {"kind": "ramp", "normal_deg": 180, "per_mm": 0.01},
+        "i": {"kind": "image", "file": "photo.npy", "pixel_mm": 2, "origin_mm": [-1, -2]},
+    }
+    np.save(tmp_path / "photo.npy", np.array([[0, 51], [102, 255]], dtype=np.uint8))
+    plan = read_plan(put(tmp_path, "x_mm,y_mm,pattern\n" + "".join(f"0,0,{k}\n" for k in kinds), kinds))
+    image = plan.patterns["i"]
+    np.testing.assert_allclose(image.albedo, [[0, 0.2], [0.4, 1]])
+    assert {name: p for name, p in plan.patterns.items() if name != "i"} == {
+        "u": Uniform(0.5),
+        "h": HalfPlane(np.pi / 2, 2, 0.25, 0.75),
+        "q": Quadrant((1, 2), (1, -1)),
+        "d": Disc((1, 2), 3, 0.25, 0.75),
+        "p": Polygon(((0, 0), (1, 0), (0, 1))),
+        "s": Stripes(0, 4, 0.5, 1),
+        "r": Ramp(np.pi, 0.01),
+    }
+
+
+def test_a_recording_is_accepted_as_a_plan_even_without_any_reading(tmp_path):
+    assert len(read_plan(put(tmp_path, "x_mm,y_mm,reading\n0,0,\n"))) == 1
+
+
+def test_time_that_runs_backwards_is_noted(tmp_path):
+    recording = read_recording(put(tmp_path, "x_mm,y_mm,reading,time_s\n0,0,1,5\n0,0,1,4\n"))
+    assert recording.notes == ("time_s runs backwards at row 3",)
+
+
+HEAD = "x_mm,y_mm,reading\n"
+BAD_TABLES = {
+    "missing column": ("x_mm,reading\n0,1\n", ["row 1", "column y_mm", "'x_mm', 'reading'"]),
+    "a plan": ("x_mm,y_mm\n0,1\n", ["row 1", "column reading", "plan"]),
+    "text in a number": (HEAD + "0,0,1\n0,abc,2\n", ["row 3", "column y_mm", "'abc'", "finite number"]),
+    "text in a reading": (HEAD + "0,0,dark\n", ["row 2", "column reading", "'dark'", "empty or nan"]),
+    "comma as decimal point": (HEAD + '0,0,"1,5"\n', ["row 2", "column reading", "'1,5'"]),
+    "underscore": (HEAD + "0,0,1_000\n", ["row 2", "'1_000'"]),
+    "no coordinate": (HEAD + "0,0,1\n0,,1\n", ["row 3", "column y_mm", "empty"]),
+    "NaN coordinate": (HEAD + "nan,0,1\n", ["row 2", "column x_mm", "'nan'"]),
+    "infinite reading": (HEAD + "0,0,1\n0,0,inf\n", ["row 3", "column reading", "'inf'"]),
+    "overflow": (HEAD + "0,0,1e999\n", ["row 2", "column reading", "'1e999'"]),
+    "huge coordinate": (HEAD + "1e300,0,1\n", ["row 2", "column x_mm", "'1e300'", "1e+09"]),
+    "NaN orientation": ("orientation_deg," + HEAD + "nan,0,0,1\n", ["row 2", "column orientation_deg"]),
+    "NaN time": ("time_s," + HEAD + ",0,0,1\n", ["row 2", "column time_s"]),
+    "text in a covariate": ("t_c," + HEAD + "1,0,0,1\n2,0,0,1\nx,0,0,1\n", ["row 4", "column t_c", "'x'"]),
+    "infinite covariate": ("t_c," + HEAD + "1,0,0,1\n1e400,0,0,1\n", ["row 3", "column t_c"]),
+    "duplicate header": ("x_mm,y_mm,reading,x_mm\n0,0,1,2\n", ["row 1", "column x_mm", "twice"]),
+    "short row": (HEAD + "0,0,1\n\n0,0\n", ["row 4", "2 cells", "3 cells"]),
+    "long row": (HEAD + "0,0,1,9\n", ["row 2", "4 cells", "3 cells"]),
+    "only a header": (HEAD, ["no reading at all"]),
+    "no reading": (HEAD + "0,0,\n0,0,nan\n", ["column reading", "no reading at all"]),
+    "nothing in range": (HEAD + "0,0,200\n", ["column reading", "0 to 100"]),
+    "empty": ("", ["the file is empty"]),
+    "only blank lines": ("\n\n", ["the file is empty"]),
+    "open quote": (HEAD + '0,0,"1\n', ["row", "CSV"]),
+    "not UTF-8": (HEAD.encode() + b"0,0,1\n0,0,\xff\n", ["row 3", "0xff", "UTF-8"]),
+    "UTF-16": (HEAD.encode("utf-16"), ["row 1", "UTF-8"]),
+    "unknown pattern": ("pattern," + HEAD + "white,0,0,1\nred,0,0,1\n", ["row 3", "column pattern", "'red'", "white"]),
+    "semicolons": ("x_mm;y_mm;reading\n0;0;1\n", ["row 1", "column x_mm", "comma-separated"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD_TABLES)
+def test_a_bad_table_is_answered_with_file_row_and_column(tmp_path, what):
+    csv, fragments = BAD_TABLES[what]
+    path = put(tmp_path, csv)
+    with pytest.raises(FileError) as caught:
+        read_recording(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert "allowed: " in message
+    assert "\n" not in message
+    for fragment in fragments:
+        assert fragment in message
+
+
+def test_a_pattern_must_be_named_where_there_are_several(tmp_path):
+    with pytest.raises(FileError, match=r"row 1, column pattern: .*2 patterns"):
+        read_recording(put(tmp_path, HEAD + "0,0,1\n", TWO))
+
+
+def described(**patterns):
+    return json.dumps({"format": "recording/1", "patterns": patterns})
+
+
+def with_white(**more):
+    return json.dumps({"format": "recording/1", "patterns": WHITE, **more})
+
+
+BAD_DESCRIPTIONS = {
+    "does not parse": ('{"format": \n "recording/1",,}', ["row 2", "JSON"]),
+    "cut short": ('{"format": "recording/1"', ["row 1", "JSON"]),
+    "not a number of JSON": ('{"format": "recording/1", "reading": {"min": NaN}}', ["NaN"]),
+    "a list": ("[]", ["an object"]),
+    "a name twice": ('{"format": 1, "format": 2}', ["'format' comes twice"]),
+    "too deep": ("[" * 100_000, ["JSON"]),
+    "another format": ('{"format": "recording/9", "patterns": {}}', ["format is", '"recording/1"']),
+    "no format": ("{}", ["format is missing", '"recording/1"']),
+    "no patterns": ('{"format": "recording/1"}', ["patterns is missing"]),
+    "empty patterns": (described(), ["patterns is empty"]),
+    "unknown kind": (described(a={"kind": "blob"}), ['patterns.a.kind is "blob"', "half_plane", "image"]),
+    "no kind": (described(a={}), ["patterns.a.kind is missing"]),
+    "not an object": (described(a=3), ["patterns.a is 3"]),
+    "field missing": (described(a={"kind": "uniform"}), ["patterns.a.albedo is missing"]),
+    "text in a field": (described(a={"kind": "uniform", "albedo": "1"}), ['patterns.a.albedo is "1"', "finite number"]),
+    "true in a field": (described(a={"kind": "uniform", "albedo": True}), ["patterns.a.albedo is true"]),
+    "huge field": ('{"format": "recording/1", "patterns": {"a": {"kind": "uniform", "albedo": 1e999}}}', ["albedo"]),
+    "negative radius": (
+        described(a={"kind": "disc", "center_mm": [0, 0], "radius_mm": -3}),
+        ["radius_mm is -3", "greater than 0"],
+    ),
+    "half a pair": (described(a={"kind": "disc", "center_mm": [0], "radius_mm": 3}), ["center_mm is [0]"]),
+    "direction": (described(a={"kind": "quadrant", "corner_mm": [0, 0], "direction": [1, 0]}), ["direction is [1, 0]"]),
+    "two corners": (described(a={"kind": "polygon", "vertices_mm": [[0, 0], [1, 1]]}), ["three corners"]),
+    "duty": (
+        described(a={"kind": "stripes", "normal_deg": 0, "period_mm": 1, "duty": 2, "phase_mm": 0}),
+        ["duty is 2", "0 to 1"],
+    ),
+    "image elsewhere": (
+        described(a={"kind": "image", "file": "../x.png", "pixel_mm": 1, "origin_mm": [0, 0]}),
+        ["without a path"],
+    ),
+    "image missing": (
+        described(a={"kind": "image", "file": "x.png", "pixel_mm": 1, "origin_mm": [0, 0]}),
+        ["x.png", "no such file"],
+    ),
+    "range": (with_white(reading={"min": 5, "max": 5}), ["reading.max is 5", "greater than reading.min"]),
+    "step": (with_white(reading={"step": 0}), ["reading.step is 0", "greater than 0"]),
+    "controls": (with_white(controls="led"), ["controls", "list of texts"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD_DESCRIPTIONS)
+def test_a_bad_description_is_answered_with_file_and_field(tmp_path, what):
+    text, fragments = BAD_DESCRIPTIONS[what]
+    path = put(tmp_path, HEAD + "0,0,1\n")
+    (tmp_path / "rec.json").write_text(text)
+    with pytest.raises(FileError) as caught:
+        read_recording(path)
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path))
+    assert "allowed: " in message
+    for fragment in fragments:
+        assert fragment in message
+
+
+def test_an_unused_field_of_a_pattern_is_noted(tmp_path):
+    patterns = {"a": {"kind": "uniform", "albedo": 1, "colour": "white"}}
+    notes = read_recording(put(tmp_path, HEAD + "0,0,1\n", patterns)).notes
+    assert notes == ("pattern a: colour not used, no field of kind uniform",)
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(FileError, match=r"rec\.csv: there is no such file"):
+        read_recording(tmp_path / "rec.csv")
+    (tmp_path / "rec.csv").write_text(HEAD + "0,0,1\n")
+    with pytest.raises(FileError, match=r"rec\.json: there is no such file; .*beside the CSV"):
+        read_recording(tmp_path / "rec.csv")
+    with pytest.raises(FileError, match="name of the CSV"):
+        read_recording(tmp_path / "rec.json")
+    with pytest.raises(FileError, match="cannot be read"):
+        read_recording(tmp_path)
+
+
+def test_a_prediction_with_a_spread_of_nothing_is_refused(tmp_path):
+    (tmp_path / "p.csv").write_text("mean,sd,log_density\n1,1,\n1,0,2\n")
+    with pytest.raises(FileError, match="row 3, column sd"):
+        read_prediction(tmp_path / "p.csv")

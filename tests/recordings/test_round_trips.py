@@ -1,0 +1,249 @@
+"""What is written is what is read back, in full precision."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from probewise.errors import FileError, ParameterError
+from probewise.recordings import (
+    Disc,
+    HalfPlane,
+    Image,
+    Instrumentation,
+    Plan,
+    Polygon,
+    Prediction,
+    Quadrant,
+    Ramp,
+    Recording,
+    Stripes,
+    Uniform,
+    fingerprint,
+    read_plan,
+    read_plan_and_readings,
+    read_prediction,
+    read_recording,
+    write_plan,
+    write_prediction,
+    write_recording,
+)
+from probewise.recordings.description import degrees_of
+
+numbers = st.floats(-1e6, 1e6)
+lengths = st.floats(1e-6, 1e6)
+angles_rad = st.floats(-720, 720).map(math.radians)
+names = st.text(st.characters(categories=("L", "N", "P", "S")), max_size=12)
+levels = {"inside": numbers, "outside": numbers}
+pairs = st.tuples(numbers, numbers)
+patterns = st.one_of(
+    st.builds(Uniform, numbers),
+    st.builds(HalfPlane, angles_rad, numbers, **levels),
+    st.builds(Quadrant, pairs, st.tuples(st.sampled_from((-1, 1)), st.sampled_from((-1, 1))), **levels),
+    st.builds(Disc, pairs, lengths, **levels),
+    st.builds(Polygon, st.lists(pairs, min_size=3, max_size=6).map(tuple), **levels),
+    st.builds(Stripes, angles_rad, lengths, st.floats(0, 1), numbers, **levels),
+    st.builds(Ramp, angles_rad, numbers),
+)
+instruments = st.builds(
+    Instrumentation,
+    unit=names,
+    min=st.none() | st.floats(-100, 0),
+    max=st.none() | st.floats(1, 100),
+    step=st.none() | lengths,
+    sensor=names,
+    height_mm=st.none() | lengths,
+    controls=st.lists(names, max_size=2).map(tuple),
+    description=names,
+)
+
+
+@st.composite
+def plans(draw):
+    n = draw(st.integers(1, 8))
+    columns = [draw(st.lists(numbers, min_size=n, max_size=n)) for _ in range(4)]
+    steps = draw(st.lists(st.sampled_from((0, 1)), min_size=n, max_size=n))
+    scan = np.cumsum([0, *steps[1:]])
+    known = draw(st.dictionaries(names, patterns, min_size=1, max_size=3))
+    return Plan(
+        x_mm=columns[0],
+        y_mm=columns[1],
+        orientation_rad=draw(st.lists(angles_rad, min_size=n, max_size=n)),
+        time_s=np.sort(columns[2]),
+        scan=scan,
+        scan_names=tuple(draw(names) + f"#{k}" for k in range(scan[-1] + 1)),
+        pattern=draw(st.lists(st.integers(0, len(known) - 1), min_size=n, max_size=n)),
+        pattern_names=tuple(known),
+        patterns=known,
+        covariates={"battery_mv": columns[3]} if draw(st.booleans()) else {},
+        instrumentation=draw(instruments),
+    )
+
+
+@st.composite
+def recordings(draw):
+    plan = draw(plans())
+    values = draw(st.lists(st.none() | st.floats(-200, 200), min_size=len(plan), max_size=len(plan)))
+    values[0] = 0.5
+    return Recording(plan, [math.nan if v is None else v for v in values])
+
+
+def assert_same(one: Plan, two: Plan) -> None:
+    for name in ("x_mm", "y_mm", "orientation_rad", "time_s", "scan", "pattern"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
+    assert one.scan_names == two.scan_names
+    assert one.pattern_names == two.pattern_names
+    assert one.patterns == two.patterns
+    assert one.instrumentation == two.instrumentation
+    assert one.covariates.keys() == two.covariates.keys()
+    for name, values in one.covariates.items():
+        np.testing.assert_array_equal(values, two.covariates[name])
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(recording=recordings())
+def test_a_recording_comes_back_to_the_last_bit(recording, tmp_path_factory):
+    path = tmp_path_factory.mktemp("trip") / "rec.csv"
+    write_recording(recording, path)
+    back = read_recording(path)
+    assert_same(recording.plan, back.plan)
+    np.testing.assert_array_equal(recording.readings, back.readings)
+    assert fingerprint(back) == fingerprint(recording)
+    assert sorted(p.name for p in path.parent.iterdir()) == ["rec.csv", "rec.json"]
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(plan=plans())
+def test_a_plan_comes_back_to_the_last_bit(plan, tmp_path_factory):
+    path = tmp_path_factory.mktemp("trip") / "plan.csv"
+    write_plan(plan, path)
+    assert_same(plan, read_plan(path))
+    back, readings = read_plan_and_readings(path)
+    assert_same(plan, back)
+    assert readings is None
+
+
+@given(degrees=st.floats(-1e4, 1e4))
+def test_an_angle_read_from_degrees_is_written_as_degrees_that_read_the_same(degrees):
+    radians = math.radians(degrees)
+    assert math.radians(degrees_of(radians)) == radians
+
+
+def test_round_angles_are_written_round():
+    assert [degrees_of(math.radians(d)) for d in (0, 90, 180, 270, -84.5592)] == [0, 90, 180, 270, -84.5592]
+
+
+def plan_of(n: int, **changes) -> Plan:
+    base = Plan(
+        x_mm=np.arange(float(n)),
+        y_mm=np.zeros(n),
+        orientation_rad=np.zeros(n),
+        time_s=np.arange(float(n)),
+        scan=np.zeros(n, dtype=int),
+        scan_names=("a",),
+        pattern=np.zeros(n, dtype=int),
+        pattern_names=("white",),
+        patterns={"white": Uniform(1.0)},
+    )
+    return replace(base, **changes)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".npy"])
+def test_an_image_travels_with_its_recording(tmp_path, suffix):
+    albedo = np.arange(12).reshape(3, 4) * 20 / 255
+    image = Image(albedo, 2.0, (-4.0, 1.5), f"photo{suffix}")
+    plan = plan_of(2, patterns={"photo": image}, pattern_names=("photo",))
+    write_plan(plan, tmp_path / "plan.csv")
+    back = read_plan(tmp_path / "plan.csv").patterns["photo"]
+    np.testing.assert_allclose(back.albedo, albedo, rtol=1e-15)
+    assert (back.pixel_mm, back.origin_mm, back.file) == (2.0, (-4.0, 1.5), f"photo{suffix}")
+
+
+def test_an_image_that_a_png_cannot_hold_is_not_rounded_in_silence(tmp_path):
+    image = Image(np.array([[0.1234]]), 1.0, (0.0, 0.0), "photo.png")
+    with pytest.raises(ParameterError, match=r"npy"):
+        write_plan(plan_of(2, patterns={"white": image}), tmp_path / "plan.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_scans_of_one_name_that_follow_each_other_stay_two(tmp_path):
+    plan = plan_of(4, scan=[0, 0, 1, 1], scan_names=("a", "a"))
+    write_plan(plan, tmp_path / "plan.csv")
+    back = read_plan(tmp_path / "plan.csv")
+    np.testing.assert_array_equal(back.scan, plan.scan)
+    assert back.scan_names == ("a", "a (again)")
+
+
+def test_the_fingerprint_does_not_depend_on_layout_and_does_on_content(tmp_path):
+    recording = Recording(plan_of(3), [1.0, 2.0, 3.5])
+    write_recording(recording, tmp_path / "a.csv")
+    text = (tmp_path / "a.csv").read_text()
+    rows = [line.split(",") for line in text.split()]
+    turned = "\r\n".join(",".join(reversed(row)) for row in rows)
+    (tmp_path / "b.csv").write_bytes(b"\xef\xbb\xbf" + turned.encode())
+    (tmp_path / "b.json").write_bytes((tmp_path / "a.json").read_bytes())
+    assert fingerprint(read_recording(tmp_path / "b.csv")) == fingerprint(recording)
+    assert fingerprint(Recording(plan_of(3), [1.0, 2.0, 3.6])) != fingerprint(recording)
+
+
+def test_predictions_keep_every_row_and_leave_missing_densities_empty(tmp_path):
+    mean, sd, log_density = np.array([1.0, 2 / 3, 3.0]), np.array([0.1, 0.2, 1 / 3]), np.array([-1.5, np.nan, 0.7])
+    path = tmp_path / "p.csv"
+    write_prediction(Prediction(plan_of(3), mean, sd, log_density), path)
+    back = read_prediction(path)
+    for written, read in zip((mean, sd, log_density), back, strict=True):
+        np.testing.assert_array_equal(written, read)
+    lines = path.read_text().splitlines()
+    assert len(lines) == 4
+    assert lines[2].endswith(",")
+
+
+@pytest.mark.parametrize(
+    ("mean", "sd", "log_density"),
+    [([np.nan, 1], [1, 1], [0, 0]), ([1, 1], [0, 1], [0, 0]), ([1, 1], [1, 1], [0, -np.inf])],
+)
+def test_a_prediction_without_sense_is_refused(mean, sd, log_density):
+    with pytest.raises(ParameterError):
+        Prediction(plan_of(2), mean, sd, log_density)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"patterns": {}},
+        {"scan_names": ("a\nb",)},
+        {"scan_names": (" a",)},
+        {"scan": [1, 0, 0], "scan_names": ("a", "b")},
+        {"covariates": {"reading": [1, 2, 3]}},
+        {"covariates": {"t_c": [1, 2, np.inf]}},
+        {"x_mm": [0, 1, 1e300]},
+        {"patterns": {"white": "paint"}},
+    ],
+)
+def test_what_the_format_cannot_say_is_not_written(tmp_path, changes):
+    with pytest.raises(ParameterError):
+        write_plan(plan_of(3, **changes), tmp_path / "plan.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_writing_into_no_folder_is_a_file_error(tmp_path):
+    with pytest.raises(FileError, match="existing, writable folder"):
+        write_plan(plan_of(2), tmp_path / "none" / "plan.csv")
+
+
+def test_a_write_that_fails_leaves_the_old_file_whole(tmp_path, monkeypatch):
+    path = tmp_path / "plan.csv"
+    write_plan(plan_of(2), path)
+    before = path.read_bytes()
+
+    def no_room(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", no_room)
+    with pytest.raises(FileError, match="No space left"):
+        write_plan(plan_of(5), path)
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["plan.csv", "plan.json"]

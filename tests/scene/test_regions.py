@@ -1,0 +1,190 @@
+"""Albedo and coverage of every kind of region."""
+
+import numpy as np
+import pytest
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.recordings import patterns as kinds
+from probewise.scene import (
+    EllipseRegion,
+    HalfPlaneRegion,
+    ImageRegion,
+    MixtureOfRegions,
+    PolygonRegion,
+    QuadrantRegion,
+    RampRegion,
+    StripesRegion,
+    UniformRegion,
+    disc_region,
+    outlines,
+    region_of,
+)
+
+PATTERNS = {
+    "uniform": kinds.Uniform(0.3),
+    "half_plane": kinds.HalfPlane(0.4, 2.0),
+    "quadrant": kinds.Quadrant((1.0, -2.0), (-1, 1)),
+    "disc": kinds.Disc((3.0, 1.0), 20.0),
+    "polygon": kinds.Polygon(((0.0, 0.0), (14.0, 2.0), (9.0, 15.0), (4.0, 6.0))),
+    "star": kinds.Polygon(((0.0, 20.0), (12.0, -16.0), (-19.0, 6.0), (19.0, 6.0), (-12.0, -16.0))),
+    "stripes": kinds.Stripes(0.3, 9.0, 0.35, 1.0),
+    "ramp": kinds.Ramp(0.7, 0.02),
+    "image": kinds.Image(np.random.default_rng(5).random((12, 16)), 2.0, (-15.0, -11.0), "random.npy"),
+}
+
+
+@pytest.fixture(params=PATTERNS, name="region")
+def _region(request):
+    return region_of(PATTERNS[request.param])
+
+
+def painted(region, centers, pixel, turn, n=60):
+    """Mean albedo over turned squares by brute force: n x n points each."""
+    steps = ((np.arange(n) + 0.5) / n - 0.5) * pixel
+    out = []
+    for center, angle in zip(centers, turn, strict=True):
+        a, b = np.meshgrid(steps, steps)
+        x = center[0] + np.cos(angle) * a - np.sin(angle) * b
+        y = center[1] + np.sin(angle) * a + np.cos(angle) * b
+        out.append(region.albedo(np.stack([x.ravel(), y.ravel()], axis=-1)).mean(axis=1))
+    return np.stack(out, axis=-1)
+
+
+def test_coverage_is_the_mean_albedo_of_a_turned_pixel(region):
+    rng = np.random.default_rng(1)
+    centers, turn = rng.uniform(-18, 18, (80, 2)), rng.uniform(0, 6.3, 80)
+    found = region.coverage(centers, 2.0, turn)
+    tolerance = 0.03 if isinstance(region, ImageRegion) else 0.015
+    assert np.abs(found - painted(region, centers, 2.0, turn)).max() < tolerance
+
+
+def test_coverage_of_a_straight_edge_is_exact():
+    """The share of a square at 45 degrees cut at half its half-diagonal is 7/8."""
+    region = HalfPlaneRegion(np.zeros(1), np.zeros(1))
+    half_diagonal = np.sqrt(0.5)
+    found = region.coverage(np.array([[half_diagonal / 2, 0.0]]), 1.0, np.array([np.pi / 4]))
+    assert found[0, 0] == pytest.approx(7 / 8, abs=1e-12)
+
+
+def test_a_half_plane_and_a_large_polygon_cover_pixels_alike():
+    """Two routes to one number: the projected square, and Green's theorem on clipped edges."""
+    rng = np.random.default_rng(2)
+    centers, turn = rng.uniform(-1, 1, (200, 2)), rng.uniform(0, 6.3, 200)
+    c, s = np.cos(0.7), np.sin(0.7)
+    far = np.array([[0.0, -99.0], [99.0, -99.0], [99.0, 99.0], [0.0, 99.0]]) @ np.array([[c, s], [-s, c]])
+    half = HalfPlaneRegion(np.array([0.7]), np.zeros(1))
+    assert np.allclose(
+        PolygonRegion.simple(far[None]).coverage(centers, 1.3, turn), half.coverage(centers, 1.3, turn), atol=1e-10
+    )
+
+
+def test_the_inner_pentagon_of_a_star_is_outside_by_the_even_odd_rule():
+    star = region_of(PATTERNS["star"])
+    assert star.albedo(np.array([[0.0, 0.0], [0.0, 17.0]])).tolist() == [[0.0, 1.0]]
+    area = star.coverage(np.stack(np.meshgrid(np.arange(-25, 26.0), np.arange(-25, 26.0)), -1).reshape(-1, 2), 1.0, 0.0 * np.arange(51**2))
+    crossed = 0.5 * np.sum(np.cross(star.edges_mm[0, :, 0], star.edges_mm[0, :, 1])) if False else None
+    assert crossed is None
+    edges = star.edges_mm[0]
+    shoelace = 0.5 * np.sum(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    assert area.sum() == pytest.approx(shoelace, rel=1e-9)
+
+
+def test_an_edge_traced_twice_bounds_nothing():
+    doubled = PolygonRegion.even_odd(np.array([[0.0, 0], [2, 0], [2, 2], [0, 2], [0, 0], [0, 2], [2, 2], [2, 0], [4, 0], [4, 2], [2, 2], [2, 0]]))
+    points = np.array([[1.0, 1.0], [3.0, 1.0], [9.0, 9.0]])
+    assert doubled.albedo(points).tolist() == [[0.0, 1.0, 0.0]]
+
+
+def test_vertices_in_either_sense_make_the_same_polygon():
+    corners = np.array([[[0.0, 0], [5, 0], [5, 3], [0, 3]]])
+    points = np.random.default_rng(0).uniform(-2, 7, (100, 2))
+    one, other = PolygonRegion.simple(corners), PolygonRegion.simple(corners[:, ::-1])
+    zero = np.zeros(100)
+    assert np.array_equal(one.coverage(points, 1.0, zero), other.coverage(points, 1.0, zero))
+
+
+def test_quadrant_and_half_plane_follow_the_format_at_the_edge():
+    """Inside is strictly beyond the edge (recording format)."""
+    half = region_of(kinds.HalfPlane(0.0, 1.0))
+    quadrant = region_of(kinds.Quadrant((0.0, 0.0), (1, -1)))
+    assert half.albedo(np.array([[1.0, 0.0], [1.0001, 0.0]])).tolist() == [[0.0, 1.0]]
+    assert quadrant.albedo(np.array([[1.0, -1.0], [1.0, 1.0], [0.0, -1.0]])).tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_inside_and_outside_albedo_are_kept():
+    region = region_of(kinds.Disc((0.0, 0.0), 5.0, inside=0.2, outside=0.9))
+    assert region.albedo(np.array([[0.0, 0.0], [9.0, 0.0]])).tolist() == [[0.2, 0.9]]
+    assert region.coverage(np.array([[0.0, 0.0], [9.0, 0.0]]), 1.0, np.zeros(2)).tolist() == [[0.2, 0.9]]
+
+
+def test_an_image_has_its_first_row_on_top():
+    region = ImageRegion(np.array([[1.0, 0.0], [0.25, 0.5]]), 10.0, (0.0, 0.0))
+    points = np.array([[5.0, 15.0], [15.0, 15.0], [5.0, 5.0], [15.0, 5.0], [25.0, 5.0], [-1.0, 5.0]])
+    assert region.albedo(points).tolist() == [[1.0, 0.0, 0.25, 0.5, 0.0, 0.0]]
+
+
+def test_a_batch_equals_its_members_one_by_one():
+    rng = np.random.default_rng(3)
+    points, turn = rng.uniform(-20, 20, (30, 2)), rng.uniform(0, 6, 30)
+    n = 5
+    angle, center = rng.uniform(0, 6, n), rng.normal(size=(n, 2))
+    makers = [
+        lambda i: UniformRegion(np.linspace(0, 1, n)[i]),
+        lambda i: HalfPlaneRegion(angle[i], center[i, 0]),
+        lambda i: QuadrantRegion(center[i], np.sign(center)[i]),
+        lambda i: EllipseRegion(center[i], 5 + np.abs(center)[i], angle[i]),
+        lambda i: PolygonRegion.simple(center[i][:, None] + rng_corners),
+        lambda i: StripesRegion(angle[i], 3 + angle[i], 0.4 + 0 * angle[i], center[i, 0]),
+        lambda i: RampRegion(angle[i], center[i, 0]),
+    ]
+    rng_corners = np.array([[-4.0, -3.0], [5.0, -2.0], [3.0, 6.0]])
+    for make in makers:
+        whole = make(slice(None))
+        assert whole.n_regions == n
+        for i in range(n):
+            one = make(slice(i, i + 1))
+            assert np.allclose(whole.albedo(points)[i], one.albedo(points)[0])
+            assert np.allclose(whole.coverage(points, 1.5, turn)[i], one.coverage(points, 1.5, turn)[0])
+
+
+def test_a_mixture_takes_each_hypothesis_from_its_own_kind():
+    disc = disc_region(np.zeros((2, 2)), np.array([1.0, 5.0]))
+    half = HalfPlaneRegion(np.zeros(1), np.zeros(1))
+    mixed = MixtureOfRegions(np.array([0, 1, 0]), (disc, half))
+    assert mixed.albedo(np.array([[3.0, 0.0], [-0.5, 0.0]])).tolist() == [[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
+    with pytest.raises(ShapeError, match="part 0 holds 2"):
+        MixtureOfRegions(np.array([0, 1]), (disc, half))
+
+
+def test_outlines_lie_on_the_edge():
+    ellipse = EllipseRegion(np.array([[1.0, 2.0]]), np.array([[5.0, 3.0]]), np.array([0.4]))
+    square = PolygonRegion.simple(np.array([[[0.0, 0], [4, 0], [4, 4], [0, 4]]]))
+    mixed = MixtureOfRegions(np.array([1, 0]), (ellipse, square))
+    traces = outlines(mixed)
+    assert len(traces[0]) == 5
+    assert np.array_equal(traces[0][0], traces[0][-1])
+    inner = 1 + (traces[1] - [1.0, 2.0]) * 0.999 + [0.0, 1.0]
+    assert ellipse.albedo(inner).all()
+    assert not ellipse.albedo([1.0, 2.0] + (traces[1] - [1.0, 2.0]) * 1.001).any()
+    with pytest.raises(ParameterError, match="HalfPlaneRegion"):
+        outlines(HalfPlaneRegion(np.zeros(1), np.zeros(1)))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: disc_region(np.zeros((1, 2)), np.array([-3.0])), "semi_axes_mm is -3.0; allowed: greater than 0"),
+        (lambda: StripesRegion([0.0], [5.0], [1.5], [0.0]), "duty"),
+        (lambda: QuadrantRegion([[0.0, 0.0]], [[1.0, 0.5]]), "direction"),
+        (lambda: HalfPlaneRegion([np.nan], [0.0]), r"normal_rad\[0\] is nan"),
+        (lambda: HalfPlaneRegion([0.0, 1.0, 2.0], [0.0, 1.0]), "offset_mm has 2 rows"),
+        (lambda: PolygonRegion.simple(np.zeros((1, 2, 2))), "3 or more"),
+        (lambda: PolygonRegion.even_odd(np.zeros((4, 2))), "a polygon with an area"),
+        (lambda: PolygonRegion.even_odd(np.array([[0.0, 0], [1, 0], [2, 0]])), "a polygon with an area"),
+        (lambda: ImageRegion(np.zeros((0, 3)), 1.0, (0.0, 0.0)), "not empty"),
+        (lambda: region_of("a square"), "a pattern of probewise.recordings.patterns"),
+    ],
+)
+def test_numbers_that_make_no_region_are_named(build, message):
+    with pytest.raises((ParameterError, ShapeError), match=message):
+        build()

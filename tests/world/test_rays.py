@@ -1,0 +1,197 @@
+"""The light that a spot gathers, against closed forms and against itself refined."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+from scipy.stats import multivariate_normal
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform, paper_plan
+from probewise.world import (
+    Blob,
+    Oval,
+    Spot,
+    World,
+    gaussian_spot,
+    paint,
+    raster_spot,
+    ridge_spot,
+    seen_white,
+    tailed_spot,
+)
+
+BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)
+SPOTS = {
+    "gaussian": lambda pixel_mm: gaussian_spot([BLOB], pixel_mm=pixel_mm),
+    "two gaussians": lambda pixel_mm: gaussian_spot([BLOB, Blob(0.5, (3, -2), (1.5, 2), -0.5)], pixel_mm=pixel_mm),
+    "ridge": lambda pixel_mm: ridge_spot(pixel_mm=pixel_mm),
+    "tailed": lambda pixel_mm: tailed_spot((2.0, 1.5), pixel_mm=pixel_mm),
+}
+SURFACES = {
+    "half plane": HalfPlane(0.0, 0.0),
+    "slanted half plane": HalfPlane(0.7, 1.3),
+    "quadrant": Quadrant((1.0, 2.0), (-1, 1)),
+    "disc": Disc((3.0, -2.0), 11.3),
+    "oval": Oval((0.0, 4.0), (14.0, 6.0), 0.4),
+    "polygon": Polygon(((-9.0, -7.0), (12.0, -3.0), (2.0, 10.0))),
+    "stripes": Stripes(0.2, 7.0, 0.4, 1.0),
+}
+
+
+def poses(n=40):
+    rng = np.random.default_rng(3)
+    # Whole millimetres and right angles are the hard case: edges run along pixel borders.
+    x, y = rng.integers(-12, 13, n).astype(float), rng.integers(-12, 13, n).astype(float)
+    turn = np.where(np.arange(n) % 2, rng.uniform(0, 6.28, n), rng.integers(0, 4, n) * np.pi / 2)
+    return x, y, turn
+
+
+@pytest.mark.parametrize("spot", SPOTS)
+@pytest.mark.parametrize("surface", SURFACES)
+def test_refining_pixels_and_rays_changes_less_than_a_thousandth(spot, surface):
+    coarse = seen_white(SURFACES[surface], SPOTS[spot](0.25), *poses())
+    fine = seen_white(SURFACES[surface], SPOTS[spot](0.1), *poses(), n_rays=256)
+    assert np.abs(coarse - fine).max() < 1e-3
+
+
+def test_a_half_plane_is_the_normal_integral():
+    """A Gaussian spot over a straight edge: the distribution function of its distance to the edge."""
+    x, _, turn = poses(200)
+    normal, offset = 0.7, 1.3
+    direction = normal - turn  # the edge's normal in the sensor frame
+    c, s = np.cos(direction), np.sin(direction)
+    sd = np.sqrt(16 * c**2 + 6.25 * s**2 + 2 * 0.15 * 10 * c * s)
+    expected = ndtr((x * math.cos(normal) + 1.5 * s - offset) / sd)
+    got = seen_white(HalfPlane(normal, offset), gaussian_spot([BLOB]), x, np.zeros(200), turn)
+    assert np.abs(got - expected).max() < 3e-4
+
+
+@pytest.mark.parametrize(
+    ("corner", "direction"), [((0, 0), (1, 1)), ((0, 0), (-1, 1)), ((4, 4), (1, 1)), ((-4, 4), (-1, 1))]
+)
+def test_a_quadrant_is_the_bivariate_normal_integral(corner, direction):
+    (cx, cy), (dx, dy) = corner, direction
+    cov = [[16, 1.5 * dx * dy], [1.5 * dx * dy, 6.25]]
+    expected = multivariate_normal(mean=[0, 0], cov=cov).cdf([dx * (0 - cx), dy * (1.5 - cy)])
+    got = seen_white(Quadrant(corner, direction), gaussian_spot([BLOB]), *np.zeros((3, 1)))[0]
+    assert abs(got - expected) < 3e-4
+
+
+def test_a_disc_under_a_round_spot_is_the_rayleigh_integral():
+    spot = gaussian_spot([Blob(1.0, (0.0, 0.0), (3.0, 3.0))])
+    got = seen_white(Disc((5.0, 5.0), 4.0), spot, np.array([5.0]), np.array([5.0]), np.array([1.0]))[0]
+    assert abs(got - (1 - math.exp(-16 / 18))) < 3e-4
+
+
+@pytest.mark.parametrize("spot", SPOTS)
+def test_a_plain_surface_shows_its_albedo(spot):
+    x, y, turn = poses()
+    np.testing.assert_allclose(seen_white(Uniform(0.3), SPOTS[spot](0.25), x, y, turn), 0.3, rtol=1e-12)
+
+
+def test_a_ramp_shows_the_albedo_at_the_spots_middle():
+    spot = tailed_spot()
+    mean, _ = spot.moments()
+    x, y, turn = poses()
+    u = x + np.cos(turn) * mean[0] - np.sin(turn) * mean[1]
+    np.testing.assert_allclose(seen_white(Ramp(0.0, 0.02), spot, x, y, turn), 0.02 * u, atol=1e-12)
+
+
+def test_turning_spot_and_surface_together_changes_nothing():
+    spot = ridge_spot()
+    x, y, turn = poses()
+    by = 0.9
+    c, s = math.cos(by), math.sin(by)
+    one = seen_white(HalfPlane(0.2, 1.0), spot, x, y, turn)
+    two = seen_white(HalfPlane(0.2 + by, 1.0), spot, c * x - s * y, s * x + c * y, turn + by)
+    assert np.abs(one - two).max() < 5e-4
+
+
+def test_a_photograph_of_a_polygon_looks_like_the_polygon():
+    triangle = SURFACES["polygon"]
+    centers = (np.arange(300) + 0.5) * 0.1 - 15
+    x, y = np.meshgrid(centers, centers[::-1])  # first row on top
+    photo = Image(paint(triangle, x, y), 0.1, (-15.0, -15.0), "photo.npy")
+    spot = gaussian_spot([BLOB])
+    apart = seen_white(photo, spot, *poses()) - seen_white(triangle, spot, *poses())
+    assert np.abs(apart).max() < 2e-3
+
+
+def test_an_image_shows_nothing_outside_and_has_its_first_row_on_top():
+    photo = Image(np.array([[0.1, 0.2], [0.3, 0.4]]), 2.0, (10.0, 20.0), "photo.npy")
+    x, y = np.array([11.0, 13.0, 11.0, 13.0, 9.9, 14.1]), np.array([23.0, 23.0, 21.0, 21.0, 21.0, 21.0])
+    np.testing.assert_array_equal(paint(photo, x, y), [0.1, 0.2, 0.3, 0.4, 0, 0])
+
+
+def test_a_polygon_that_crosses_itself_follows_the_even_odd_rule():
+    star = Polygon(tuple((math.sin(k * 4 * math.pi / 5), math.cos(k * 4 * math.pi / 5)) for k in range(5)))
+    np.testing.assert_array_equal(paint(star, np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.7, 0.0])), [0, 1, 0])
+
+
+def test_inside_and_outside_can_be_any_two_levels():
+    disc = Disc((0, 0), 1.0, inside=0.2, outside=0.7)
+    np.testing.assert_array_equal(paint(disc, np.array([0.0, 2.0]), np.zeros(2)), [0.2, 0.7])
+
+
+def test_no_surface_is_no_surface():
+    with pytest.raises(ParameterError, match="pattern of the recording format"):
+        paint("white", np.zeros(1), np.zeros(1))
+
+
+def test_moments_of_a_gaussian_spot_are_those_asked_for():
+    mean, covariance = gaussian_spot([BLOB]).moments()
+    np.testing.assert_allclose(mean, [0, 1.5], atol=1e-6)
+    np.testing.assert_allclose(covariance, [[16, 1.5], [1.5, 6.25]], atol=0.006)
+
+
+def test_the_other_spots_are_no_gaussians():
+    """A Gaussian's fourth moment along u is three times its variance squared; these are far from it."""
+    for spot in (ridge_spot(), tailed_spot()):
+        u_edges, _ = spot.edges_mm()
+        u = u_edges[:-1] + spot.pixel_mm / 2
+        share = spot.weights.sum(axis=0)
+        mean = share @ u
+        kurtosis = share @ (u - mean) ** 4 / (share @ (u - mean) ** 2) ** 2
+        assert abs(kurtosis - 3) > 0.4
+
+
+@pytest.mark.parametrize(
+    ("weights", "pixel_mm", "error"),
+    [
+        (np.zeros((2, 2)), 1.0, ParameterError),
+        ([[1.0, -1.0]], 1.0, ParameterError),
+        ([[1.0, np.nan]], 1.0, ParameterError),
+        ([[1.0]], 0.0, ParameterError),
+        ([1.0], 1.0, ShapeError),
+    ],
+)
+def test_a_spot_without_light_is_refused(weights, pixel_mm, error):
+    with pytest.raises(error):
+        Spot(np.array(weights), pixel_mm, (0.0, 0.0))
+
+
+def test_a_skew_of_one_is_refused():
+    with pytest.raises(ParameterError):
+        tailed_spot(skew=1.0)
+
+
+def test_any_density_can_be_a_spot():
+    square = raster_spot(lambda u, v: ((abs(u) < 2) & (abs(v) < 2)).astype(float), 5.0)
+    got = seen_white(HalfPlane(0.0, 0.0), square, np.array([-1.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(got, [0.25, 0.5, 0.75], atol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_plan_takes_less_than_two_seconds_and_a_reading_less_than_20_ms():
+    import time
+
+    world = World(gaussian_spot([BLOB]))
+    start = time.perf_counter()
+    world.expected(paper_plan())
+    assert time.perf_counter() - start < 2
+    start = time.perf_counter()
+    for k in range(20):
+        world.read(Disc((500.0, 200.0), 80.0), 420.0 + k, 200.0, time_s=0.0, rng=None)
+    assert (time.perf_counter() - start) / 20 < 0.02

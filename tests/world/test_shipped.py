@@ -1,0 +1,60 @@
+"""What ships is what the seeds make, and what it conceals has the size that is said."""
+
+import numpy as np
+import pytest
+
+from probewise.errors import ParameterError
+from probewise.recordings import shipped, two_way_plan
+from probewise.world import Blob, CorrelatedNoise, World, gaussian_spot
+from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, make
+
+
+@pytest.fixture(scope="module")
+def made_again(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made")
+    main([str(folder)])
+    return folder
+
+
+@pytest.mark.parametrize("name", ["paper", "drifting"])
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_the_shipped_files_are_made_again_byte_for_byte(made_again, name, suffix):
+    assert (made_again / f"{name}{suffix}").read_bytes() == shipped(name).with_suffix(suffix).read_bytes()
+
+
+def test_the_files_do_not_tell_what_they_conceal():
+    text = shipped("drifting").with_suffix(".json").read_text()
+    assert not any(effect.name in text for effect in CANDIDATES)
+
+
+def test_a_recording_that_does_not_ship_cannot_be_made():
+    with pytest.raises(ParameterError):
+        make("other")
+
+
+def test_the_paper_recording_conceals_nothing_and_the_other_one_thing():
+    assert make("paper").world.concealed == ()
+    assert len(make("drifting").world.concealed) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", [e for e in CANDIDATES if not isinstance(e, CorrelatedNoise)], ids=lambda e: e.name)
+def test_every_candidate_has_a_size_of_15_to_25(effect):
+    """Diagnosis, size of an effect: what is left of the noise-free readings after the null is refitted in full."""
+    plan = two_way_plan()
+    truth = np.array([*BLOB.center_mm, *BLOB.sd_mm, BLOB.correlation, BLACK, WHITE])
+
+    def null(theta, *concealed):
+        spot = gaussian_spot([Blob(1.0, (theta[0], theta[1]), (theta[2], theta[3]), theta[4])])
+        return World(spot, theta[5], theta[6], concealed=concealed).expected(plan)
+
+    steps = np.array([0.1, 0.1, 0.1, 0.1, 0.02, 0.1, 0.1])
+    jacobian = np.stack(
+        [(null(truth + d) - null(truth - d)) / (2 * d.sum()) for d in np.diag(steps)],
+        axis=1,
+    )
+    readings, theta = null(truth, effect), truth.copy()
+    for _ in range(3):
+        theta += np.linalg.lstsq(jacobian, readings - null(theta), rcond=None)[0]
+    size = np.linalg.norm(readings - null(theta)) / NOISE_SD
+    assert 15 < size < 25

@@ -103,7 +103,7 @@ def assert_same(one: Plan, two: Plan) -> None:
         np.testing.assert_array_equal(values, two.covariates[name])
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(recording=recordings())
 def test_a_recording_comes_back_to_the_last_bit(recording, tmp_path_factory):
     path = tmp_path_factory.mktemp("trip") / "rec.csv"

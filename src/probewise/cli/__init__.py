@@ -15,13 +15,13 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from probewise.cli import calibrate, explore, predict
+from probewise.cli import calibrate, demo, diagnose, explore, predict
 from probewise.cli._common import OneLineParser, Verb
 from probewise.errors import NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
 
-VERBS: tuple[Verb, ...] = (calibrate.VERB, predict.VERB, explore.VERB)
+VERBS: tuple[Verb, ...] = (demo.VERB, calibrate.VERB, predict.VERB, explore.VERB, diagnose.VERB)
 
 
 def parser() -> OneLineParser:

@@ -28,7 +28,7 @@ from probewise.scene import (
     RegularPolygon,
     Shape,
 )
-from probewise.sensor import Chain, FieldSSF, FixedLevels, NaiveSensor
+from probewise.sensor import Chain, FixedLevels, NaiveSensor, footprint_of, mean_mixture
 from probewise.world import Oval, Spot, Surface, World
 
 __all__ = ["SHAPES", "experiment_for", "field_arm", "parse_field", "parse_truth", "shape_named", "surface_of", "world_like"]
@@ -63,7 +63,8 @@ def experiment_for(sensor: FittedSensor, shape: Shape, field: Field, *, model: s
     Parameters
     ----------
     sensor
-        As calibrated. The SSF model takes its mean field, the naive model its two levels.
+        As calibrated. The SSF model takes the mixture with the mean and covariance of its mean field, so that
+        closed forms stand in for the sum over pixels; the naive model takes its two levels.
     shape
         What may lie on the field.
     field
@@ -81,7 +82,9 @@ def experiment_for(sensor: FittedSensor, shape: Shape, field: Field, *, model: s
     if model == "naive":
         likelihood = Naive(levels.i_min, noise_sd, levels.i_max, noise_sd)
         return Experiment(shape, NaiveSensor(levels, scene), likelihood, noise_sd, grid, n_live=n_live)
-    chain = Chain(FieldSSF(sensor.field), levels, scene)
+    n = sensor.n_gaussians
+    mixture = mean_mixture(footprint_of(sensor.samples[:, : 6 * n], n), n_gaussians=n)
+    chain = Chain(mixture, levels, scene)
     return Experiment(shape, chain, GaussianKnown(noise_sd), noise_sd, grid, n_live=n_live)
 
 

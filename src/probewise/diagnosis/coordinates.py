@@ -134,9 +134,7 @@ def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArra
     slope = ((up - down) / (2 * steps[:, None])).T
     natural_cov = slope @ cov @ slope.T
     floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
-    return SensorCoordinates(
-        n_gaussians, center, np.linalg.cholesky(natural_cov + np.diag(floor)), exchangeable=False
-    )
+    return SensorCoordinates(n_gaussians, center, np.linalg.cholesky(natural_cov + np.diag(floor)), exchangeable=False)
 
 
 def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
@@ -153,4 +151,4 @@ def effect_scores(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
         middle = (low + high) / 2
         below = (effect_values(effect, middle) < values) == rising
         low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return (low + high) / 2
+    return np.asarray((low + high) / 2)

@@ -56,16 +56,20 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
     """
     everything = np.arange(len(usable))
     direction = plan.direction[usable]
-    sign = np.where(direction[:, 0] != 0, np.sign(direction[:, 0]), np.sign(direction[:, 1]))
+    sign: FloatArray = np.where(direction[:, 0] != 0, np.sign(direction[:, 0]), np.sign(direction[:, 1]))
     moving = np.flatnonzero(sign != 0)
     scan = plan.scan[usable]
-    degrees = np.round(np.degrees(plan.orientation_rad[usable]), 6)
+    degrees = np.asarray(np.round(np.degrees(plan.orientation_rad[usable]), 6), dtype=np.float64)
     pooled: Mapping[str, FloatArray] = {
         "time": plan.time_s[usable],
         "level": level,
         **{name: values[usable] for name, values in plan.covariates.items()},
     }
-    out = [Covariate(name, values, everything) for name, values in pooled.items() if _varies(values)]
+    out: list[Covariate] = []
+    for name, values in pooled.items():
+        there = np.flatnonzero(np.isfinite(values))
+        if there.size and _varies(values[there]):
+            out.append(Covariate(name, values[there], there))
     if moving.size and _varies(slope[moving]):
         out.append(Covariate("slope", slope[moving], moving))
     if _varies(sign[moving]):
@@ -92,5 +96,4 @@ def _along(x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
 
 
 def _varies(values: FloatArray) -> bool:
-    values = values[np.isfinite(values)]
     return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(1.0, float(np.abs(values).max()))

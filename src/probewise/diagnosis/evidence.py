@@ -48,16 +48,14 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
     p = found.slopes.shape[1]
     eye = np.eye(p)
-    constant = (
-        float(gammaln(n_points / 2)) - 0.5 * n_points * math.log(math.pi) + found.model.sensor.log_multiplicity
-    )
+    constant = float(gammaln(n_points / 2)) - 0.5 * n_points * math.log(math.pi) + found.model.sensor.log_multiplicity
     out = np.empty(len(noise.whiteners))
     for node, whitener in enumerate(noise.whiteners):
         turned = whitener(joined)
         gram = turned.T @ turned
         jj, jr, rr = gram[:p, :p], gram[:p, p], float(gram[p, p])
         floor = n_points * sd_floor**2
-        rss, step = rr + floor, np.zeros(p)
+        rss = rr + floor
         for _ in range(3):
             variance = rss / n_points
             curvature = jj / variance + eye
@@ -65,9 +63,7 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
             rss = max(rr - 2 * float(step @ jr) + float(step @ jj @ step), 0.0) + floor
         _, log_det = np.linalg.slogdet(curvature)
         z = found.z + step
-        out[node] = (
-            constant - 0.5 * n_points * math.log(rss) - whitener.log_det() - 0.5 * float(z @ z) - 0.5 * log_det
-        )
+        out[node] = constant - 0.5 * n_points * math.log(rss) - whitener.log_det() - 0.5 * float(z @ z) - 0.5 * log_det
     return NoiseEvidence(noise, float(logsumexp(out)) - math.log(len(out)), out)
 
 
@@ -105,6 +101,12 @@ class Linearised:
         turned = np.zeros((self.n_rows, columns.shape[1]))
         turned[: self.n_points] = self.whitener(columns) / self.sd
         return turned - self.basis @ (self.basis.T @ turned)
+
+    def absorbed(self, found: Fit, change: FloatArray) -> FloatArray:
+        """Move the fit's coordinates so that a change of the readings (n_points,) is taken up, (n_params,)."""
+        slopes = self.whitener(found.slopes) / self.sd
+        shift = slopes.T @ (self.whitener(found.residuals - change) / self.sd) - found.z
+        return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
 
     def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw residuals under the null, shape (n_rows, n_draws)."""
@@ -187,4 +189,5 @@ def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int
         occam = np.add.reduceat(0.5 * np.log1p(ratio), blocks.starts)
         explained = np.add.reduceat(scores * (ratio / (1 + ratio))[:, None], blocks.starts, axis=0) / total
         terms[k] = -occam[:, None] - 0.5 * n_points * np.log1p(-np.minimum(explained, 1 - 1e-12))
-    return np.asarray(logsumexp(terms, axis=0) - math.log(len(SCALES)))
+    top = terms.max(axis=0)
+    return np.asarray(top + np.log(np.exp(terms - top).mean(axis=0)))

@@ -21,7 +21,7 @@ from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 __all__ = ["Fit", "Model", "fit", "start_with_more_gaussians", "starts_of_one_gaussian"]
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
-_DAMPINGS = np.array([0.0, 0.02, 0.2, 2.0, 20.0, 300.0])
+_DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +114,12 @@ def fit(
     *,
     sd_floor: float,
     max_steps: int = 30,
-    tolerance: float = 1e-3,
+    tolerance: float = 5e-3,
 ) -> Fit:
     """Find the most probable point, the noise sd integrated out.
 
     Maximises -(n/2) log RSS - |z|^2 / 2 over the box |z| <= 6. Each step differentiates in one
-    vectorised prediction and tries six dampings in another.
+    vectorised prediction and tries five dampings in another.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def fit(
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         whitened = whitener((readings - predicted).T)
         rss = np.sum(whitened**2, axis=0) + floor
-        return 0.5 * n_points * np.log(rss) + 0.5 * np.sum(z**2, axis=1)
+        return np.asarray(0.5 * n_points * np.log(rss) + 0.5 * np.sum(z**2, axis=1))
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))

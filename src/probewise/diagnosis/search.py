@@ -1,4 +1,4 @@
-"""Score, weigh, combine: which set of effects explains the recording?
+"""Score, weigh, combine: find the set of effects that explains the recording.
 
 Every subset of effects on the mean, under every noise model and several SSF orders. Templates screen,
 a beam of the best is refitted jointly and non-linearly, Laplace weighs.
@@ -46,8 +46,8 @@ class PriorOdds:
 
     clean_mean: float = 0.60
     unknown: float = 0.06
-    by_size: tuple[float, ...] = (0.27, 0.05, 0.02)
-    white: float = 0.84
+    by_size: tuple[float, ...] = (0.31, 0.025, 0.005)
+    white: float = 0.88
 
     def log_mean(self, names: Names, n_effects: int) -> float:
         """Log prior of a combination of effects on the mean."""
@@ -94,7 +94,7 @@ class Search:
     sd_floor: float
     covariates: tuple[Covariate, ...]
     unknown_bases: UnknownTemplates
-    slope: FloatArray
+    unknown_shares: Mapping[str, float]
     probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)  # (mean, noise); ("unknown",)
     order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
 
@@ -161,6 +161,8 @@ class _Searcher:
         }
         self.candidates: dict[tuple[int, Names], Candidate] = {}
         self.sensors: dict[int, SensorCoordinates] = {}
+        self.unknown_shares: dict[str, float] = {}
+        self.not_felt: set[Names] = set()
 
     def run(self) -> Search:
         order = self._null_fits()
@@ -184,31 +186,34 @@ class _Searcher:
             self.sd_floor,
             covariates,
             bases,
-            slope,
+            self.unknown_shares,
         )
+        self._refit_what_matters(search, screened)
         self._other_orders(search)
         return weighed(search)
 
     def _fit(self, model: Model, starts: FloatArray, whitener: Whitener, max_steps: int = 30) -> Fit:
-        fits = [
-            fit(model, self.recording, start, whitener, sd_floor=self.sd_floor, max_steps=max_steps)
-            for start in starts
-        ]
-        return min(fits, key=lambda f: f.objective)
+        """Go a few steps from each start, then all the way from the best."""
+        if len(starts) > 1:
+            tried = [
+                fit(model, self.recording, start, whitener, sd_floor=self.sd_floor, max_steps=5) for start in starts
+            ]
+            starts = min(tried, key=lambda f: f.objective).z[None, :]
+        return fit(model, self.recording, starts[0], whitener, sd_floor=self.sd_floor, max_steps=max_steps)
 
     def _weighed(self, model: Model, starts: FloatArray, max_steps: int = 30) -> Candidate:
         """Fit with white noise, weigh under every noise model, refit where another one is more probable."""
         found = self._fit(model, starts, white(self.n_points), max_steps)
         evidence = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
-        score = {
-            k: e.log_z + self.prior.log_noise(k, len(self.noise_models)) for k, e in evidence.items()
-        }
+        score = {k: e.log_z + self.prior.log_noise(k, len(self.noise_models)) for k, e in evidence.items()}
         best = max(score, key=lambda k: score[k])
         if best:
             found = self._fit(model, found.z[None, :], evidence[best].whitener, max_steps)
             evidence = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
-        candidate = Candidate(found, evidence)
-        self.candidates[model.sensor.n_gaussians, tuple(sorted(model.names))] = candidate
+        return Candidate(found, evidence)
+
+    def _keep(self, candidate: Candidate) -> Candidate:
+        self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
     def _null_fits(self) -> int:
@@ -217,19 +222,20 @@ class _Searcher:
         if self.sensor is not None:
             n = self.sensor.n_gaussians
             self.sensors[n] = self.sensor
-            self._weighed(Model(self.sensor, (), plan), np.zeros((1, self.sensor.n_params)))
+            self._keep(self._weighed(Model(self.sensor, (), plan), np.zeros((1, self.sensor.n_params))))
             return n
         first = default_sensor(self.extent, 1)
         self.sensors[1] = first
-        last = self._weighed(Model(first, (), plan), starts_of_one_gaussian(first))
+        last = self._keep(self._weighed(Model(first, (), plan), starts_of_one_gaussian(first)))
         log_z = {1: _best_log_z(last)}
-        for n in range(2, self.max_order + 2):
-            if n > self.max_order and max(log_z, key=lambda k: log_z[k]) != self.max_order:
+        for n in range(2, self.max_order + 2 if self.max_order > 1 else 2):
+            # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
+            if log_z[n - 1] < max(log_z.values()) - 3:
                 break
             wanted = default_sensor(self.extent, n)
             self.sensors[n] = wanted
             starts = start_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
-            last = self._weighed(Model(wanted, (), plan), starts)
+            last = self._keep(self._weighed(Model(wanted, (), plan), starts))
             log_z[n] = _best_log_z(last)
         return max(log_z, key=lambda k: log_z[k])
 
@@ -255,10 +261,15 @@ class _Searcher:
             for i, names in enumerate(combinations):
                 of = scores[np.array(owners) == i]
                 screened[names, noise] = float(logsumexp(of)) - math.log(len(of))
-            unknown[noise] = _mean_by_family(_log_bayes_factors(problem, bases.columns), bases.families)
+            by_family = _by_family(_log_bayes_factors(problem, bases.columns), bases.families)
+            unknown[noise] = float(logsumexp(list(by_family.values()))) - math.log(len(by_family))
+            if evidence is max(null.evidence.values(), key=lambda e: e.log_z):
+                self.unknown_shares = {
+                    k: math.exp(v - logsumexp(list(by_family.values()))) for k, v in by_family.items()
+                }
         return screened, unknown
 
-    def _grow_beam(self, order: int, screened: Mapping[tuple[Names, Names], float]) -> None:
+    def _grow_beam(self, order: int, screened: dict[tuple[Names, Names], float]) -> None:
         """Refit the best combinations of each size, each grown from the best of the size before."""
         null = self.candidates[order, ()]
         reference = {k: e.log_z for k, e in null.evidence.items()}
@@ -270,23 +281,63 @@ class _Searcher:
             if size == 2:
                 for (names, noise), value in screened.items():
                     if len(names) == 2 and value > wishes.get(names, (-np.inf,))[0]:
-                        parent = grown.get(names[:1]) or grown.get(names[1:])
-                        if parent is not None:
-                            added = names[1] if parent[1].names == names[:1] else names[0]
-                            wishes[names] = (value + reference[noise] - max(reference.values()), parent[1], added)
+                        held = grown.get(names[:1]) or grown.get(names[1:])
+                        if held is not None:
+                            added = names[1] if held[1].names == names[:1] else names[0]
+                            wishes[names] = (value + reference[noise] - max(reference.values()), held[1], added)
             ranked = sorted(wishes, key=lambda names: -wishes[names][0])
             best_so_far = max(score for score, _ in grown.values())
             grown = {}
             for rank, names in enumerate(ranked[: self.beam]):
                 score, parent_candidate, added = wishes[names]
                 # A combination that screening puts this far behind cannot come to matter.
-                if size > 1 and score < best_so_far - 4 or (size == 1 and rank >= 2 and score < -4):
+                if score < best_so_far - 3 and (size > 1 or rank > 0):
                     continue
-                candidate = self._extend(parent_candidate, added)
+                candidate = self._refit(parent_candidate, added, screened)
+                if candidate is None:
+                    continue
                 gain = max(e.log_z - max(reference.values()) for e in candidate.evidence.values())
                 grown[names] = (gain, candidate)
             if not grown:
                 break
+
+    def _refit(self, parent: Candidate, added: str, screened: dict[tuple[Names, Names], float]) -> Candidate | None:
+        """Refit a candidate with one more effect and keep it, or note that the effect is not felt."""
+        candidate, scores = self._extend(parent, added)
+        if _acts(candidate, parent):
+            return self._keep(candidate)
+        # Laplace fails where an effect is too small to be felt and the closed form does not; but the
+        # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
+        null = self.candidates[parent.n_gaussians, ()]
+        names = tuple(sorted((*parent.names, added)))
+        for noise, value in scores.items():
+            screened[names, noise] = min(value, 0.0) + parent.evidence[noise].log_z - null.evidence[noise].log_z
+        self.not_felt.add(names)
+        return None
+
+    def _refit_what_matters(self, search: Search, screened: dict[tuple[Names, Names], float]) -> None:
+        """Refit whatever the screening alone would give some probability, the most probable first."""
+        null = self.candidates[search.order, ()]
+        for _ in range(6):
+            merged: dict[Names, float] = {}
+            for (names, _noise), p in weighed(search).probabilities.items():
+                if names not in ((), ("unknown",)) and names not in self.not_felt:
+                    merged[names] = merged.get(names, 0.0) + p
+            still_open = [n for n, p in merged.items() if p > 0.02 and (search.order, n) not in self.candidates]
+            if not still_open:
+                return
+            names = max(still_open, key=lambda n: merged[n])
+            parts = [part for part in subsets(names, len(names) - 1) if (search.order, part) in self.candidates]
+            held = self.candidates[search.order, parts[-1]]
+            for added in [n for n in names if n not in held.names]:
+                grown = self._refit(held, added, screened)
+                if grown is None:
+                    self.not_felt.add(names)
+                    for noise, evidence in held.evidence.items():
+                        gained = evidence.log_z - null.evidence[noise].log_z
+                        screened[names, noise] = min(screened.get((names, noise), np.inf), gained)
+                    break
+                held = grown
 
     def _wish(
         self,
@@ -307,21 +358,27 @@ class _Searcher:
                 if score > wishes.get(names, (-np.inf,))[0]:
                     wishes[names] = (score, parent, name)
 
-    def _extend(self, parent: Candidate, name: str) -> Candidate:
-        """Refit with one more effect, from the two best entries of its bank."""
+    def _extend(self, parent: Candidate, name: str) -> tuple[Candidate, dict[Names, float]]:
+        """Refit with one more effect, from the best entries of its bank; give the closed-form scores too."""
         effect = self.mean_effects[name]
         templates = effect_templates(parent.found, effect, self.usable)
+        by_noise: dict[Names, float] = {}
+        for noise, evidence in parent.evidence.items():
+            scores = _log_bayes_factors(Linearised.of(parent.found, evidence.whitener), templates.columns)
+            by_noise[noise] = float(logsumexp(scores)) - math.log(len(scores))
         best = max(parent.evidence.values(), key=lambda e: e.log_z)
         problem = Linearised.of(parent.found, best.whitener)
         scores = _log_bayes_factors(problem, templates.columns)
         model = parent.found.model.with_effect(effect)
         starts = []
-        for at in np.argsort(-scores)[:2]:
-            projected = problem.project(templates.columns[at])
-            amount = np.linalg.lstsq(projected, problem.residual, rcond=None)[0]
+        ranked = np.argsort(-scores)
+        for at in ranked[: 2 if scores[ranked[0]] > 5 else 1]:
+            columns = templates.columns[at]
+            amount = np.asarray(np.linalg.lstsq(problem.project(columns), problem.residual)[0], dtype=np.float64)
             setting = _scaled_setting(effect, templates.settings[at], amount)
-            starts.append(np.concatenate([parent.found.z, model.scores_of(setting[None, :])[0]]))
-        return self._weighed(model, np.stack(starts))
+            z = parent.found.z + problem.absorbed(parent.found, columns @ amount)
+            starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
+        return self._weighed(model, np.stack(starts)), by_noise
 
     def _other_orders(self, search: Search) -> None:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
@@ -337,13 +394,15 @@ class _Searcher:
             if source is None:
                 continue
             for n, sensor in self.sensors.items():
-                if n == search.order or (n > search.order + 1):
+                if n == search.order or n > search.order + 1:
                     continue
                 null = self.candidates[n, ()]
                 effects = source.found.model.effects
                 model = Model(sensor, effects, self.recording.plan)
                 own = source.found.z[source.found.model.sensor.n_params :]
-                self._weighed(model, np.concatenate([null.found.z, own])[None, :])
+                candidate = self._weighed(model, np.concatenate([null.found.z, own])[None, :])
+                if _acts(candidate, null):
+                    self._keep(candidate)
 
 
 def weighed(search: Search) -> Search:
@@ -364,9 +423,7 @@ def weighed(search: Search) -> Search:
         refitted = {names for _, names in search.candidates if names}
         for names in refitted:
             values = [c.evidence[noise].log_z for (_, key), c in search.candidates.items() if key == names]
-            log_p[names, noise] = (
-                float(logsumexp(values)) + log_order + prior.log_mean(names, n_effects) + log_noise
-            )
+            log_p[names, noise] = float(logsumexp(values)) + log_order + prior.log_mean(names, n_effects) + log_noise
         for (names, model), value in search.screened.items():
             if model == noise and names not in refitted:
                 log_p[names, noise] = (
@@ -384,6 +441,12 @@ def weighed(search: Search) -> Search:
     )
 
 
+def _acts(candidate: Candidate, parent: Candidate) -> bool:
+    """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
+    n_points = len(candidate.found.residuals)
+    return 2 * n_points * math.log(parent.found.sd / candidate.found.sd) > 3.0
+
+
 def _best_log_z(candidate: Candidate) -> float:
     return max(e.log_z for e in candidate.evidence.values())
 
@@ -393,11 +456,12 @@ def _log_bayes_factors(problem: Linearised, columns: Sequence[FloatArray]) -> Fl
     return block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_points)[:, 0]
 
 
-def _mean_by_family(values: FloatArray, families: Sequence[str]) -> float:
-    """Average Bayes factors within each covariate, then over covariates."""
+def _by_family(values: FloatArray, families: Sequence[str]) -> dict[str, float]:
+    """Average Bayes factors within each covariate."""
     names = np.array(families)
-    means = [float(logsumexp(values[names == f])) - math.log(np.sum(names == f)) for f in dict.fromkeys(families)]
-    return float(logsumexp(means)) - math.log(len(means))
+    return {
+        f: float(logsumexp(values[names == f])) - math.log(int(np.sum(names == f))) for f in dict.fromkeys(families)
+    }
 
 
 def _products(banks: Sequence[Sequence[FloatArray]]) -> list[tuple[FloatArray, ...]]:

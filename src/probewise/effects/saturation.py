@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.vocabulary import Extent, give_or_take
-from probewise.priors import Product, Uniform
+from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
@@ -19,36 +19,55 @@ __all__ = ["Saturation"]
 
 @dataclass(frozen=True)
 class Saturation:
-    """Clip at a level: reading = min(reading, level)."""
+    """Run out of range: reading = level - softness log(1 + exp((level - reading) / softness)).
+
+    As the softness goes to zero this is min(reading, level).
+    """
 
     lowest: float = 0.0
-    highest: float = 100.0
+    highest: float = 150.0
+    sharpest: float = 0.05
+    softest: float = 20.0
 
     name: ClassVar[str] = "saturation"
     stage: ClassVar[Stage] = Stage.SATURATION
-    units: ClassVar[tuple[str, ...]] = ("reading",)
+    units: ClassVar[tuple[str, ...]] = ("reading", "reading")
     covariates: ClassVar[tuple[str, ...]] = ("level",)
     amplitudes: ClassVar[tuple[int, ...]] = ()
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self:
-        """Look among the levels that were reached: a level above all readings clips nothing."""
-        return cls(lowest=extent.low + 0.2 * extent.span, highest=extent.high)
+        """Look among the levels that were reached; a soft limit may lie some way above them."""
+        return cls(
+            lowest=extent.low + 0.2 * extent.span,
+            highest=extent.high + 0.3 * extent.span,
+            sharpest=1e-3 * extent.span,
+            softest=0.3 * extent.span,
+        )
 
     @cached_property
     def prior(self) -> Product:
-        """The level, even over the range where it would bite."""
-        return Product({"level": Uniform(self.lowest, self.highest)})
+        """Level, even over the range where it would bite, and softness over its orders of magnitude."""
+        return Product(
+            {"level": Uniform(self.lowest, self.highest), "softness": LogUniform(self.sharpest, self.softest)}
+        )
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Clip the readings, (n_samples, n_points)."""
-        return np.minimum(value, theta[:, :1])
+        """Limit the readings, (n_samples, n_points)."""
+        level, softness = theta[:, :1], theta[:, 1:2]
+        return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
     def bank(self) -> FloatArray:
-        """One column each for twelve levels, closer together near the top."""
-        share = 1 - np.geomspace(0.02, 0.9, 12)
-        return (self.lowest + share * (self.highest - self.lowest))[:, None, None]
+        """One column each for sharp limits, closer together near the top, and for soft ones."""
+        span = (self.highest - self.lowest) / 1.1
+        top = self.highest - 0.3 * span
+        sharp = [(top - share * 0.8 * span, self.sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]
+        soft = [(top + share * span, 0.1 * span) for share in (-0.2, -0.05, 0.1, 0.25)]
+        return np.array([*sharp, *soft])[:, None, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say above which reading nothing is reported."""
-        return f"no reading rises above {give_or_take(mean[0], sd[0])}: the electronics saturate"
+        """Say above which reading nothing is reported, and how gently that limit sets in."""
+        return (
+            f"no reading rises above {give_or_take(mean[0], sd[0])}: the electronics saturate, "
+            f"within about {mean[1]:.2g} of that limit"
+        )

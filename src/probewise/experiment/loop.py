@@ -29,14 +29,18 @@ from probewise.experiment.journal import (
 from probewise.experiment.values import Experiment, Exploration, State, Step, widest_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inquiry import EntropyMap, bits_gained, entropy_map, prior_entropy
-from probewise.nested.diversify import diversify
+from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import run as run_nested
+from probewise.nested.stop import RemainingEvidence
 from probewise.scene.shapes import AnyOf
 
 __all__ = ["begin", "explore", "run", "step"]
 
 NO_FIT = 1e-6  # below this probability of the best hypothesis a step says that none explains the readings
+
+DLOGZ = 0.5  # the last live points are posterior samples too: letting them die one by one would only refine log Z
+N_KERNELS = 100  # posterior samples that proposals stand about
 
 
 def begin(experiment: Experiment, reachable: BoolArray, *, rng: np.random.Generator) -> State:
@@ -94,9 +98,17 @@ def step(
     with warnings.catch_warnings():
         # Each step keeps its own doubts; a warning a reading would bury them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        posterior = run_nested(problem, rng=rng, n_live=experiment.n_live)
+        posterior = run_nested(
+            problem,
+            rng=rng,
+            n_live=experiment.n_live,
+            n_replaced=experiment.n_live // 2,
+            move=KernelMove(),
+            stop=RemainingEvidence(DLOGZ),
+        )
     drawn = posterior.samples(experiment.n_samples, rng=rng)
-    samples, _ = diversify(drawn, problem, rng=rng, n_steps=experiment.n_diversify)
+    cloud = posterior.samples(N_KERNELS, rng=rng)
+    samples, _ = diversify_by_kernels(drawn, cloud, problem, rng=rng, n_steps=experiment.n_diversify)
     samples.flags.writeable = False
     mean, sd, shapes = _moments(experiment, posterior)
     p_value, worst = _fit(experiment, posterior, problem)

@@ -33,7 +33,7 @@ PAPER_BITS = 25.0
 
 @dataclass(frozen=True)
 class OneScan:
-    """Score a growing number of readings that share one unknown sd: Student-t over one data set (paper, SSF likelihood).
+    """Score a growing number of readings that share one unknown sd: Student-t, one data set (paper, SSF likelihood).
 
     `sd_floor` and `sd_ceiling` bound the sd, in the sensor's unit; its prior is 1/sigma between them.
     """

@@ -8,20 +8,28 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ParameterError
+from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 
 __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
+_FRAME, _DIFFERENCE, _HOP = 0, 1, 2
+
 
 @dataclass(frozen=True)
 class Tally:
-    """Count what a move did: likelihood evaluations, accepted ones, chains that could not move."""
+    """Count what a move did.
+
+    `n_evaluated`: likelihood evaluations. `n_tried`, `n_accepted`: candidates and accepted ones of the
+    kind that the move tunes itself by. `n_stuck`: chains that could not leave their start.
+    """
 
     n_evaluated: int
     n_accepted: int
     n_stuck: int = 0
+    n_tried: int = 0
 
 
 class Move(Protocol):
@@ -90,18 +98,26 @@ class SliceMove:
     reversible without it (Neal's limit m = 1), and evaluations are saved. Each chain goes to its
     next step when its own bracket has delivered, so the batches stay full.
 
-    Lines follow random orthogonal frames in the metric of the live points, so that n_params
-    successive steps cover every direction; a share of them follows differences of two live
-    points, which lead from one mode to another.
+    Three kinds of steps, every one reversible by itself:
+
+    - along random orthogonal frames in the metric of the live points, so that n_params successive
+      steps cover every direction. Where the live points fall into clusters, each has its own
+      metric and such a step stays within its cluster's part of space;
+    - along the difference of two live points, from anywhere to anywhere;
+    - a hop, where there are clusters: the point is carried to its counterpart in another cluster
+      by the affine map between the two, accepted with the ratio of their volumes. It keeps the
+      share of live points in each mode from drifting.
 
     Parameters
     ----------
     steps_per_param
-        Steps of a chain for each parameter.
+        Steps of a chain along frames and differences for each parameter.
     width
         Bracket width in units of the live points' sd along the line.
     differences
         Share of the steps that follow differences of live points.
+    hops
+        Hops of each chain, where there are clusters.
     target
         Candidates a step should need on average; the width is tuned to it.
     """
@@ -109,6 +125,7 @@ class SliceMove:
     steps_per_param: float = 2.0
     width: float = 5.0
     differences: float = 0.1
+    hops: int = 3
     target: float = 2.5
 
     def __post_init__(self) -> None:
@@ -116,74 +133,106 @@ class SliceMove:
             raise ParameterError("steps_per_param", self.steps_per_param, "greater than 0")
         if not 0 <= self.differences <= 1:
             raise ParameterError("differences", self.differences, "0 to 1")
+        if self.hops < 0:
+            raise ParameterError("hops", self.hops, "0 or more")
 
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start; see `Move`."""
         n_chains, n_params = start.u.shape
-        n_steps = max(2, math.ceil(self.steps_per_param * n_params))
-        lines = self._lines(n_chains, n_steps, live, rng)
-        u, theta = start.u.copy(), start.theta.copy()
-        log_likelihood, label = start.log_likelihood.copy(), start.label.copy()
+        clusters = find_clusters(live)
+        n_lines = max(2, math.ceil(self.steps_per_param * n_params))
+        n_hops = self.hops if len(clusters) > 1 else 0
+        n_steps = n_lines + n_hops
+        frames = _frames(n_chains, n_steps, n_params, rng)
+        kind = np.where(rng.random((n_chains, n_steps)) < self.differences, _DIFFERENCE, _FRAME)
+        kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
+        now = Points(start.u.copy(), start.theta.copy(), start.log_likelihood.copy(), start.label.copy())
+        home = clusters.assign(now.u)
+        line = np.empty((n_chains, n_params))
+        low, high = np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
         moved = np.zeros(n_chains, dtype=bool)
+        n_evaluated = n_tried = n_taken = 0
+
+        def begin(rows: IntArray) -> None:
+            """Lay the next step's line and bracket."""
+            line[rows] = self.width * np.einsum("nij,nj->ni", clusters.root[home[rows]], frames[rows, step[rows]])
+            follow = rows[kind[rows, step[rows]] == _DIFFERENCE]
+            if follow.size:
+                first = rng.integers(len(live), size=follow.size)
+                second = (first + rng.integers(1, len(live), size=follow.size)) % len(live)
+                line[follow] = 2.0 * (live[first] - live[second])
+            low[rows], high[rows] = _bracket(now.u[rows], line[rows], rng)
+
         active = np.arange(n_chains)
-        low, high = np.empty(n_chains), np.empty(n_chains)
-        low[:], high[:] = _bracket(u, lines[:, 0], rng)
-        n_evaluated = n_accepted = 0
+        begin(active)
         while active.size:
             a, b = low[active], high[active]
             t = a + (b - a) * rng.random(active.size)
-            line = lines[active, step[active]]
-            tried = evaluate(np.clip(u[active] + t[:, None] * line, 0.0, 1.0), rng)
-            n_evaluated += active.size
-            ok = bound.admits(tried.log_likelihood, tried.label)
+            candidate = np.clip(now.u[active] + t[:, None] * line[active], 0.0, 1.0)
+            hop = np.zeros(active.size, dtype=bool)
+            place = home[active]
+            ok = np.ones(active.size, dtype=bool)
+            if len(clusters) > 1:
+                kinds = kind[active, step[active]]
+                hop = kinds == _HOP
+                goal = place.copy()
+                if hop.any():
+                    rows = active[hop]
+                    goal[hop] = (home[rows] + rng.integers(1, len(clusters), size=rows.size)) % len(clusters)
+                    candidate[hop], ok[hop] = _hop(clusters, now.u[rows], home[rows], goal[hop], rng)
+                place = clusters.assign(candidate)
+                ok &= (kinds == _DIFFERENCE) | (place == goal)
+            asked = np.flatnonzero(ok)
+            if asked.size:
+                tried = evaluate(candidate[asked], rng)
+                inside = bound.admits(tried.log_likelihood, tried.label)
+                ok[asked] = inside
+                taken, rows = active[asked[inside]], inside
+                now.u[taken], now.theta[taken] = tried.u[rows], tried.theta[rows]
+                now.log_likelihood[taken], now.label[taken] = tried.log_likelihood[rows], tried.label[rows]
+                home[taken] = place[asked[inside]]
+                moved[taken] = True
+                n_evaluated += asked.size
+            n_tried += int((~hop).sum())
+            n_taken += int((ok & ~hop).sum())
             high[active] = np.where(t > 0, t, b)
             low[active] = np.where(t > 0, a, t)
-            taken = active[ok]
-            u[taken], theta[taken] = tried.u[ok], tried.theta[ok]
-            log_likelihood[taken], label[taken] = tried.log_likelihood[ok], tried.label[ok]
-            moved[taken] = True
-            n_accepted += taken.size
             # A bracket that has shrunk to nothing (a point alone on its line) ends the step where it began.
-            done = active[ok | (high[active] - low[active] < 1e-13)]
-            step[done] += 1
+            done = active[ok | hop | (high[active] - low[active] < 1e-13)]
             if done.size:
+                step[done] += 1
                 ended = step[done] >= n_steps
                 if ended.any():
                     active = active[step[active] < n_steps]
-                    done = done[~ended]
-                low[done], high[done] = _bracket(u[done], lines[done, step[done]], rng)
-        return Points(u, theta, log_likelihood, label), Tally(n_evaluated, n_accepted, int((~moved).sum()))
+                begin(done[~ended])
+        return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def adapted(self, tally: Tally) -> SliceMove:
         """Widen or narrow the bracket towards `target` candidates a step."""
-        excess = math.log(tally.n_evaluated / max(tally.n_accepted, 1) / self.target)
+        excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 
-    def _lines(self, n_chains: int, n_steps: int, live: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Draw directions whose length is the bracket's width, (n_chains, n_steps, n_params)."""
-        n_params = live.shape[1]
-        n_frames = -(-n_steps // n_params)
-        frames = np.linalg.qr(rng.standard_normal((n_chains * n_frames, n_params, n_params)))[0]
-        frames = frames.reshape(n_chains, n_frames * n_params, n_params)[:, :n_steps]
-        lines = np.asarray(frames @ _root_covariance(live).T) * self.width
-        follow = rng.random((n_chains, n_steps)) < self.differences
-        n_follow = int(follow.sum())
-        if n_follow:
-            first = rng.integers(len(live), size=n_follow)
-            second = (first + rng.integers(1, len(live), size=n_follow)) % len(live)
-            lines[follow] = 2.0 * (live[first] - live[second])
-        return lines
 
 
-def _root_covariance(live: FloatArray) -> FloatArray:
-    """Cholesky root of the live points' covariance, (n_params, n_params)."""
-    n_params = live.shape[1]
-    covariance = np.atleast_2d(np.cov(live, rowvar=False))
-    ridge = 1e-10 * np.diag(covariance) + 1e-30
-    return np.linalg.cholesky(covariance + np.diag(ridge)) if n_params > 1 else np.sqrt(covariance + ridge)
+
+def _frames(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> FloatArray:
+    """Draw rows of random orthogonal matrices, (n_chains, n_steps, n_params)."""
+    n_frames = -(-n_steps // n_params)
+    frames = np.linalg.qr(rng.standard_normal((n_chains * n_frames, n_params, n_params)))[0]
+    return np.asarray(frames.reshape(n_chains, n_frames * n_params, n_params)[:, :n_steps])
+
+
+def _hop(
+    clusters: Clusters, u: FloatArray, home: IntArray, goal: IntArray, rng: np.random.Generator
+) -> tuple[FloatArray, BoolArray]:
+    """Map points to their counterparts in other clusters; say which the map's Jacobian and the cube let pass."""
+    z = np.einsum("nij,nj->ni", clusters.inverse_root[home], u - clusters.mean[home])
+    out = clusters.mean[goal] + np.einsum("nij,nj->ni", clusters.root[goal], z)
+    passes = np.log(rng.random(len(u))) < clusters.log_det[goal] - clusters.log_det[home]
+    return out, passes & ((out >= 0) & (out <= 1)).all(axis=1)
 
 
 def _bracket(u: FloatArray, line: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -9,15 +9,26 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration
+from probewise.diagnosis import Diagnosis
 from probewise.experiment import Exploration
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
+from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import AxesGrid, grid_of_axes, information_gained, png, posterior_widths
 from probewise.report.words import number
 
-__all__ = ["Search", "answer", "comparison_rows", "comparison_table", "figures", "write_page"]
+__all__ = [
+    "Search",
+    "answer",
+    "comparison_lines",
+    "comparison_rows",
+    "comparison_table",
+    "diagnosis_sections",
+    "figures",
+    "write_page",
+]
 
 FIRST = 3  # the paper shows the first three measurements side by side
 LATER = 7  # and the map after seven
@@ -188,3 +199,22 @@ def write_page(
         key_figure=figure(drawn["after_seven.png"], caption),
         sections=[*robot, *diagnosis, *sensor, closing],
     )
+
+
+def comparison_lines(searches: Sequence[Search]) -> list[str]:
+    """Lay the comparison out as lines of text."""
+    rows = [HEADER, *comparison_rows(searches)]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(HEADER))]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def diagnosis_sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> list[Section]:
+    """Build the sections on the second recording, and say what really was concealed in it."""
+    opening = Section(
+        "A second recording, diagnosed",
+        (
+            paragraph(diagnosis_report.answer(diagnosis)),
+            paragraph(f"The world that made the recording concealed: {concealed.replace('_', ' ')}."),
+        ),
+    )
+    return [opening, *diagnosis_report.sections(diagnosis, drawn)]

@@ -17,16 +17,18 @@ _DENSITY = np.exp(-0.5 * _NODES**2) / np.sqrt(2 * np.pi)
 _BLOCK = 16384  # elements that stay in the cache with the table
 
 
-def normal_cdf(z: FloatArray) -> FloatArray:
+def normal_cdf(z: FloatArray, *, out: FloatArray | None = None) -> FloatArray:
     """Cumulative of the standard normal, any shape, within 1e-10.
 
     Taylor's series to second order about the nearest entry of a table: the third-order term is
-    at most 0.4 (h/2)^3 / 6 = 6e-11. Large arrays are taken in blocks that fit the cache.
+    at most 0.4 (h/2)^3 / 6 = 6e-11. Large arrays are taken in blocks that fit the cache. The
+    result goes into `out`, which may be `z` itself and must be contiguous.
     """
     z = np.asarray(z, dtype=np.float64)
     if z.size < 1000:  # the calls cost more than the function
-        return np.asarray(ndtr(z))
-    out = np.empty(z.shape)
+        return np.asarray(ndtr(z, out=out))
+    if out is None:
+        out = np.empty(z.shape)
     flat_in, flat_out = z.reshape(-1), out.reshape(-1)
     length = min(_BLOCK, z.size)
     entries, steps, sums = np.empty(length, dtype=np.intp), np.empty(length), np.empty(length)

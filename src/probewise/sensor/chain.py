@@ -89,7 +89,7 @@ class Chain:
     of theta: the SSF's, the levels', the scene's, then the effects' as "effect.parameter".
 
     `n_nodes` is the number of quadrature nodes over curved edges (the default holds 1e-8 of the
-    span, `FAST_NODES` 1e-4).
+    span, `FAST_NODES` 1e-4 for footprints up to three times as long as wide).
     """
 
     ssf: SSFModel
@@ -139,14 +139,28 @@ class Chain:
             If the plan has a pattern that the scene lacks, or theta names no proper SSF.
         """
         seen = self.seen(theta, plan)
+        if not self.effects:
+            return self._read(seen, theta)
         apply = self._applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, seen))
-        n_ssf = len(self.ssf.names)
-        i_min, i_max = self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
-        reading = i_min + apply(Stage.GAIN, (i_max - i_min) * seen)
+        i_min, i_max = self._levels(theta)
+        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * seen)
         for stage in (Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             reading = apply(stage, reading)
-        return np.array(np.broadcast_to(reading, (len(theta), len(plan))))
+        shape = (len(theta), len(plan))
+        return reading if reading.shape == shape else np.array(np.broadcast_to(reading, shape))
+
+    def _levels(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        n_ssf = len(self.ssf.names)
+        return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
+
+    def _read(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
+        """Turn R into readings where no effect acts, in place: `seen` is this call's own."""
+        i_min, i_max = self._levels(theta)
+        reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)
+        reading *= i_max - i_min
+        reading += i_min
+        return reading
 
     def seen(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Seen white fraction R before any effect on it, shape (n_samples or 1, n_points)."""
@@ -315,8 +329,15 @@ def _add_half_planes(
     else:
         distinct, which = np.unique(angles, return_inverse=True)
     c, s = np.cos(distinct), np.sin(distinct)
-    share = np.empty((len(out), len(rows)))
+    together = bool((np.diff(rows) == 1).all())  # then a view of the result takes the place of a copy
+    share = out[:, rows[0] : rows[0] + len(rows)] if together else np.empty((len(out), len(rows)))
     step = max(1, _BLOCK // max(1, len(rows)))
+    workspace = np.empty((min(step, len(out)), len(rows)))
+    by_product = len(distinct) <= 16 and len(place) == 1
+    hand_out = np.empty((0, 0))
+    if by_product:
+        own = np.eye(len(distinct))[:, which]
+        hand_out = np.concatenate([own * place, own])
     for g, gaussian in enumerate(gaussians):
         u, v, var_u, var_v, cov, weight = (
             _columns_of(a, rows)
@@ -326,18 +347,25 @@ def _add_half_planes(
         shift = c * u + s * v
         for start in range(0, len(out), step):
             block = slice(start, start + step)
-            z = _rows_of(shift, block)[:, which] + _rows_of(place, block)
-            z *= _rows_of(per_sd, block)[:, which]
-            found = normal_cdf(z)
-            found *= _rows_of(weight, block)
-            if g == 0:
-                share[block] = found
+            z = workspace[: len(share[block])]
+            per_sd_here = _rows_of(per_sd, block)
+            if by_product and len(shift) == len(per_sd) == len(out):
+                # z = place / sd + shift / sd, each angle's handed out to its readings: one product.
+                np.matmul(np.concatenate([per_sd_here, _rows_of(shift, block) * per_sd_here], axis=1), hand_out, out=z)
             else:
-                share[block] += found
+                np.add(_rows_of(shift, block)[:, which], _rows_of(place, block), out=z)
+                z *= per_sd_here[:, which]
+            normal_cdf(z, out=z)
+            if g == 0:
+                np.multiply(z, _rows_of(weight, block), out=share[block])
+            else:
+                z *= _rows_of(weight, block)
+                share[block] += z
     if (inside != 1.0).any() or (outside != 0.0).any():
         share *= inside - outside
         share += outside
-    out[:, rows] = share
+    if not together:
+        out[:, rows] = share
 
 
 def _add_quadrants(

@@ -33,7 +33,7 @@ from probewise.sensor._normal import normal_cdf
 __all__ = ["ACCURATE_NODES", "FAST_NODES", "Spot", "mass_in_quadrant", "seen", "seen_by_one"]
 
 ACCURATE_NODES = 64
-FAST_NODES = 16
+FAST_NODES = 20
 
 _REACH = 8.0  # standard deviations beyond which an edge is not seen (Phi(-8) = 6e-16)
 
@@ -352,22 +352,29 @@ def _seen_of_unit_disc(
     per_sd = 1 / np.sqrt(var_across - slope * cov)
     span = reach * sd_along
     found = np.empty(len(d))
-    wraps = span > 0.7
-    for group, wrapped in ((~wraps, False), (wraps, True)):
-        rows = np.flatnonzero(group)
-        for start in range(0, len(rows), _BLOCK):
-            r = rows[start : start + _BLOCK]
-            found[r] = _strips(d[r], sd_along[r], slope[r], per_sd[r], n_nodes, wrapped=wrapped)
+    wraps = span > 0.95
+    # How many conditional sd the edge moves over one sd along it: footprints slanting to the
+    # edge, or far longer than the edge's radius, take more nodes.
+    wide = np.minimum(sd_along, 1.0)
+    sharpness = wide * per_sd * (np.abs(slope) + wide)
+    doublings = np.clip(np.ceil(np.log2(np.maximum(sharpness / _SHARP, 1.0))), 0, 5).astype(np.int64)
+    for key in np.unique(2 * doublings + wraps):
+        rows = np.flatnonzero(2 * doublings + wraps == key)
+        times, wrapped = 2 ** (int(key) // 2), bool(key % 2)
+        for start in range(0, len(rows), _BLOCK // times):
+            r = rows[start : start + _BLOCK // times]
+            found[r] = _strips(d[r], sd_along[r], slope[r], per_sd[r], reach, n_nodes * times, wrapped=wrapped)
     share[near] = found
     return np.clip(share, 0.0, 1.0)
 
 
 _BLOCK = 2048  # pairs at a time, times nodes: stays in the cache
+_SHARP = 0.8  # the sharpness that n_nodes are good for
 
 
 def _reach_of(n_nodes: int) -> float:
     """Choose how many standard deviations n_nodes cover, errors of tail and rule balanced."""
-    return min(7.0, 3.1 + 0.09 * n_nodes)
+    return float(np.clip(4.0 + (n_nodes - 24) / 16, 4.0, 6.5))
 
 
 def _strips(
@@ -375,6 +382,7 @@ def _strips(
     sd_along: FloatArray,
     slope: FloatArray,
     per_sd: FloatArray,
+    reach: float,
     n_nodes: int,
     *,
     wrapped: bool,
@@ -387,10 +395,11 @@ def _strips(
         x = np.cos(t)[:, None]
         share = (0.5 * np.pi * weight)[:, None] * x * np.exp(-0.5 * (y / sd_along) ** 2)
     else:
-        reach = _reach_of(n_nodes)
         y = (reach * node)[:, None] * sd_along
         x = np.sqrt(1 - y * y)
-        share = (reach * weight * np.exp(-0.5 * (reach * node) ** 2))[:, None] * sd_along
+        # Divided by the mass within reach, so that what is cut off is shared out, not lost.
+        mass = 2 * ndtr(reach) - 1
+        share = (reach / mass * weight * np.exp(-0.5 * (reach * node) ** 2))[:, None] * sd_along
     tilt = slope * y
     far = (x - d) * per_sd
     turn = tilt * per_sd

@@ -295,7 +295,7 @@ def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     response differs by more.
     """
     values = np.maximum(field.values.ravel(), 0.0)
-    kept = values > 1e-9 * values.max()
+    kept = values > 1e-7 * values.max()
     covs = np.zeros((int(kept.sum()), 2, 2))
     return _merged(values[kept], field.centers_mm[kept], covs, n_gaussians)
 
@@ -314,9 +314,15 @@ def _density(mixture: FixedMixture, points: FloatArray) -> FloatArray:
     total = np.zeros(len(points))
     for w, mean, cov in zip(mixture.weights, mixture.means_mm, mixture.covs_mm2, strict=True):
         off = points - mean
-        quadratic = np.einsum("ni,ij,nj->n", off, np.linalg.inv(cov), off)
+        quadratic = _quadratic(off, np.linalg.inv(cov))
         total += w * np.exp(-0.5 * quadratic) / (2 * np.pi * np.sqrt(np.linalg.det(cov)))
     return total
+
+
+def _quadratic(off: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Form off' matrix off for each row, off (n, 2)."""
+    x, y = off[:, 0], off[:, 1]
+    return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
 
 
 def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
@@ -324,12 +330,13 @@ def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")
     w = w / w.sum()
+    flat_covs = covs.reshape(len(w), 4)
 
     def moments(share: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         mass = float(share.sum())
         mean = share @ means / mass
         off = means - mean
-        cov = np.einsum("n,nij->ij", share, covs) / mass + (share[:, None] * off).T @ off / mass
+        cov = (share @ flat_covs).reshape(2, 2) / mass + (share[:, None] * off).T @ off / mass
         return mass, mean, cov
 
     _, mean, cov = moments(w)
@@ -343,12 +350,11 @@ def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int
     shapes = cov * np.geomspace(0.4, 2.0, n_gaussians)[:, None, None]
     floor = 1e-6 * np.trace(cov) * np.eye(2)
     last = -np.inf
-    for _ in range(500):
+    for _ in range(300):
         log_p = np.empty((len(w), n_gaussians))
         for k in range(n_gaussians):
             inverse = np.linalg.inv(shapes[k])
-            off = means - centers[k]
-            quadratic = np.einsum("ni,ij,nj->n", off, inverse, off) + np.einsum("ij,nji->n", inverse, covs)
+            quadratic = _quadratic(means - centers[k], inverse) + flat_covs @ inverse.ravel()
             log_p[:, k] = np.log(weights[k]) - 0.5 * (quadratic + np.log(np.linalg.det(shapes[k])))
         top = log_p.max(axis=1, keepdims=True)
         p = np.exp(log_p - top)
@@ -362,7 +368,7 @@ def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int
         weights = np.array([f[0] for f in fitted])
         centers = np.array([f[1] for f in fitted])
         shapes = np.array([f[2] for f in fitted]) + floor
-        if score - last < 1e-10:
+        if score - last < 1e-8:
             break
         last = score
     return FixedMixture(weights, centers, shapes - floor)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from probewise.errors import ParameterError
 from probewise.recordings.files import write_recording
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plan import Recording
 from probewise.recordings.plans import jittered, paper_plan, two_way_plan
 from probewise.recordings.shipping import SHIPPED
 from probewise.world.concealed import (
@@ -30,7 +30,7 @@ from probewise.world.concealed import (
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
-__all__ = ["BLOB", "CANDIDATES", "SEEDS", "Made", "main", "make"]
+__all__ = ["BLACK", "BLOB", "CANDIDATES", "NOISE_SD", "SEEDS", "WHITE", "main", "make", "truth"]
 
 BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)
 """The true SSF of both: one Gaussian, shifted towards the photodiode and wider along x'."""
@@ -38,6 +38,11 @@ BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)
 BLACK, WHITE, NOISE_SD = 10.0, 60.0, 0.6
 
 SEEDS = {"paper": 408, "drifting": 9844}
+
+_DESCRIPTIONS = {
+    "paper": "Simulated readings over the black-and-white boundary and four quadrants, as in the paper",
+    "drifting": "Simulated readings, scans out and back; something is not as a plain sensor has it",
+}
 
 CANDIDATES: tuple[Concealed, ...] = (
     AmbientGradient(0.02, -0.02),
@@ -50,15 +55,22 @@ CANDIDATES: tuple[Concealed, ...] = (
 """What `drifting` may conceal; each at a size lambda of about 20 there (diagnosis, size of an effect)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Made:
-    """A recording and the world that it comes from."""
+def truth(name: str) -> World:
+    """Return the world that a shipped recording comes from, with what it conceals.
 
-    recording: Recording
-    world: World
+    Raises
+    ------
+    ParameterError
+        If there is no recording of that name.
+    """
+    choice, _, _ = _streams(name)
+    world = World(gaussian_spot([BLOB]), black=BLACK, white=WHITE, noise_sd=NOISE_SD)
+    if name == "paper":
+        return world
+    return replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
 
 
-def make(name: str) -> Made:
+def make(name: str) -> Recording:
     """Make a shipped recording again.
 
     Readings are rounded to 0.001, far below the noise, so that the last bits of a computer's
@@ -69,25 +81,18 @@ def make(name: str) -> Made:
     ParameterError
         If there is no recording of that name.
     """
+    _, times, noise = _streams(name)
+    plan = paper_plan() if name == "paper" else two_way_plan()
+    plan = replace(plan, instrumentation=replace(plan.instrumentation, description=_DESCRIPTIONS[name]))
+    recording = truth(name).simulate(jittered(plan, rng=times), rng=noise)
+    return replace(recording, readings=np.round(recording.readings, 3))
+
+
+def _streams(name: str) -> list[np.random.Generator]:
+    """Draw what is concealed, the times and the noise from three independent streams."""
     if name not in SHIPPED:
         raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
-    choice, times, noise = np.random.default_rng(SEEDS[name]).spawn(3)
-    world = World(gaussian_spot([BLOB]), black=BLACK, white=WHITE, noise_sd=NOISE_SD)
-    if name == "paper":
-        plan = _described(
-            paper_plan(), "Simulated readings over the black-and-white boundary and four quadrants, as in the paper"
-        )
-    else:
-        plan = _described(
-            two_way_plan(), "Simulated readings, scans out and back; something is not as a plain sensor has it"
-        )
-        world = replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
-    recording = world.simulate(jittered(plan, rng=times), rng=noise)
-    return Made(replace(recording, readings=np.round(recording.readings, 3)), world)
-
-
-def _described(plan: Plan, description: str) -> Plan:
-    return replace(plan, instrumentation=replace(plan.instrumentation, description=description))
+    return np.random.default_rng(SEEDS[name]).spawn(3)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -96,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, help="an existing folder")
     folder: Path = parser.parse_args(arguments).folder
     for name in SHIPPED:
-        write_recording(make(name).recording, folder / f"{name}.csv")
+        write_recording(make(name), folder / f"{name}.csv")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.concealed import STEPS, Concealed, Rows, Step
@@ -128,7 +128,7 @@ class World:
     def _clean(
         self,
         surfaces: Mapping[str, Surface],
-        rows_by_pattern: list[tuple[str, np.ndarray[tuple[int], np.dtype[np.int64]]]],
+        rows_by_pattern: Sequence[tuple[str, IntArray]],
         rows: Rows,
         orientation_rad: FloatArray,
     ) -> FloatArray:

@@ -6,12 +6,14 @@ beside them progress towards the precision asked for, and what a diagnosis found
 """
 
 from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
+from probewise.report.plots.posterior import posterior_pairs
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
 from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
 from probewise.report.plots.scene import playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
 from probewise.report.plots.verdict import hypothesis_probabilities
+from probewise.report.plots.witness import witness
 
 __all__ = [
     "AxesGrid",
@@ -22,10 +24,12 @@ __all__ = [
     "log_evidences",
     "playing_field",
     "png",
+    "posterior_pairs",
     "posterior_widths",
     "predicted_against_recorded",
     "readings_by_orientation",
     "residuals_against",
     "spatial_sensitivity",
     "ssf_by_order",
+    "witness",
 ]

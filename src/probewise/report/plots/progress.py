@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, CYCLE, axes_or_new, tidy
@@ -34,7 +35,10 @@ def posterior_widths(
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(f"{target_mm:g} mm", (1, target_mm), xytext=(2, -11), textcoords="offset points", fontsize="small")
     ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(frameon=False, fontsize="small")
     return tidy(ax, x="number of readings", y="widest posterior sd (mm)")
 
@@ -60,5 +64,6 @@ def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None
             color=colour,
             label=f"{name}: {per_reading:.2f} bits a reading",
         )
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(frameon=False, fontsize="small")
     return tidy(ax, x="number of readings", y="information about the shape (bits)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
@@ -23,6 +24,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     values = np.asarray(field.values)
     x, y = field.u_mm, field.v_mm
     half = field.pixel_mm / 2
+    ax.set_facecolor(colormaps["cividis"](0.0))  # beyond the field's pixels there is nothing
     ax.imshow(
         values,
         origin="lower",

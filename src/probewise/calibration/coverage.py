@@ -1,0 +1,150 @@
+"""Check calibration against hidden truth: whether the 95 % intervals hold it, and evidence finds the order.
+
+Recordings come from the independent pixel world, by the paper's plan, each with a single Gaussian of
+its own; calibration sees the readings alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise._version import __version__
+from probewise.calibration.fields import mixture_moments
+from probewise.calibration.fit import calibrate
+from probewise.errors import ParameterError
+from probewise.recordings import Recording, paper_plan, write_text_atomically
+from probewise.world import Blob, World, gaussian_spot
+
+__all__ = ["Coverage", "Truth", "coverage", "draw_truth", "order_lead", "simulate_truth", "wilson_interval"]
+
+_MASS = 0.95
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A hidden sensor: one Gaussian (centre and sds in mm), the two levels, the noise."""
+
+    center_mm: tuple[float, float]
+    sd_mm: tuple[float, float]
+    correlation: float
+    black: float
+    white: float
+    noise_sd: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many of `n_recordings` had the truth inside the 95 % interval, by quantity."""
+
+    n_recordings: int
+    held: dict[str, int]
+    n_live: int
+
+    def to_json(self, **about: object) -> str:
+        """Write the counts with their Wilson intervals as JSON; `about` says how they were made."""
+        rows = {
+            name: {"held": k, "of": self.n_recordings, "wilson95": list(wilson_interval(k, self.n_recordings))}
+            for name, k in self.held.items()
+        }
+        total = sum(self.held.values())
+        share = {"held": total, "of": self.n_recordings * len(self.held)}
+        document = {"mass": _MASS, "n_live": self.n_live, "version": __version__, "all": share, "intervals": rows}
+        return json.dumps({**about, **document}, indent=1, allow_nan=False) + "\n"
+
+    def save(self, path: str | os.PathLike[str], **about: object) -> None:
+        """Write `to_json` to a file, in one piece or not at all."""
+        write_text_atomically(path, self.to_json(**about))
+
+
+def draw_truth(*, rng: np.random.Generator) -> Truth:
+    """Draw a sensor like the paper's: offset by a few mm, wider one way, a span of 45 to 55 units."""
+    black = float(rng.uniform(8, 12))
+    return Truth(
+        center_mm=(float(rng.uniform(-3, 3)), float(rng.uniform(-3, 3))),
+        sd_mm=(float(rng.uniform(2.5, 7)), float(rng.uniform(2.5, 7))),
+        correlation=float(rng.uniform(-0.5, 0.5)),
+        black=black,
+        white=black + float(rng.uniform(45, 55)),
+        noise_sd=float(rng.uniform(0.3, 0.8)),
+    )
+
+
+def simulate_truth(truth: Truth, *, rng: np.random.Generator) -> Recording:
+    """Let the pixel world carry out the paper's plan with this sensor."""
+    spot = gaussian_spot([Blob(1.0, truth.center_mm, truth.sd_mm, truth.correlation)])
+    world = World(spot, black=truth.black, white=truth.white, noise_sd=truth.noise_sd)
+    return world.simulate(paper_plan(), rng=rng)
+
+
+def coverage(
+    n_recordings: int,
+    *,
+    rng: np.random.Generator,
+    n_live: int = 300,
+    progress: Callable[[Coverage], None] | None = None,
+) -> Coverage:
+    """Calibrate one Gaussian on many simulated recordings and count the intervals that hold the truth.
+
+    Parameters
+    ----------
+    n_recordings
+        How many.
+    rng
+        Source of randomness for truths, noise and fits.
+    n_live
+        Live points of each fit.
+    progress
+        Called after each recording with the counts so far.
+    """
+    if n_recordings < 1:
+        raise ParameterError("n_recordings", n_recordings, "1 or more")
+    held: dict[str, int] = {}
+    for k, stream in enumerate(rng.spawn(n_recordings)):
+        truth = draw_truth(rng=stream)
+        recording = simulate_truth(truth, rng=stream)
+        samples = calibrate(recording, orders=(1,), n_live=n_live, rng=stream).sensor.samples
+        found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
+        for name, value in _quantities(truth).items():
+            low, high = _interval(found[name])
+            held[name] = held.get(name, 0) + int(low <= value <= high)
+        if progress is not None:
+            progress(Coverage(k + 1, dict(held), n_live))
+    return Coverage(n_recordings, held, n_live)
+
+
+def order_lead(truth: Truth, *, rng: np.random.Generator, n_live: int = 300) -> tuple[float, float]:
+    """Simulate a single-Gaussian recording; return log Z of one Gaussian less that of two, and its error."""
+    one, two = calibrate(simulate_truth(truth, rng=rng), orders=(1, 2), n_live=n_live, rng=rng).orders
+    return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
+
+
+def wilson_interval(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's interval of a probability from k successes in n trials."""
+    if not 0 <= k <= n or n == 0:
+        raise ParameterError("(k, n)", (k, n), "0 <= k <= n, n above 0")
+    middle, half = (k + z * z / 2) / (n + z * z), z * math.sqrt(k * (n - k) / n + z * z / 4) / (n + z * z)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def _quantities(truth: Truth) -> dict[str, float]:
+    return {
+        "centre x'": truth.center_mm[0],
+        "centre y'": truth.center_mm[1],
+        "log width along x'": math.log(truth.sd_mm[0]),
+        "log width along y'": math.log(truth.sd_mm[1]),
+        "correlation of x' and y'": truth.correlation,
+        "I_min": truth.black,
+        "I_max": truth.white,
+    }
+
+
+def _interval(samples: FloatArray) -> tuple[float, float]:
+    low, high = np.quantile(samples, [0.5 - _MASS / 2, 0.5 + _MASS / 2])
+    return float(low), float(high)

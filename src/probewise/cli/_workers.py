@@ -1,0 +1,42 @@
+"""Two processes of our own, which end with the command, also when it is stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+
+__all__ = ["two_workers"]
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@contextlib.contextmanager
+def two_workers() -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of two processes with one thread of linear algebra each.
+
+    Processes are spawned, not forked, so that it works alike on every system.
+    """
+    for name in THREAD_VARIABLES:
+        os.environ.setdefault(name, "1")
+    pool = ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet_worker)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+def _quiet_worker() -> None:
+    import warnings
+
+    from probewise.errors import DoubtfulResultWarning
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # end at once on Ctrl-C; the command says what was kept
+    warnings.simplefilter("ignore", DoubtfulResultWarning)  # the results hold the reasons, and the report shows them

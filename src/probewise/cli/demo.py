@@ -1,0 +1,165 @@
+"""`probewise demo`: the main job, the paper end to end on the recordings that ship with the package."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, say, staged
+
+if TYPE_CHECKING:
+    from probewise.calibration import Calibration, FittedSensor
+    from probewise.diagnosis import Diagnosis
+    from probewise.experiment import Exploration
+
+__all__ = ["VERB"]
+
+MODELS = ("naive", "ssf")
+N_LIVE = 100  # of the calibration; --full takes the paper's 300
+N_LIVE_ROBOT = 100
+MAX_READINGS = 80
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    add_out_directory(parser)
+    parser.add_argument(
+        "--full", action="store_true", help="weigh one to four Gaussians with 300 live points, as the paper does"
+    )
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate, search twice, diagnose, report."""
+    import time
+
+    import numpy as np
+    from tqdm import tqdm
+
+    from probewise.calibration import predict, write_sensor
+    from probewise.cli import _simulation as simulation
+    from probewise.cli import diagnose as diagnose_verb
+    from probewise.cli._workers import two_workers
+    from probewise.recordings import read_recording, shipped
+    from probewise.report import demo as report
+    from probewise.report import diagnosis as diagnosis_report
+    from probewise.scene import Field, outlines
+    from probewise.world.shipped import truth as world_behind
+
+    started = time.monotonic()
+    seed = arguments.seed
+    out = check_out_directory(arguments.out)
+    truth = hidden_circle(seed)
+    with (
+        two_workers() as pool,
+        tqdm(total=4, desc="demo", unit=" part", disable=True if arguments.quiet else None) as bar,
+    ):
+        calibrating = pool.submit(_calibrate, seed, arguments.full)
+        diagnosing = pool.submit(_diagnose, seed)
+        calibration = calibrating.result()
+        bar.update()
+        searching = [pool.submit(_search, calibration.sensor, model, truth, seed) for model in MODELS]
+        diagnosis = diagnosing.result()
+        bar.update()
+        runs = []
+        for future in searching:
+            runs.append(future.result())
+            bar.update()
+    recording = read_recording(shipped("paper"))
+    sensor = calibration.sensor
+    prediction = predict(sensor, recording.plan, recording.readings)
+    means = sensor.mean()
+    circle = simulation.SHAPES["circle"](Field())
+    searches = [
+        report.Search(
+            {"naive": "naive", "ssf": "SSF"}[model],
+            run,
+            dict(zip(circle.prior.names, truth, strict=True)),
+            outlines(circle.region(np.array([truth])))[0],
+            (means["I_min"], means["I_max"]),
+        )
+        for model, run in zip(MODELS, runs, strict=True)
+    ]
+    drawn = report.figures(calibration, recording, prediction, searches)
+    diagnosis_drawn = diagnosis_report.figures(diagnosis)
+    concealed = ", ".join(effect.name for effect in world_behind("drifting").concealed)
+    seconds = time.monotonic() - started
+    with staged(out) as stage:
+        write_sensor(sensor, stage / "sensor.json")
+        for name, png in drawn.items():
+            (stage / name).write_bytes(png)
+        (stage / "diagnosis").mkdir()
+        rng = np.random.default_rng([seed, 3])
+        diagnose_verb.write_results(diagnosis, diagnosis_drawn, stage / "diagnosis", rng=rng)
+        page = report.write_page(
+            calibration,
+            recording,
+            prediction,
+            searches,
+            drawn,
+            report.diagnosis_sections(diagnosis, diagnosis_drawn, concealed),
+            seed=seed,
+            seconds=seconds,
+        )
+        (stage / "report.html").write_text(page, encoding="utf-8")
+    for line in (
+        *report.comparison_lines(searches),
+        f"diagnosis of the second recording: {diagnosis.verdict}, "
+        f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
+        f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
+    ):
+        say(line, quiet=arguments.quiet)
+    return 0
+
+
+def hidden_circle(seed: int) -> tuple[float, ...]:
+    """Draw the circle to be found, wholly on the field: x, y, radius in mm."""
+    import numpy as np
+
+    from probewise.scene import Circle
+
+    prior = Circle(radius_mm=(50.0, 150.0), inside=True).prior
+    drawn = prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
+    return tuple(float(v) for v in drawn)
+
+
+def _calibrate(seed: int, full: bool) -> Calibration:
+    import numpy as np
+
+    from probewise.calibration import calibrate
+    from probewise.recordings import read_recording, shipped
+
+    return calibrate(
+        read_recording(shipped("paper")),
+        orders=(1, 2, 3, 4) if full else (1, 2),
+        n_live=300 if full else N_LIVE,
+        rng=np.random.default_rng([seed, 1]),
+    )
+
+
+def _search(sensor: FittedSensor, model: str, truth: tuple[float, ...], seed: int) -> Exploration:
+    import numpy as np
+
+    from probewise.cli import _simulation as simulation
+    from probewise.experiment import run
+    from probewise.scene import Field
+    from probewise.world.shipped import truth as world_behind
+
+    field = Field()
+    shape = simulation.shape_named(["circle"], field)
+    experiment = simulation.experiment_for(sensor, shape, field, model=model, n_live=N_LIVE_ROBOT)
+    surface = simulation.surface_of("circle", np.array(truth), field)
+    with simulation.field_arm(world_behind("paper"), surface, field, seed=seed) as arm:
+        return run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
+
+
+def _diagnose(seed: int) -> Diagnosis:
+    import numpy as np
+
+    from probewise.diagnosis import diagnose
+    from probewise.recordings import read_recording, shipped
+
+    return diagnose(read_recording(shipped("drifting")), rng=np.random.default_rng([seed, 4]))
+
+
+VERB = Verb("demo", "Do all of it: calibrate, find a hidden circle with two models, diagnose.", add_arguments, run)

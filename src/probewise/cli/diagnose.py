@@ -1,0 +1,80 @@
+"""`probewise diagnose`: which physics the sensor model leaves out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, say, staged
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from probewise.diagnosis import Diagnosis
+
+__all__ = ["VERB", "write_results"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="REC.csv",
+        help="recording, its JSON beside it; several are diagnosed together",
+    )
+    parser.add_argument(
+        "--sensor", type=Path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
+    )
+    add_out_directory(parser)
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Diagnose and write diagnosis.json, both models, the next plan, report.html and the figures."""
+    import numpy as np
+
+    from probewise.calibration import read_sensor
+    from probewise.diagnosis import diagnose
+    from probewise.recordings import read_recording
+    from probewise.report import diagnosis as report
+
+    out = check_out_directory(arguments.out)
+    recordings = [read_recording(path) for path in arguments.recordings]
+    sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+    diagnosis_rng, files_rng = np.random.default_rng(arguments.seed).spawn(2)
+    diagnosis = diagnose(recordings, sensor=sensor, rng=diagnosis_rng)
+    drawn = report.figures(diagnosis)
+    source = ", ".join(path.name for path in arguments.recordings)
+    with staged(out) as stage:
+        write_results(diagnosis, drawn, stage, rng=files_rng)
+        page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed)
+        (stage / "report.html").write_text(page, encoding="utf-8")
+    if diagnosis.next_measurement is None:
+        for name in ("next_plan.csv", "next_plan.json"):  # of an earlier run: nobody asks for it now
+            (out / name).unlink(missing_ok=True)
+    say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *, rng: np.random.Generator) -> None:
+    """Write everything but the page: diagnosis.json, the two sensor models, the next plan, the figures."""
+    import json
+
+    from probewise.calibration import write_sensor
+    from probewise.diagnosis import diagnosis_json
+    from probewise.recordings import write_plan
+
+    text = json.dumps(diagnosis_json(diagnosis), allow_nan=False, indent=1)
+    (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
+    write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), folder / "sensor.json")
+    write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), folder / "calibrated.json")
+    if diagnosis.next_measurement is not None:
+        write_plan(diagnosis.next_measurement.plan, folder / "next_plan.csv")
+    for name, png in drawn.items():
+        (folder / name).write_bytes(png)
+
+
+VERB = Verb("diagnose", "Find which physics the sensor model leaves out of recordings.", add_arguments, run)

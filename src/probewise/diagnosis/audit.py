@@ -1,0 +1,246 @@
+"""Audit a plan: what it cannot tell apart, which readings would cure that, and what to measure next."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Fit, Model
+from probewise.effects import NamedEffect
+from probewise.recordings.patterns import Uniform
+from probewise.recordings.plan import Plan
+
+__all__ = [
+    "Alias",
+    "NextMeasurement",
+    "aliases",
+    "candidate_plans",
+    "covariance_of",
+    "log_bayes_factor_expected",
+    "next_measurement",
+    "settle",
+]
+
+ALIAS_COSINE = 0.9
+_MOST_READINGS = 102
+
+
+@dataclass(frozen=True)
+class Alias:
+    """Effects whose surviving parts look alike under this plan, and what would tell them apart."""
+
+    effects: tuple[str, str]
+    cosine: float
+    settle_by: str
+    readings: int
+
+
+@dataclass(frozen=True, eq=False)
+class NextMeasurement:
+    """A plan to take next, and how much it is expected to tell between the two leading hypotheses, in nats."""
+
+    plan: Plan
+    description: str
+    minutes: float
+    expected_log_bayes_factor: float
+
+
+def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
+    """Largest principal cosine of what survives of two templates, each (n_points, k)."""
+    bases = []
+    for columns in (first, second):
+        raw = np.linalg.norm(problem.whitener(columns)) / problem.sd
+        projected = problem.project(columns)
+        # What the fit absorbs to within a thousandth is not there to be compared.
+        if np.linalg.norm(projected) < 1e-3 * raw:
+            return 0.0
+        u, lengths, _ = np.linalg.svd(projected, full_matrices=False)
+        bases.append(u[:, lengths > 1e-3 * lengths[0]])
+    return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
+
+
+def aliases(
+    problem: Linearised, templates: Mapping[str, FloatArray], cures: Mapping[tuple[str, str], tuple[str, int]]
+) -> list[Alias]:
+    """List pairs of effects whose surviving templates have a cosine of 0.9 or more.
+
+    Parameters
+    ----------
+    problem
+        The null fit.
+    templates
+        For each effect its most telling columns (n_points, k).
+    cures
+        For each pair, sorted, what would tell them apart and by how many readings; pairs without
+        an entry are said to need a repeat of the plan under other conditions.
+    """
+    out = []
+    for pair in itertools.combinations(sorted(templates), 2):
+        cosine = surviving_cosine(problem, templates[pair[0]], templates[pair[1]])
+        if cosine >= ALIAS_COSINE:
+            settle_by, readings = cures.get(pair, ("no reading that this apparatus can take tells them apart", 0))
+            out.append(Alias(pair, cosine, settle_by, readings))
+    return sorted(out, key=lambda alias: -alias.cosine)
+
+
+def candidate_plans(plan: Plan) -> list[tuple[str, Plan]]:
+    """List what could be measured next, with words for it: repeat, reverse, respeed, rotate, plain patterns."""
+    rows_by_scan = [rows for rows in plan.rows_by_scan() if rows.size >= 8]
+    out: list[tuple[str, Plan]] = []
+    if not rows_by_scan:
+        return out
+    seen_poses: set[tuple[object, ...]] = set()
+    gap_s = _reading_s(plan)
+    start_s = float(plan.time_s.max()) + 30.0
+    for rows in rows_by_scan:
+        ends = tuple(
+            sorted((round(float(plan.x_mm[r]), 3), round(float(plan.y_mm[r]), 3)) for r in (rows[0], rows[-1]))
+        )
+        key = (int(plan.pattern[rows[0]]), round(float(plan.orientation_rad[rows[0]]), 4), ends)
+        if key in seen_poses or len(seen_poses) >= 6:
+            continue
+        seen_poses.add(key)
+        rows = rows[:_MOST_READINGS]
+        name = plan.scan_names[int(plan.scan[rows[0]])]
+        degrees = math.degrees(float(plan.orientation_rad[rows[0]]))
+        out.append((f"take scan {name} again", _rescheduled(plan, rows, start_s, gap_s, f"{name}_again")))
+        out.append((f"take scan {name} backwards", _rescheduled(plan, rows[::-1], start_s, gap_s, f"{name}_reversed")))
+        both = np.concatenate([rows[: _MOST_READINGS // 2 * 2 : 2], rows[: _MOST_READINGS // 2 * 2 : 2][::-1]])
+        out.append(
+            (f"scan {name} forth and back at double speed", _rescheduled(plan, both, start_s, gap_s, f"{name}_both"))
+        )
+        if "orientation_deg" in plan.instrumentation.controls and len(seen_poses) == 1:
+            turned = _rescheduled(plan, rows, start_s, gap_s, f"{name}_turned")
+            turned = replace(turned, orientation_rad=turned.orientation_rad + math.radians(45))
+            out.append((f"take scan {name} with the sensor turned to {degrees + 45:.0f} degrees", turned))
+    for colour, albedo in (("white", 1.0), ("black", 0.0)):
+        rows = rows_by_scan[0][:: max(len(rows_by_scan[0]) // 20, 1)]
+        flat = _rescheduled(plan, rows, start_s, gap_s, f"{colour}_next")
+        names = (*flat.pattern_names, f"plain_{colour}")
+        flat = replace(
+            flat,
+            pattern=np.full(len(flat), len(names) - 1),
+            pattern_names=names,
+            patterns={**flat.patterns, f"plain_{colour}": Uniform(albedo)},
+        )
+        out.append((f"scan a plain {colour} surface", flat))
+    rows = rows_by_scan[0]
+    turned_way = replace(
+        _rescheduled(plan, rows, start_s, gap_s, "across"),
+        x_mm=plan.x_mm[rows].mean() + (plan.y_mm[rows] - plan.y_mm[rows].mean()),
+        y_mm=plan.y_mm[rows].mean() + (plan.x_mm[rows] - plan.x_mm[rows].mean()),
+    )
+    out.append((f"scan across scan {plan.scan_names[int(plan.scan[rows[0]])]}, along the other axis", turned_way))
+    return out
+
+
+def _reading_s(plan: Plan) -> float:
+    gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
+    gaps = gaps[gaps > 0]
+    return float(np.median(gaps)) if gaps.size else 1.0
+
+
+def _rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
+    taken = plan.take(rows)
+    return replace(
+        taken,
+        time_s=np.asarray(start_s + gap_s * np.arange(len(rows)), dtype=np.float64),
+        scan=np.zeros(len(rows), dtype=np.int64),
+        scan_names=(name,),
+        covariates={},
+    )
+
+
+def log_bayes_factor_expected(
+    first: tuple[Model, FloatArray, FloatArray], second: tuple[Model, FloatArray, FloatArray], sd: float, plan: Plan
+) -> float:
+    """Expect the log Bayes factor for the true one of two fitted models after this plan's readings.
+
+    Each model is (model, z, covariance of z). Predictive distributions are normal; the value is the
+    mean of the two Kullback-Leibler divergences.
+    """
+    means, covs = [], []
+    for model, z, cov in (first, second):
+        moved = replace_plan(model, plan)
+        mean, slopes = moved.jacobian(z)
+        means.append(mean)
+        covs.append(sd**2 * np.eye(len(plan)) + slopes @ cov @ slopes.T)
+    difference = means[0] - means[1]
+    inverse = [np.linalg.inv(c) for c in covs]
+    n = len(plan)
+    total = 0.0
+    for a, b in ((0, 1), (1, 0)):
+        trace = float(np.sum(inverse[b] * covs[a]))
+        log_det = float(np.linalg.slogdet(covs[b])[1] - np.linalg.slogdet(covs[a])[1])
+        total += 0.5 * (trace - n + log_det + float(difference @ inverse[b] @ difference))
+    return max(total / 2, 0.0)
+
+
+def replace_plan(model: Model, plan: Plan) -> Model:
+    """Look at another plan with the same model."""
+    return Model(model.sensor, model.effects, plan)
+
+
+def next_measurement(
+    first: tuple[Model, FloatArray, FloatArray],
+    second: tuple[Model, FloatArray, FloatArray],
+    sd: float,
+    plan: Plan,
+) -> NextMeasurement | None:
+    """Choose, among what the arm can do, the plan that tells the two leading hypotheses apart best per minute.
+
+    A plan that promises three nats in less time is preferred to more for longer; None where the recording
+    holds no scan to build on.
+    """
+    best: tuple[float, NextMeasurement] | None = None
+    for description, candidate in candidate_plans(plan):
+        minutes = (float(np.ptp(candidate.time_s)) + 30.0) / 60.0
+        expected = log_bayes_factor_expected(first, second, sd, candidate)
+        option = NextMeasurement(candidate, description, minutes, expected)
+        worth = min(expected, 10.0) / minutes
+        if best is None or worth > best[0]:
+            best = (worth, option)
+    return None if best is None else best[1]
+
+
+def settle(pair: Alias, found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float) -> Alias:
+    """Say which candidate plan tells two aliased effects apart, and by how many readings.
+
+    Each effect is taken at the size at which 400 readings would show it at lambda 8; the plan of the
+    most expected nats a reading is advised, as many readings of it as three nats take.
+    """
+    best: tuple[float, str, int] = (0.0, "", 0)
+    shapes = []
+    for name in pair.effects:
+        effect = effects[name]
+        model = found.model.with_effect(effect)
+        shapes.append((model, np.concatenate([found.z, model.scores_of(effect.bank()[0][:1])[0]])))
+    for description, plan in candidate_plans(found.model.plan):
+        looks = []
+        for model, z in shapes:
+            here = model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0]
+            moved, null = replace_plan(model, plan), replace_plan(found.model, plan)
+            there = moved.predict(z[None, :])[0] - null.predict(found.z[None, :])[0]
+            looks.append((here, there / max(float(np.sqrt(np.mean(here**2))), 1e-12) * 0.4 * sd))
+        sign = np.sign(float(looks[0][0] @ looks[1][0])) or 1.0
+        nats = 0.5 * float(np.sum((looks[0][1] - sign * looks[1][1]) ** 2)) / sd**2
+        per_reading = nats / len(plan)
+        if per_reading > best[0]:
+            best = (per_reading, description, min(max(math.ceil(3.0 / per_reading), 1), _MOST_READINGS))
+    if not best[1]:
+        return pair
+    return replace(pair, settle_by=best[1], readings=best[2])
+
+
+def covariance_of(found: Fit) -> FloatArray:
+    """Covariance of a fit's coordinates by Laplace, noise white."""
+    n_points, p = found.slopes.shape
+    variance = found.sd**2 * n_points / max(n_points - p, 1)
+    return np.asarray(np.linalg.inv(found.slopes.T @ found.slopes / variance + np.eye(p)))

@@ -1,0 +1,200 @@
+"""Is anything missing, and where? One global p-value, then windows over every covariate.
+
+The null law of every statistic comes from the same pivotal bootstrap, r* = P eps: residuals of a linearised
+fit to pure noise, no refits. Every look is counted, because each draw takes every look too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, frozen
+from probewise.diagnosis.covariates import Covariate
+from probewise.diagnosis.evidence import Blocks, Linearised, block_log_bayes_factors
+
+__all__ = ["Place", "global_p_value", "places", "windows"]
+
+_LEAST_ROWS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A window of a covariate where the residual stands out, with its witness curve.
+
+    `start`, `end` in the covariate's unit, None for a scan; the curve is the residual's mean in bins of
+    the covariate, with the noise sd of that mean.
+    """
+
+    covariate: str
+    scan: str | None
+    start: float | None
+    end: float | None
+    p_value: float
+    z: float
+    curve_at: FloatArray
+    curve_mean: FloatArray
+    curve_sd: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("curve_at", "curve_mean", "curve_sd"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def witness(self) -> str:
+        """Name of the figure file that shows it."""
+        where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
+        return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".png"
+
+
+def global_p_value(
+    problem: Linearised, columns: Sequence[FloatArray], families: Sequence[str], draws: FloatArray
+) -> float:
+    """Test that nothing is missing from the mean: the sum of all Bayes factors against its null law.
+
+    Parameters
+    ----------
+    problem
+        The fit under the noise model found.
+    columns, families
+        Every template looked at, and what it belongs to; families count alike.
+    draws
+        Residuals under the null, shape (n_rows, n_draws).
+
+    Returns
+    -------
+    Probability, under the null, of at least what was seen. Beyond the draws' reach the
+    bound P(Bayes factor > b) < 1/b takes over.
+    """
+    blocks = Blocks.of(problem, columns, families)
+    names, codes = np.unique(np.array(families), return_inverse=True)
+    log_weight = -np.log(np.bincount(codes)[codes]) - math.log(len(names))
+    residuals = np.concatenate([problem.residual[:, None], draws], axis=1)
+    scores = block_log_bayes_factors(blocks, residuals, problem.n_points)
+    total: FloatArray = logsumexp(scores + log_weight[:, None], axis=0)
+    above = int(np.sum(total[1:] >= total[0]))
+    p_value: float = (1 + above) / (1 + draws.shape[1])
+    return p_value if above else min(p_value, math.exp(-max(float(total[0]), 0.0)))
+
+
+def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
+    """List windows over the order statistics of a covariate, widths geometric, half overlapping.
+
+    Returns
+    -------
+    Indicator columns (n_points, n_windows) and each one's least and largest value.
+    """
+    values, rows = covariate.values, covariate.rows
+    columns: list[FloatArray] = []
+    ends: list[tuple[float, float]] = []
+
+    def add(members: FloatArray, low: float, high: float) -> None:
+        column = np.zeros(n_points)
+        column[rows[members.astype(np.int64)]] = 1.0
+        columns.append(column)
+        ends.append((low, high))
+
+    if covariate.groups:
+        for value in np.unique(values):
+            add(np.flatnonzero(values == value).astype(np.float64), float(value), float(value))
+        return np.stack(columns, axis=1), ends
+    order = np.argsort(values, kind="stable")
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]])
+    n = len(values)
+    width = n // 2
+    looked: set[tuple[int, int]] = set()
+    while width >= _LEAST_ROWS and len(columns) <= 160:
+        for first in sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width}):
+            # Equal values stay together: a window that parted them would select by something else.
+            low = int(edges[np.searchsorted(edges, first)])
+            high = int(edges[np.searchsorted(edges, first + width)])
+            if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
+                looked.add((low, high))
+                members = order[low:high]
+                add(members.astype(np.float64), float(values[members[0]]), float(values[members[-1]]))
+        width //= 2
+    if not columns:
+        return np.zeros((n_points, 0)), []
+    return np.stack(columns, axis=1), ends
+
+
+def places(
+    problem: Linearised,
+    covariates: Sequence[Covariate],
+    scan_names: Sequence[str],
+    residuals: FloatArray,
+    draws: FloatArray,
+    *,
+    favoured: Sequence[str] = (),
+    largest_p: float = 0.05,
+) -> list[Place]:
+    """Find the window of each covariate that stands out most, strongest first.
+
+    Parameters
+    ----------
+    problem
+        The fit under the noise model found.
+    covariates
+        Where to look.
+    scan_names
+        Names of the scans, for the covariate `scan`.
+    residuals
+        Reading minus prediction, (n_points,), for the witness curves.
+    draws
+        Residuals under the null, (n_rows, n_draws).
+    favoured
+        Covariates in which the effect found shows: they come first among equal p-values.
+    largest_p
+        Windows less surprising than this are not reported.
+    """
+    out: list[Place] = []
+    norms = np.sqrt(np.sum(draws**2, axis=0) / problem.n_points)
+    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_points)
+    for covariate in covariates:
+        columns, ends = windows(covariate, problem.n_points)
+        if not ends:
+            continue
+        projected = problem.project(columns)
+        lengths = np.linalg.norm(projected, axis=0)
+        units = projected[:, lengths > 1e-6] / lengths[lengths > 1e-6]
+        kept = [e for e, length in zip(ends, lengths, strict=True) if length > 1e-6]
+        if not kept:
+            continue
+        scores = np.abs(units.T @ problem.residual) / own_norm
+        null = np.max(np.abs(units.T @ draws) / norms, axis=0)
+        best = int(np.argmax(scores))
+        p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
+        if p_value > largest_p:
+            continue
+        start: float | None
+        end: float | None
+        start, end = kept[best]
+        scan = covariate.scan
+        if covariate.name == "scan":
+            scan, start, end = scan_names[int(kept[best][0])], None, None
+        at, mean, sd = _curve(covariate, residuals, problem.sd)
+        out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), at, mean, sd))
+    return sorted(out, key=lambda place: (place.p_value, place.covariate not in favoured, -place.z))
+
+
+def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    values, mine = covariate.values, residuals[covariate.rows]
+    if covariate.groups:
+        parts = [np.flatnonzero(values == value) for value in np.unique(values)]
+    else:
+        parts = np.array_split(np.argsort(values, kind="stable"), min(30, max(len(values) // 4, 1)))
+    return (
+        np.array([values[p].mean() for p in parts]),
+        np.array([mine[p].mean() for p in parts]),
+        np.array([sd / math.sqrt(len(p)) for p in parts]),
+    )
+
+
+def families_of(effects: Mapping[str, Sequence[FloatArray]]) -> tuple[list[FloatArray], list[str]]:
+    """Flatten templates by name into columns and the name of each."""
+    columns = [c for entries in effects.values() for c in entries]
+    return columns, [name for name, entries in effects.items() for _ in entries]

@@ -1,0 +1,125 @@
+"""The model that a diagnosis ends with: a chain with its effects, as posterior samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen
+from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
+from probewise.calibration.noise import noise_by_scan
+from probewise.calibration.sensor_file import FittedSensor
+from probewise.diagnosis.coordinates import FARTHEST
+from probewise.diagnosis.evidence import NoiseEvidence
+from probewise.diagnosis.fit import Fit
+from probewise.effects import Extent
+from probewise.inference import sd_ceiling, sd_floor
+from probewise.recordings import fingerprint
+from probewise.recordings.plan import Recording
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FreeLevels, FreeMixture
+
+__all__ = ["ModelSamples", "sample_model"]
+
+N_SAMPLES = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSamples:
+    """Equally weighted posterior samples of a chain with effects.
+
+    `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
+    `effects` names all effects, those on the noise too, in the order of their columns.
+    """
+
+    chain: Chain
+    theta: FloatArray
+    noise_sd: FloatArray
+    effects: tuple[str, ...]
+    n_gaussians: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", frozen(self.theta))
+        object.__setattr__(self, "noise_sd", frozen(self.noise_sd))
+
+    def columns(self, effect: str) -> FloatArray:
+        """Select samples of one effect's parameters, (n_samples, n_params of the effect)."""
+        at = [i for i, name in enumerate(self.chain.names) if name.startswith(f"{effect}.")]
+        return self.theta[:, at]
+
+    def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
+        """Make the sensor of it that predicts, drives the robot, and is written to sensor.json."""
+        from_chain = by_mass(self.theta, self.n_gaussians)
+        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_step_mm(recording))
+        field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
+        usable = recording.usable
+        residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
+        scan_noise = noise_by_scan(
+            residuals,
+            recording.plan.scan[usable],
+            recording.plan.scan_names,
+            sd_floor=sd_floor(recording),
+            sd_ceiling=sd_ceiling(recording),
+            rng=rng,
+        )
+        return FittedSensor(
+            names=self.chain.names,
+            samples=from_chain,
+            n_gaussians=self.n_gaussians,
+            noise_sd=self.noise_sd,
+            field=field,
+            instrumentation=recording.plan.instrumentation,
+            effects=self.effects,
+            scan_noise=scan_noise,
+            fingerprint=fingerprint(recording),
+            source=recording.source,
+        )
+
+
+def sample_model(
+    found: Fit, noise: NoiseEvidence, recording: Recording, *, rng: np.random.Generator, n_samples: int = N_SAMPLES
+) -> ModelSamples:
+    """Draw from the Laplace approximation of a fit, under the noise model it was weighed with.
+
+    Parameters
+    ----------
+    found, noise
+        The fit and its evidence under a noise model; the model's nodes are drawn by their weight.
+    recording
+        What was fitted.
+    rng
+        Source of randomness.
+    n_samples
+        How many.
+    """
+    n_points, p = found.slopes.shape
+    whitener = noise.whitener
+    turned, whitened = whitener(found.slopes), whitener(found.residuals)
+    rss = float(whitened @ whitened)
+    dof = max(n_points - p, 1)
+    curvature = turned.T @ turned * dof / max(rss, 1e-300) + np.eye(p)
+    factor = np.linalg.inv(np.linalg.cholesky(curvature))
+    center = found.z + np.linalg.solve(curvature, turned.T @ whitened * dof / max(rss, 1e-300) - found.z)
+    z = np.clip(center + rng.standard_normal((n_samples, p)) @ factor, -FARTHEST, FARTHEST)
+    noise_sd = np.sqrt(np.full(n_samples, rss) / rng.chisquare(dof, n_samples))
+    noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
+    effects = (*found.model.effects, *noise.noise.effects)
+    scene = KnownScene(recording.plan.patterns)
+    chain = Chain(FreeMixture(found.model.sensor.n_gaussians), FreeLevels(), scene, effects)
+    theta = found.model.theta(z)
+    if noise.noise.effects:
+        nodes = noise.noise.settings[rng.choice(len(noise.weights), n_samples, p=noise.weights)]
+        for k in range(nodes.shape[1]):
+            spacing = np.diff(np.unique(noise.noise.settings[:, k]))
+            nodes[:, k] += (rng.random(n_samples) - 0.5) * (spacing[0] if spacing.size else 0.0)
+        theta = np.concatenate([theta, nodes], axis=1)
+    names = tuple(effect.name for effect in chain.effects)
+    return ModelSamples(chain, theta, noise_sd, names, found.model.sensor.n_gaussians)
+
+
+def _step_mm(recording: Recording) -> float:
+    plan = recording.plan
+    moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
+    moves = moves[moves > 0]
+    return float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)

@@ -1,0 +1,87 @@
+"""Repair a model where nothing in the vocabulary explains the residual: by bases orthogonal to what is known.
+
+The correction is a Gaussian process of finite rank: the amplitudes of the bases have normal priors, and each
+basis is projected past everything that the sensor model could take up. It belongs to the recording's rows
+and covariates; it names no physics, so the sensor written to sensor.json does not carry it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.evidence import SCALES, Blocks, Linearised, block_log_bayes_factors
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.gain import HeldOut, compare_scans
+
+__all__ = ["Correction", "correct"]
+
+_MOST_BASES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What the bases add: `change` of the readings (n_points,), and its gain on scans kept back."""
+
+    change: FloatArray
+    columns: FloatArray
+    held_out: HeldOut
+
+
+def correct(found: Fit, problem: Linearised, bases: Sequence[FloatArray], scan: IntArray) -> Correction:
+    """Correct a fit by the few most probable bases.
+
+    Parameters
+    ----------
+    found, problem
+        The null, and its linearisation under the noise model found.
+    bases
+        Templates, each (n_points, k).
+    scan
+        Scan of each usable row, for keeping scans back, shape (n_points,).
+    """
+    blocks = Blocks.of(problem, bases, [""] * len(bases))
+    scores = block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_points)[:, 0]
+    best = np.argsort(-scores)[:_MOST_BASES]
+    best = best[scores[best] > scores[best[0]] - 5]
+    columns = np.concatenate([bases[i] for i in best], axis=1)
+    norms = np.sqrt(np.mean(columns**2, axis=0))
+    columns = columns[:, norms > 0] / norms[norms > 0]
+    everything = np.ones(len(found.residuals), dtype=np.bool_)
+    plain = np.zeros((len(columns), 0))
+    change = found.residuals - _without(found, problem, columns, everything, everything)[0]
+
+    def gain(out: BoolArray) -> FloatArray:
+        return _log_density(found, problem, columns, out) - _log_density(found, problem, plain, out)
+
+    return Correction(change, columns, compare_scans(scan, gain))
+
+
+def _without(
+    found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Fit parameters and amplitudes to the rows kept; return residual and variance of the mean of the rows asked."""
+    sd, p = problem.sd, found.slopes.shape[1]
+    design = np.concatenate([found.slopes, columns], axis=1)
+    center = np.concatenate([-found.z, np.zeros(columns.shape[1])])
+    # An amplitude's prior is that of a rms of a few noise sd: wide, and known to be needed by now.
+    precision = np.concatenate([np.ones(p), np.full(columns.shape[1], 1 / (sd * SCALES[5]) ** 2)])
+    normal = design[kept].T @ design[kept] / sd**2 + np.diag(precision)
+    covariance = np.linalg.inv(normal)
+    amount = covariance @ (design[kept].T @ found.residuals[kept] / sd**2 + precision * center)
+    return (
+        found.residuals[asked] - design[asked] @ amount,
+        np.asarray(np.einsum("ij,jk,ik->i", design[asked], covariance, design[asked])),
+    )
+
+
+def _log_density(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
+    miss, spread = _without(found, problem, columns, ~out, out)
+    kept_miss, _ = _without(found, problem, columns, ~out, ~out)
+    n_free = max(len(kept_miss) - found.slopes.shape[1] - columns.shape[1], 1)
+    total = float(kept_miss @ kept_miss) / n_free + spread
+    return np.asarray(-0.5 * np.log(2 * math.pi * total) - 0.5 * miss**2 / total)

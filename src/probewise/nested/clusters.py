@@ -1,0 +1,112 @@
+"""Find separate clusters among live points, so that moves can take the measure of each by itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+
+__all__ = ["Clusters", "find_clusters"]
+
+_MOST_CLUSTERS = 32
+_N_REFINEMENTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Describe clusters by mean and covariance, and divide space between them.
+
+    `mean` (n_clusters, n_params); `root` the Cholesky roots of the covariances and `inverse_root`
+    their inverses, (n_clusters, n_params, n_params); `log_det` of the roots, (n_clusters,).
+    """
+
+    mean: FloatArray
+    root: FloatArray
+    inverse_root: FloatArray
+    log_det: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def assign(self, u: FloatArray) -> IntArray:
+        """Give each point to the cluster whose Gaussian is densest there, (n, n_params) -> (n,)."""
+        if len(self) == 1:
+            return np.zeros(len(u), dtype=np.int64)
+        z = np.einsum("cij,cnj->cni", self.inverse_root, u[None, :, :] - self.mean[:, None, :])
+        return np.asarray(np.argmin(0.5 * np.einsum("cni,cni->cn", z, z) + self.log_det[:, None], axis=0))
+
+    @staticmethod
+    def of(groups: list[FloatArray]) -> Clusters:
+        """Measure groups of points, each (n, n_params)."""
+        mean = np.stack([g.mean(axis=0) for g in groups])
+        root = np.stack([_root(g) for g in groups])
+        inverse = np.linalg.inv(root)
+        return Clusters(mean, root, inverse, np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1))
+
+
+def find_clusters(points: FloatArray) -> Clusters:
+    """Split points, (n, n_params), again and again while two Gaussians explain them better than one.
+
+    The criterion is the gain in log likelihood beyond two Gaussians' additional parameters
+    (Akaike's); halving a convex cloud never passes it. A false split costs little: the moves stay
+    exact however space is divided.
+    """
+    queue, done = [points], []
+    while queue:
+        group = queue.pop()
+        halves = _split(group) if len(queue) + len(done) + 2 <= _MOST_CLUSTERS else None
+        if halves is None:
+            done.append(group)
+        else:
+            queue.extend(halves)
+    return Clusters.of(done)
+
+
+def _split(points: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    n, n_params = points.shape
+    least = 2 * n_params + 2
+    if n < 2 * least:
+        return None
+    z = (points - points.mean(axis=0)) / np.maximum(points.std(axis=0), 1e-300)
+    values, vectors = np.linalg.eigh(z.T @ z / n)
+    axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, 1e-300))], axis=1)
+    # Two equal modes make the fourth moment small, a small mode beside a great one makes it great.
+    fourth = (axes**4).mean(axis=0)
+    whole = n * _log_det(points)
+    n_more = 1 + n_params * (n_params + 3) / 2
+    best, halves = n_more + 2.0, None
+    for axis in {int(np.argmin(fourth)), int(np.argmax(fourth))}:
+        column = axes[:, axis]
+        side = column > (0.0 if fourth[axis] < 3 else 0.5 * (column.max() + column.min()))
+        for _ in range(_N_REFINEMENTS):
+            if not least <= side.sum() <= n - least:
+                break
+            pair = Clusters.of([points[~side], points[side]])
+            refined = pair.assign(points) == 1
+            if np.array_equal(refined, side):
+                break
+            side = refined
+        n_one = int(side.sum())
+        if not least <= n_one <= n - least:
+            continue
+        a, b = points[~side], points[side]
+        entropy = n_one * np.log(n_one / n) + (n - n_one) * np.log(1 - n_one / n)
+        gain = whole - len(a) * _log_det(a) - len(b) * _log_det(b) + entropy
+        if gain > best:
+            best, halves = float(gain), (a, b)
+    return halves
+
+
+def _root(points: FloatArray) -> FloatArray:
+    n_params = points.shape[1]
+    centred = points - points.mean(axis=0)
+    covariance = centred.T @ centred / max(len(points) - 1, 1)
+    # The ridge keeps a direction without extent from making the root singular.
+    ridge = 1e-10 * np.diag(covariance) + 1e-24 + 1e-13 * np.trace(covariance) / n_params
+    return np.linalg.cholesky(covariance + np.diag(ridge))
+
+
+def _log_det(points: FloatArray) -> float:
+    return float(np.log(np.diag(_root(points))).sum())

@@ -1,0 +1,110 @@
+"""How results show themselves in a notebook: a line of text, a picture, a table where it helps."""
+
+from __future__ import annotations
+
+import html
+
+import numpy as np
+
+from probewise._display import render_html
+from probewise.calibration import Calibration, FittedSensor
+from probewise.diagnosis import Diagnosis
+from probewise.experiment import Exploration, Step
+from probewise.nested import NestedResult
+from probewise.recordings import Recording
+from probewise.report import calibration as calibration_report
+from probewise.report import diagnosis as diagnosis_report
+from probewise.report import exploration as exploration_report
+from probewise.report.html import Markup, element, figure, paragraph, table
+from probewise.report.plots import (
+    hypothesis_probabilities,
+    png,
+    posterior_pairs,
+    posterior_widths,
+    readings_by_orientation,
+    spatial_sensitivity,
+    ssf_by_order,
+)
+from probewise.report.words import count
+from probewise.sensor import SSFField
+
+__all__: list[str] = []
+
+DPI = 70  # notebooks keep every picture: small files
+
+
+def _card(*parts: Markup) -> str:
+    return element("div", *parts)
+
+
+@render_html.register
+def _(value: SSFField) -> str:
+    return _card(figure(png(spatial_sensitivity(value), dpi=DPI), "Spatial sensitivity function, seen from above"))
+
+
+@render_html.register
+def _(value: Recording) -> str:
+    said = f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
+    return _card(figure(png(readings_by_orientation(value), dpi=DPI), said))
+
+
+@render_html.register
+def _(value: FittedSensor) -> str:
+    picture = figure(png(spatial_sensitivity(value.field), dpi=DPI), "Mean SSF field")
+    return _card(
+        paragraph(calibration_report.answer(value)), picture, calibration_report.parameter_table(value)
+    )
+
+
+@render_html.register
+def _(value: Calibration) -> str:
+    drawn = ssf_by_order(
+        value.fields, {o.n_gaussians: o.log_z for o in value.orders}, {o.n_gaussians: o.log_z_error for o in value.orders}
+    )
+    return _card(
+        paragraph(calibration_report.answer(value.sensor)),
+        figure(png(drawn, dpi=DPI), "Mean SSF by number of Gaussians"),
+        calibration_report.evidence_table(value.sensor),
+    )
+
+
+@render_html.register
+def _(value: NestedResult) -> str:
+    text = Markup(f"<pre>{html.escape(value.summary())}</pre>")
+    if not value.names:
+        return _card(text)
+    drawn = posterior_pairs(value.names, value.theta, value.weight)
+    return _card(figure(png(drawn, dpi=DPI), "Posterior: each parameter, and each pair"), text)
+
+
+@render_html.register
+def _(value: Step) -> str:
+    pose = value.reading.pose
+    return _card(paragraph(value.summary()), paragraph(f"Taken at ({pose.x_mm:g}, {pose.y_mm:g}) mm."))
+
+
+@render_html.register
+def _(value: Exploration) -> str:
+    readings = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in value.readings]
+    seen = [r.value for r in value.readings]
+    picture = exploration_report.frame(value.last, value.experiment, readings, levels=(min(seen), max(seen)))
+    widths = posterior_widths(
+        {"run": np.array([s.widest_mm for s in value.steps])}, target_mm=value.experiment.stop_sd_mm
+    )
+    return _card(
+        paragraph(exploration_report.answer(value)),
+        figure(picture, "The robot's view at the end"),
+        figure(png(widths, dpi=DPI), "Widest posterior sd after each reading"),
+    )
+
+
+@render_html.register
+def _(value: Diagnosis) -> str:
+    hypotheses = [h for h in value.hypotheses if h.probability > 1e-3]
+    bars = hypothesis_probabilities([h.label for h in hypotheses], [h.probability for h in hypotheses])
+    rows = [(e.name, f"{e.probability:.3f}", e.sentence) for e in value.effects if e.probability > 0.05]
+    return _card(
+        paragraph(diagnosis_report.answer(value)),
+        figure(png(bars, dpi=DPI), "Probability of each hypothesis"),
+        *((table(("effect", "probability", "what it does"), rows),) if rows else ()),
+    )

@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise._arrays import FloatArray
+from probewise.calibration import Calibration, calibrate, default_prior, predict, problem_for
+from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth, wilson_interval
+from probewise.calibration.distinct import DistinctRows
+from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
+from probewise.inference import SensorProblem, sd_ceiling, sd_floor
+from probewise.nested import State
+from probewise.recordings import Recording, fingerprint
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FreeLevels, FreeMixture
+
+
+def test_calibration_finds_the_parameters_that_made_the_readings(calibration: Calibration, truth: FloatArray) -> None:
+    """Within four posterior sds of each: a right fit fails once in 2 000."""
+    sensor = calibration.sensor
+    mean, sd = sensor.samples.mean(axis=0)[1:], sensor.samples.std(axis=0)[1:]
+    assert (np.abs(mean - truth[1:]) < 4 * sd).all()
+    assert (sd[:2] < 0.3).all()
+
+
+def test_the_fitted_noise_is_that_of_the_readings(calibration: Calibration, noise_sd: float) -> None:
+    sensor = calibration.sensor
+    assert abs(sensor.noise_sd.mean() - noise_sd) < 4 * noise_sd / math.sqrt(2 * 135)
+    assert [scan.scan for scan in sensor.scan_noise] == ["edge_0", "edge_90", "edge_180", "edge_270"]
+    assert sum(scan.n_readings for scan in sensor.scan_noise) == 135
+
+
+def test_the_calibration_says_what_it_rests_on(calibration: Calibration, recording: Recording) -> None:
+    sensor = calibration.sensor
+    assert sensor.fingerprint == fingerprint(recording)
+    assert sensor.source == "edges.csv"
+    assert [(o.n_gaussians, o.n_parameters) for o in calibration.orders] == [(1, 8)]
+    assert calibration.orders[0].log_z == calibration.chosen.log_z
+    assert calibration.orders[0].log_z_error == calibration.chosen.log_z_error > 0
+    assert calibration.probabilities() == {1: 1.0}
+    assert len(calibration.priors) == 6
+    assert calibration.fields[1].values.sum() == pytest.approx(1.0)
+    assert "most probable" in calibration.summary()
+    json.loads(sensor.to_json())
+
+
+def test_the_amplitude_of_a_single_gaussian_keeps_its_prior(calibration: Calibration) -> None:
+    """Only ratios of the a_n reach the data: a_1 stays uniform, its sd that of U(0, 1)."""
+    a = calibration.sensor.samples[:, 0]
+    assert abs(a.mean() - 0.5) < 0.1
+    assert abs(a.std() - 1 / math.sqrt(12)) < 0.06
+
+
+def test_predictions_of_the_recording_leave_noise_alone(calibration: Calibration, recording: Recording) -> None:
+    found = predict(calibration.sensor, recording.plan, recording.readings)
+    z = (recording.readings - found.mean) / found.sd
+    assert 0.6 < np.mean(z**2) < 1.2
+
+
+def test_the_likelihood_is_the_product_over_scans(recording: Recording, truth: FloatArray) -> None:
+    """Sigma integrated numerically, scan by scan, against the problem's closed form."""
+    problem = problem_for(recording, default_prior(recording, 1))
+    plan = recording.plan
+    residual = recording.readings - Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns)).predict(
+        truth[None], plan
+    )
+    log_sd = np.linspace(math.log(sd_floor(recording)), math.log(sd_ceiling(recording)), 20_001)
+    total = 0.0
+    for rows in plan.rows_by_scan():
+        q, n = float((residual[0, rows] ** 2).sum()), len(rows)
+        log_p = -n * log_sd - q / 2 * np.exp(-2 * log_sd) - n / 2 * math.log(2 * math.pi)
+        total += math.log(np.trapezoid(np.exp(log_p - log_p.max()), log_sd) / np.ptp(log_sd)) + log_p.max()
+    assert problem.log_likelihood(truth[None])[0] == pytest.approx(total, abs=1e-6)
+
+
+def test_the_order_of_the_gaussians_does_not_matter(recording: Recording) -> None:
+    prior = default_prior(recording, 2)
+    theta = prior.from_unit_cube(np.random.default_rng(16).random((20, 14)))
+    swapped = np.concatenate([theta[:, 6:12], theta[:, :6], theta[:, 12:]], axis=1)
+    problem = problem_for(recording, prior)
+    np.testing.assert_allclose(problem.log_likelihood(theta), problem.log_likelihood(swapped), rtol=1e-9)
+
+
+def test_rows_predicted_once_are_those_predicted_one_by_one(recording: Recording, truth: FloatArray) -> None:
+    plan = recording.plan.take(np.array([5, 40, 5, 100, 40, 7]))
+    chain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
+    wrapped = DistinctRows(chain, plan)
+    np.testing.assert_allclose(wrapped.predict(truth[None], plan), chain.predict(truth[None], plan), rtol=1e-12)
+    with pytest.raises(ParameterError, match="plan"):
+        wrapped.predict(truth[None], recording.plan)
+
+
+def test_readings_left_out_change_nothing_but_are_counted(recording: Recording, truth: FloatArray) -> None:
+    readings = recording.readings.copy()
+    readings[[3, 70]] = np.nan
+    problem = problem_for(replace(recording, readings=readings), default_prior(recording, 1))
+    keep = np.isfinite(readings)
+    other = problem_for(recording.take(keep), default_prior(recording, 1))
+    assert isinstance(problem, SensorProblem)
+    ours, theirs = problem.log_likelihood(truth[None])[0], other.log_likelihood(truth[None])[0]
+    assert ours == pytest.approx(theirs, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_fewer_readings_than_parameters_are_warned_of_and_noted(recording: Recording) -> None:
+    few = recording.take(np.array([0, 10, 15, 17, 20, 33]))
+    rounds: list[tuple[int, State]] = []
+    with pytest.warns(DoubtfulResultWarning, match="6 usable readings for 8 parameters"):
+        found = calibrate(
+            few,
+            orders=(1,),
+            n_live=40,
+            rng=np.random.default_rng(17),
+            progress=lambda order, state: rounds.append((order, state)),
+            n_samples=500,
+        )
+    assert any("6 usable readings" in note for note in found.sensor.notes)
+    assert any("centre y'" in note for note in found.sensor.notes)
+    assert {order for order, _ in rounds} == {1}
+
+
+def test_recordings_without_contrast_and_orders_without_gaussians_are_refused(recording: Recording) -> None:
+    rng = np.random.default_rng(18)
+    with pytest.raises(ParameterError, match="all 135 usable readings equal"):
+        calibrate(replace(recording, readings=np.full(135, 30.0)), rng=rng)
+    with pytest.raises(ParameterError, match="none usable"):
+        calibrate(replace(recording, readings=np.full(135, np.nan)), rng=rng)
+    with pytest.raises(ParameterError, match="orders"):
+        calibrate(recording, orders=(), rng=rng)
+    with pytest.raises(ParameterError, match="orders"):
+        calibrate(recording, orders=(0, 1), rng=rng)
+    with pytest.raises(ShapeError, match="data_sets"):
+        problem_for(recording, default_prior(recording, 1), data_sets=np.zeros(3, dtype=int))
+
+
+def test_wilson_intervals_are_the_textbook_ones() -> None:
+    """Brown, Cai and DasGupta (2001): 95 of 100 gives 0.888 to 0.978."""
+    low, high = wilson_interval(95, 100)
+    assert low == pytest.approx(0.8882, abs=5e-4)
+    assert high == pytest.approx(0.9785, abs=5e-4)
+    with pytest.raises(ParameterError, match="n above 0"):
+        wilson_interval(3, 2)
+
+
+def test_coverage_counts_survive_as_json() -> None:
+    document = json.loads(Coverage(100, {"I_min": 95, "I_max": 93}, 300).to_json(seed=3))
+    assert document["seed"] == 3
+    assert document["all"] == {"held": 188, "of": 200}
+    assert document["intervals"]["I_min"]["held"] == 95
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    """20 recordings, 7 quantities: by the binomial 17 or more of 20 each, but for 1.6 %; 14 but for 3e-5."""
+    found = coverage(20, rng=np.random.default_rng(19), n_live=100)
+    assert min(found.held.values()) >= 14
+    assert sum(found.held.values()) >= 122
+
+
+@pytest.mark.slow
+def test_evidence_prefers_one_gaussian_where_there_is_one() -> None:
+    rng = np.random.default_rng(20)
+    assert order_lead(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
+
+
+@pytest.mark.slow
+def test_evidence_prefers_two_gaussians_where_there_are_two() -> None:
+    from probewise.recordings import paper_plan
+    from probewise.world import Blob, World, gaussian_spot
+
+    rng = np.random.default_rng(21)
+    spot = gaussian_spot([Blob(0.5, (-5.0, 0.0), (2.5, 3.0)), Blob(0.5, (6.0, 3.0), (2.5, 3.0))])
+    recording = World(spot, noise_sd=0.4).simulate(paper_plan(), rng=rng)
+    found = calibrate(recording, orders=(1, 2), n_live=100, rng=rng)
+    assert found.chosen.n_gaussians == 2
+    assert found.orders[1].log_z - found.orders[0].log_z > 20
+
+
+@pytest.mark.slow
+def test_a_simulated_recording_holds_the_readings_of_its_truth() -> None:
+    rng = np.random.default_rng(22)
+    truth = draw_truth(rng=rng)
+    recording = simulate_truth(truth, rng=rng)
+    assert abs(recording.readings[:20].mean() - truth.black) < 1.0

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from probewise._arrays import FloatArray
+from probewise.calibration import FittedSensor, predict
+from probewise.errors import DoubtfulResultWarning, ShapeError
+from probewise.recordings import Disc, Instrumentation, Plan, Recording, paper_plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FieldSSF, FixedLevels, FreeLevels, FreeMixture
+
+
+def _chain(plan: Plan) -> Chain:
+    return Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
+
+
+def _disc_plan() -> Plan:
+    """A pattern, angles and scans that no calibration had."""
+    x = np.linspace(-30, 30, 21)
+    return Plan(
+        x_mm=x,
+        y_mm=np.full(21, 4.0),
+        orientation_rad=np.linspace(0, 1, 21),
+        time_s=np.arange(21.0),
+        scan=np.zeros(21, dtype=int),
+        scan_names=("new",),
+        pattern=np.zeros(21, dtype=int),
+        pattern_names=("disc",),
+        patterns={"disc": Disc((0.0, 0.0), 15.0)},
+    )
+
+
+@pytest.mark.parametrize("plan", [paper_plan(), _disc_plan()])
+def test_mean_and_sd_are_those_of_simulated_new_readings(sensor: FittedSensor, plan: Plan) -> None:
+    """By brute force: a prediction for every sample, noise added to each."""
+    rng = np.random.default_rng(14)
+    each = _chain(plan).predict(sensor.samples, plan)
+    n_new = 60
+    sum_, squares = np.zeros(len(plan)), np.zeros(len(plan))
+    for _ in range(n_new):
+        new = each + sensor.noise_sd[:, None] * rng.standard_normal(each.shape)
+        sum_ += new.sum(axis=0)
+        squares += ((new - each.mean(axis=0)) ** 2).sum(axis=0)
+    n = n_new * len(each)
+    found = predict(sensor, plan)
+    assert np.abs(found.mean - sum_ / n).max() < 5 * found.sd.max() / math.sqrt(n)
+    np.testing.assert_allclose(found.sd, np.sqrt(squares / n), rtol=0.02)
+    assert np.isnan(found.log_density).all()
+
+
+def test_the_log_density_is_the_mixture_over_the_samples(sensor: FittedSensor, truth: FloatArray) -> None:
+    plan = _disc_plan()
+    readings = _chain(plan).predict(truth[None], plan)[0] + 1.0
+    each = _chain(plan).predict(sensor.samples, plan)
+    expected = np.log(stats.norm.pdf(readings, each, sensor.noise_sd[:, None]).mean(axis=0))
+    np.testing.assert_allclose(predict(sensor, plan, readings).log_density, expected, rtol=1e-9)
+
+
+def test_a_declared_step_gives_masses_of_cells_that_sum_to_one(sensor: FittedSensor) -> None:
+    plan = replace(_disc_plan(), instrumentation=Instrumentation(step=1.0)).take(np.array([10]))
+    total = sum(math.exp(float(predict(sensor, plan, [float(k)]).log_density[0])) for k in range(0, 101))
+    assert total == pytest.approx(1.0, abs=1e-9)
+
+
+def test_missing_readings_and_those_out_of_range_have_no_density_but_a_prediction(sensor: FittedSensor) -> None:
+    plan = replace(_disc_plan(), instrumentation=Instrumentation(min=0.0, max=100.0))
+    readings = np.full(21, 30.0)
+    readings[[3, 4]] = np.nan, 120.0
+    found = predict(sensor, plan, readings)
+    assert np.flatnonzero(np.isnan(found.log_density)).tolist() == [3, 4]
+    assert np.isfinite(found.mean).all()
+    assert (found.sd > 0).all()
+
+
+def test_blocks_of_samples_and_repeated_rows_change_nothing(
+    sensor: FittedSensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = _disc_plan()
+    twice = plan.take(np.concatenate([np.arange(21), np.arange(21)]))
+    readings = np.linspace(10, 60, 42)
+    whole = predict(sensor, twice, readings)
+    monkeypatch.setattr("probewise.calibration.prediction._BLOCK", 1000)
+    blocks = predict(sensor, twice, readings)
+    np.testing.assert_allclose(blocks.mean, whole.mean, rtol=1e-12)
+    np.testing.assert_allclose(blocks.sd, whole.sd, rtol=1e-9)
+    np.testing.assert_allclose(blocks.log_density, whole.log_density, rtol=1e-9)
+    np.testing.assert_allclose(whole.mean[:21], whole.mean[21:])
+
+
+def test_effects_that_carry_over_act_on_the_prediction(
+    sensor: FittedSensor, make_sensor: Callable[..., FittedSensor]
+) -> None:
+    """Gear play of 2 mm shifts a one-way scan by 1 mm."""
+    loose = make_sensor(effects=("backlash",), extra={"backlash.width_mm": 2.0})
+    plan = paper_plan().take(np.arange(101))
+    shifted = replace(plan, x_mm=plan.x_mm - 1.0)
+    np.testing.assert_allclose(predict(loose, plan).mean, predict(sensor, shifted).mean, rtol=1e-12)
+
+
+def test_effects_of_single_scans_do_not_carry_over(make_sensor: Callable[..., FittedSensor]) -> None:
+    extra = {"scan_misplacement.offset_mm": 5.0, "backlash.width_mm": 2.0}
+    bound = make_sensor(effects=("scan_misplacement", "backlash"), extra=extra)
+    loose = make_sensor(effects=("backlash",), extra={"backlash.width_mm": 2.0})
+    plan = paper_plan().take(np.arange(101))
+    np.testing.assert_allclose(predict(bound, plan).mean, predict(loose, plan).mean, rtol=1e-12)
+
+
+def test_the_mean_field_and_the_parameters_predict_alike(sensor: FittedSensor) -> None:
+    """Discrete route by the mean field against closed forms by the samples: 1e-3 of the span."""
+    for plan in (paper_plan(), _disc_plan()):
+        discrete = Chain(FieldSSF(sensor.field), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
+        by_field = discrete.predict(np.empty((1, 0)), plan)[0]
+        by_samples = _chain(plan).predict(sensor.samples * [1, 1, 1, 1, 1, 1, 0, 0] + [0, 0, 0, 0, 0, 0, 0, 1], plan)
+        assert np.abs(by_field - by_samples.mean(axis=0)).max() < 1e-3
+
+
+def test_chi_square_of_fresh_readings_is_one(
+    make_sensor: Callable[..., FittedSensor], truth: FloatArray, noise_sd: float
+) -> None:
+    """408 readings: the mean of z^2 has sd sqrt(2 / 408) = 0.07; four of these fail once in 16 000."""
+    plan = paper_plan()
+    narrow = make_sensor(spread=1e-3)
+    clean = _chain(plan).predict(truth[None], plan)[0]
+    readings = clean + noise_sd * np.random.default_rng(15).standard_normal(len(plan))
+    found = predict(narrow, plan, readings)
+    assert abs(np.mean(((readings - found.mean) / found.sd) ** 2) - 1) < 4 * math.sqrt(2 / len(plan))
+
+
+def test_another_unit_is_warned_of(sensor: FittedSensor) -> None:
+    plan = replace(_disc_plan(), instrumentation=Instrumentation(unit="mW"))
+    with pytest.warns(DoubtfulResultWarning, match="'mW'"):
+        predict(sensor, plan)
+
+
+def test_readings_that_do_not_match_the_plan_are_refused(sensor: FittedSensor) -> None:
+    with pytest.raises(ShapeError, match="one a row"):
+        predict(sensor, _disc_plan(), np.zeros(3))
+
+
+def test_a_plan_without_rows_predicts_nothing(sensor: FittedSensor) -> None:
+    plan = _disc_plan().take(np.array([], dtype=int))
+    assert len(predict(sensor, Recording(plan, np.array([])).plan)) == 0

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probewise.calibration import FittedSensor, OrderEvidence, PriorRow, ScanNoise, read_sensor, write_sensor
+from probewise.errors import FileError, ParameterError, ShapeError
+
+
+def _full(sensor: FittedSensor) -> FittedSensor:
+    return replace(
+        sensor,
+        orders=(OrderEvidence(1, -320.5, 0.3), OrderEvidence(2, -326.0, 0.4)),
+        priors=(PriorRow("a_n", "1", "uniform 0 to 1", "only ratios reach the data"),),
+        scan_noise=(ScanNoise("edge_0", 101, 0.5, 0.03),),
+        notes=("something to know",),
+        fingerprint="ab12",
+        source="rec.csv",
+    )
+
+
+def test_a_sensor_survives_its_file(sensor: FittedSensor, tmp_path: Path) -> None:
+    full = _full(sensor)
+    write_sensor(full, tmp_path / "sensor.json")
+    back = read_sensor(tmp_path / "sensor.json")
+    np.testing.assert_array_equal(back.samples, full.samples)
+    np.testing.assert_array_equal(back.noise_sd, full.noise_sd)
+    np.testing.assert_allclose(back.field.values, full.field.values, rtol=1e-12)
+    assert (back.field.pixel_mm, back.field.origin_mm) == (full.field.pixel_mm, full.field.origin_mm)
+    for name in ("names", "orders", "priors", "scan_noise", "notes", "fingerprint", "source", "instrumentation"):
+        assert getattr(back, name) == getattr(full, name)
+    assert list(tmp_path.iterdir()) == [tmp_path / "sensor.json"]
+
+
+def test_the_file_is_strict_json_with_the_promised_content(sensor: FittedSensor) -> None:
+    document = json.loads(_full(sensor).to_json(), parse_constant=lambda c: pytest.fail(c))
+    assert document["format"] == "sensor/1"
+    assert len(document["samples"]) >= 500
+    assert document["parameters"][6]["name"] == "I_min"
+    assert document["orders"][1]["n_parameters"] == 14
+    assert document["orders"][1]["n_ssf_parameters"] == 12
+    assert {"pixel_mm", "origin_mm", "values"} <= set(document["field"])
+
+
+def _without(*keys: str) -> Callable[[dict[str, Any]], None]:
+    def change(document: dict[str, Any]) -> None:
+        for key in keys[:-1]:
+            document = document[key]
+        del document[keys[-1]]
+
+    return change
+
+
+def _with(value: object, *keys: str | int) -> Callable[[dict[str, Any]], None]:
+    def change(document: Any) -> None:
+        for key in keys[:-1]:
+            document = document[key]
+        document[keys[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_with("sensor/2", "format"), "format 'sensor/2'; allowed: 'sensor/1'"),
+        (_without("samples"), "no samples"),
+        (_without("field", "pixel_mm"), "no field.pixel_mm"),
+        (_without("noise", "sd"), "no noise.sd"),
+        (_with(float("nan"), "noise", "sd", 0), "NaN"),
+        (_with("x", "samples", 3, 2), "samples is"),
+        (_with([1.0], "samples", 3), "equal dimensions"),
+        (_with([[1.0] * 8] * 3, "samples"), "500 or more"),
+        (_with(2, "n_gaussians"), "names"),
+        (_with(0, "n_gaussians"), "n_gaussians"),
+        (_with(1.5, "n_gaussians"), "a whole number"),
+        (_with(-1.0, "field", "pixel_mm"), "pixel_mm"),
+        (_with([0.0], "field", "origin_mm"), "two numbers"),
+        (_with([[0.0, 0.0]], "field", "values"), "SSF field"),
+        (_with(["gremlins"], "effects"), "gremlins"),
+        (_with("text", "orders"), "a list of objects"),
+        (_with({}, "priors", 0), "priors.parameter"),
+        (_with(-5.0, "samples", 0, 3), "A B - C"),
+        (_with(None, "instrumentation", "unit"), "a text"),
+        (_with("wide", "instrumentation", "min"), "a finite number"),
+    ],
+)
+def test_damaged_files_say_where(
+    sensor: FittedSensor, tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str
+) -> None:
+    document = json.loads(_full(sensor).to_json())
+    change(document)
+    path = tmp_path / "sensor.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(FileError) as caught:
+        read_sensor(path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "allowed: " in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1, 2]", b"\xff\xfe\x00", b'"sensor/1"'])
+def test_what_is_no_sensor_at_all_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "sensor.json"
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"sensor\.json"):
+        read_sensor(path)
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match=r"nothing\.json.*cannot be read"):
+        read_sensor(tmp_path / "nothing.json")
+
+
+def test_a_sensor_must_hold_together(sensor: FittedSensor) -> None:
+    with pytest.raises(ParameterError, match="500 or more"):
+        replace(sensor, samples=sensor.samples[:100], noise_sd=sensor.noise_sd[:100])
+    with pytest.raises(ShapeError, match="samples have shape"):
+        replace(sensor, samples=sensor.samples[:, :7])
+    with pytest.raises(ShapeError, match="one a sample"):
+        replace(sensor, noise_sd=sensor.noise_sd[:9])
+    with pytest.raises(ParameterError, match="greater than 0"):
+        replace(sensor, noise_sd=-sensor.noise_sd)
+    with pytest.raises(ParameterError, match="after I_max the columns"):
+        replace(sensor, effects=("backlash",))
+
+
+def test_the_summary_names_every_parameter_and_the_preferred_order(sensor: FittedSensor) -> None:
+    text = _full(sensor).summary()
+    assert all(name in text for name in sensor.names)
+    assert "-320.50 ± 0.30  most probable" in text
+    assert "something to know" in text
+
+
+def test_intervals_are_quantiles_of_the_samples(sensor: FittedSensor) -> None:
+    low, high = sensor.interval(0.9)["u_1"]
+    inside = (sensor.samples[:, 1] >= low) & (sensor.samples[:, 1] <= high)
+    assert abs(inside.mean() - 0.9) < 0.01

@@ -1,0 +1,356 @@
+"""The chain of stages, its effects, and the naive sensor."""
+
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import ndtr
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.priors import Product, Uniform
+from probewise.recordings import patterns as kinds
+from probewise.recordings.plan import Plan
+from probewise.scene import AnyOf, Circle, HypothesisScene, KnownScene, Rectangle, disc_region
+from probewise.sensor import (
+    FAST_NODES,
+    Chain,
+    FieldSSF,
+    FixedLevels,
+    FixedMixture,
+    FreeLevels,
+    FreeMixture,
+    NaiveSensor,
+    NoiseLevel,
+    SceneView,
+    Stage,
+    field_of,
+    footprint_of,
+)
+
+PATTERNS = {
+    "boundary": kinds.HalfPlane(0.0, 0.0),
+    "corner": kinds.Quadrant((1.0, 2.0), (-1, 1)),
+    "grey": kinds.HalfPlane(0.5, 1.0, inside=0.9, outside=0.2),
+    "disc": kinds.Disc((3.0, 1.0), 8.0),
+}
+ONE = np.array([1.0, 0.5, 1.5, 0.02, 0.01, 0.005])
+TWO = np.concatenate([ONE, [0.6, -2.0, 3.0, 0.03, 0.05, -0.01]])
+
+
+def plan_of(n_points=24, seed=0, names=tuple(PATTERNS), patterns=PATTERNS):
+    rng = np.random.default_rng(seed)
+    return Plan(
+        x_mm=rng.uniform(-12, 12, n_points),
+        y_mm=rng.uniform(-12, 12, n_points),
+        orientation_rad=rng.choice(np.radians([0, 90, 180, 270]), n_points),
+        time_s=np.arange(n_points) * 1.0,
+        scan=np.zeros(n_points, dtype=int),
+        scan_names=("scan",),
+        pattern=rng.integers(0, len(names), n_points),
+        pattern_names=names,
+        patterns=patterns,
+    )
+
+
+def thetas(n, n_gaussians, seed=1):
+    rng = np.random.default_rng(seed)
+    shape = TWO[: 6 * n_gaussians] * rng.uniform(0.9, 1.1, (n, 6 * n_gaussians))
+    return np.concatenate([shape, rng.uniform([[8.0, 45.0]], [[12.0, 55.0]], (n, 2))], axis=1)
+
+
+CHAINS = {
+    "one_free": (Chain(FreeMixture(1), FreeLevels(), KnownScene(PATTERNS)), lambda n: thetas(n, 1)),
+    "two_free": (Chain(FreeMixture(2), FreeLevels(), KnownScene(PATTERNS)), lambda n: thetas(n, 2)),
+    "known_sensor": (
+        Chain(FixedMixture.from_parameters(TWO), FixedLevels(10, 50), HypothesisScene(Circle())),
+        lambda n: np.random.default_rng(2).uniform([-5, -5, 5], [5, 5, 12], (n, 3)),
+    ),
+    "field": (
+        Chain(
+            FieldSSF(field_of(footprint_of(TWO[None], 2), u_mm=np.arange(-30, 31, 2.0), v_mm=np.arange(-30, 31, 2.0))),
+            FixedLevels(10, 50),
+            HypothesisScene(Circle()),
+        ),
+        lambda n: np.random.default_rng(2).uniform([-5, -5, 5], [5, 5, 12], (n, 3)),
+    ),
+    "naive": (
+        NaiveSensor(FreeLevels(), HypothesisScene(Circle())),
+        lambda n: np.random.default_rng(2).uniform([10, 50, -5, -5, 5], [12, 52, 5, 5, 12], (n, 5)),
+    ),
+}
+
+
+@pytest.fixture(params=CHAINS, name="model")
+def _model(request):
+    return CHAINS[request.param]
+
+
+def test_hypotheses_together_equal_one_by_one(model):
+    sensor, draw = model
+    theta, plan = draw(7), plan_of()
+    together = sensor.predict(theta, plan)
+    assert together.shape == (7, len(plan))
+    assert theta.shape[1] == len(sensor.names)
+    for i in range(7):
+        assert sensor.predict(theta[i : i + 1], plan)[0] == pytest.approx(together[i], abs=1e-8)
+
+
+def test_readings_together_equal_one_by_one(model):
+    sensor, draw = model
+    theta, plan = draw(3), plan_of()
+    together = sensor.predict(theta, plan)
+    for j in range(0, len(plan), 5):
+        assert sensor.predict(theta, plan.take(np.array([j])))[:, 0] == pytest.approx(together[:, j], abs=1e-8)
+
+
+def test_predictions_lie_between_dark_and_bright(model):
+    sensor, draw = model
+    found = sensor.predict(draw(50), plan_of(60))
+    assert found.min() >= 8.0 - 1e-6
+    assert found.max() <= 55.0 + 1e-6
+
+
+def test_theta_of_another_width_is_refused(model):
+    sensor, draw = model
+    with pytest.raises(ShapeError, match="theta has shape"):
+        sensor.predict(draw(2)[:, :-1], plan_of())
+
+
+def test_one_gaussian_over_a_half_plane_reads_the_error_function():
+    """Paper, eq. (modelI) and (Ssf): covariance is half the inverse of [[A, C], [C, B]]."""
+    chain, plan = CHAINS["one_free"][0], plan_of(30, names=("boundary",))
+    found = chain.predict(np.array([[*ONE, 10.0, 50.0]]), plan)[0]
+    _, u, v, aa, bb, cc = ONE
+    cov = 0.5 * np.linalg.inv([[aa, cc], [cc, bb]])
+    for j, turn in enumerate(plan.orientation_rad):
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        mean_x = plan.x_mm[j] + (rotation @ [u, v])[0]
+        sd_x = np.sqrt((rotation @ cov @ rotation.T)[0, 0])
+        assert found[j] == pytest.approx(10 + 40 * ndtr(mean_x / sd_x), abs=1e-7)
+
+
+def test_a_half_covered_ssf_reads_midway():
+    plan = replace(plan_of(1, names=("boundary",)), x_mm=[0.0], y_mm=[0.0], orientation_rad=[0.7])
+    theta = np.array([[1.0, 0.0, 0.0, 0.02, 0.01, 0.005, 10.0, 50.0]])
+    assert CHAINS["one_free"][0].predict(theta, plan)[0, 0] == pytest.approx(30.0, abs=1e-9)
+
+
+def test_an_empty_view_gives_the_dark_count():
+    plan = replace(plan_of(1, names=("boundary",)), x_mm=[-500.0])
+    assert CHAINS["two_free"][0].predict(np.array([[*TWO, 10.0, 50.0]]), plan)[0, 0] == pytest.approx(10.0, abs=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(turn=st.floats(-7, 7), seed=st.integers(0, 1000))
+def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.array([[c, -s], [s, c]])
+    plan = plan_of(12, seed=seed, names=("boundary", "disc"))
+    turned_patterns = {
+        "boundary": kinds.HalfPlane(turn, 0.0),
+        "disc": kinds.Disc(tuple(rotation @ PATTERNS["disc"].center_mm), 8.0),
+    }
+    x, y = rotation @ np.stack([plan.x_mm, plan.y_mm])
+    turned = replace(plan, x_mm=x, y_mm=y, orientation_rad=plan.orientation_rad + turn, patterns=turned_patterns)
+    still = Chain(FreeMixture(2), FreeLevels(), KnownScene(plan.patterns))
+    moved = Chain(FreeMixture(2), FreeLevels(), KnownScene(turned_patterns))
+    theta = thetas(3, 2)
+    assert moved.predict(theta, turned) == pytest.approx(still.predict(theta, plan), abs=1e-6)
+
+
+def test_the_field_route_agrees_with_the_closed_forms():
+    """1 mm pixels, 1e-3 of the span of 40."""
+    u = np.arange(-40.0, 41.0)
+    field = FieldSSF(field_of(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
+    plan = plan_of(20)
+    scene, levels = KnownScene(PATTERNS), FixedLevels(10, 50)
+    closed = Chain(FixedMixture.from_parameters(TWO), levels, scene).predict(np.zeros((1, 0)), plan)
+    summed = Chain(field, levels, scene).predict(np.zeros((1, 0)), plan)
+    assert np.abs(summed - closed).max() < 0.04
+
+
+def test_few_nodes_are_enough_for_the_robot():
+    """Stated error of FAST_NODES: 1e-4 of the span."""
+    ssf, levels, scene = FixedMixture.from_parameters(TWO), FixedLevels(10, 50), HypothesisScene(Circle())
+    theta = Circle().prior.from_unit_cube(np.random.default_rng(0).random((200, 3)))
+    plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
+    full = Chain(ssf, levels, scene).predict(theta, plan)
+    fast = Chain(ssf, levels, scene, n_nodes=FAST_NODES).predict(theta, plan)
+    assert np.abs(full - fast).max() < 40e-4
+
+
+def test_a_set_of_shapes_goes_through_the_chain():
+    shape = AnyOf({"circle": Circle(), "rectangle": Rectangle()})
+    ssf, levels = FixedMixture.from_parameters(TWO), FixedLevels(10, 50)
+    theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((30, 7)))
+    plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
+    found = Chain(ssf, levels, HypothesisScene(shape)).predict(theta, plan)
+    circles = shape.which(theta) == 0
+    alone = Chain(ssf, levels, HypothesisScene(Circle())).predict(theta[circles][:, 1:4], plan)
+    assert found[circles] == pytest.approx(alone, abs=1e-8)
+
+
+def test_the_naive_sensor_reads_by_the_point_under_it():
+    """Paper, naive likelihood: white where the distance is at most the radius."""
+    plan = replace(plan_of(3), x_mm=[0.0, 8.0, 8.1], y_mm=[0.0, 0.0, 0.0])
+    theta = np.array([[10.0, 50.0, 0.0, 0.0, 8.0], [10.0, 50.0, 100.0, 0.0, 8.0]])
+    found = CHAINS["naive"][0].predict(theta, plan)
+    assert found.tolist() == [[50.0, 50.0, 10.0], [10.0, 10.0, 10.0]]
+
+
+def test_a_pattern_that_the_scene_lacks_is_named():
+    with pytest.raises(ParameterError, match="pattern is 'boundary'; allowed: a pattern of the scene: disc"):
+        Chain(FreeMixture(1), FreeLevels(), KnownScene({"disc": PATTERNS["disc"]})).predict(
+            thetas(1, 1), plan_of(names=("boundary",))
+        )
+
+
+@dataclass(frozen=True)
+class Doer:
+    """An effect made of a function: what the stages hand it, and its one parameter."""
+
+    name: str
+    stage: Stage
+    does: object
+    prior = Product({"size": Uniform(-10.0, 10.0)})
+
+    def apply(self, value, theta, plan):
+        assert theta.shape[1] == 1
+        return self.does(value, theta)
+
+
+SHIFT = Doer("shift", Stage.POSE, lambda poses, t: replace(poses, x_mm=poses.x_mm + t))
+TURN = Doer("turn", Stage.POSE, lambda poses, t: replace(poses, orientation_rad=poses.orientation_rad + t))
+SPREAD = Doer("spread", Stage.FOOTPRINT, lambda f, t: replace(f, var_u=f.var_u + t[:, :, None] ** 2))
+CURVE = Doer("curve", Stage.RESPONSE, lambda u, t: u**t)
+GAIN = Doer("gain", Stage.GAIN, lambda signal, t: signal * (1 + t))
+OFFSET = Doer("offset", Stage.OFFSET, lambda reading, t: reading + t)
+CLIP = Doer("clip", Stage.SATURATION, lambda reading, t: np.minimum(reading, t))
+LOUD = Doer("loud", Stage.NOISE, lambda noise, t: NoiseLevel(noise.sd * t, noise.rho))
+
+
+def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
+    """reading = min(I_min + (I_max - I_min) R^c (1 + g) + o, level), worked out by hand."""
+    base = CHAINS["two_free"][0]
+    plan, theta = plan_of(), thetas(4, 2)
+    plain = base.predict(theta, plan)
+    i_min, span = theta[:, -2:-1], theta[:, -1:] - theta[:, -2:-1]
+    wanted = np.minimum(i_min + span * ((plain - i_min) / span) ** 1.4 * 1.2 + 0.7, 40.0)
+    sizes = {"curve": 1.4, "gain": 0.2, "offset": 0.7, "clip": 40.0}
+    for given_order in permutations((CURVE, GAIN, OFFSET, CLIP)):
+        chain = base.with_effects(*given_order)
+        assert chain.names[-4:] == ("curve.size", "gain.size", "offset.size", "clip.size")
+        columns = np.array([[sizes[effect.name] for effect in chain.effects]])
+        found = chain.predict(np.concatenate([theta, np.repeat(columns, 4, axis=0)], axis=1), plan)
+        assert found == pytest.approx(wanted, abs=1e-9)
+
+
+def test_effects_before_the_footprint_act_a_hypothesis_each():
+    """Shifting and turning the pose of each hypothesis equals predicting from a moved plan."""
+    base = CHAINS["two_free"][0]
+    plan, theta = plan_of(), thetas(3, 2)
+    moves = np.array([[0.0, 0.0], [2.0, 0.5], [-1.0, 3.0]])
+    found = base.with_effects(TURN, SHIFT).predict(np.concatenate([theta, moves[:, ::-1]], axis=1), plan)
+    for i, (shift, turn) in enumerate(moves):
+        moved = replace(plan, x_mm=plan.x_mm + shift, orientation_rad=plan.orientation_rad + turn)
+        assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
+
+
+def test_a_shift_alone_keeps_the_fast_route_and_its_numbers():
+    base = CHAINS["two_free"][0]
+    plan, theta = plan_of(), thetas(2, 2)
+    found = base.with_effects(SHIFT).predict(np.concatenate([theta, [[1.5], [-2.5]]], axis=1), plan)
+    for i, shift in enumerate((1.5, -2.5)):
+        moved = replace(plan, x_mm=plan.x_mm + shift)
+        assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
+
+
+def test_an_effect_on_the_scene_may_give_each_hypothesis_its_own():
+    def grow(view, t):
+        disc = disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])
+        return SceneView({**view.regions, "disc": disc})
+
+    base, plan, theta = CHAINS["one_free"][0], plan_of(), thetas(2, 1)
+    found = base.with_effects(Doer("grow", Stage.SCENE, grow)).predict(
+        np.concatenate([theta, [[0.0], [3.0]]], axis=1), plan
+    )
+    larger = Chain(base.ssf, base.levels, KnownScene({**PATTERNS, "disc": kinds.Disc((3.0, 1.0), 11.0)}))
+    assert found[0] == pytest.approx(base.predict(theta, plan)[0], abs=1e-7)
+    assert found[1] == pytest.approx(larger.predict(theta, plan)[1], abs=1e-7)
+
+
+def test_a_footprint_that_varies_along_the_plan_equals_reading_by_reading():
+    widths = np.linspace(0, 6, 24)
+
+    def widen(footprint, t):
+        return replace(footprint, var_u=footprint.var_u + t[:, :, None] * widths[None, :, None])
+
+    base, plan, theta = CHAINS["two_free"][0], plan_of(), thetas(2, 2)
+    found = base.with_effects(Doer("widen", Stage.FOOTPRINT, widen)).predict(
+        np.concatenate([theta, [[1.0], [2.0]]], axis=1), plan
+    )
+    for j in range(24):
+        one = base.with_effects(SPREAD)
+        sizes = np.sqrt(widths[j] * np.array([[1.0], [2.0]]))
+        alone = one.predict(np.concatenate([theta, sizes], axis=1), plan.take(np.array([j])))
+        assert found[:, j] == pytest.approx(alone[:, 0], abs=1e-7)
+
+
+def test_a_known_width_with_a_place_of_each_hypothesis_equals_one_by_one():
+    """Only some of the footprint's arrays depend on the hypothesis; so do only some of the patterns."""
+
+    def move(footprint, t):
+        return replace(footprint, u_mm=footprint.u_mm + t[:, :, None])
+
+    def grow(view, t):
+        return SceneView({**view.regions, "disc": disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])})
+
+    plan = plan_of()
+    chain = Chain(FixedMixture.from_parameters(TWO), FixedLevels(10, 50), KnownScene(PATTERNS))
+    for effect in (Doer("move", Stage.FOOTPRINT, move), Doer("grow", Stage.SCENE, grow)):
+        model = chain.with_effects(effect)
+        theta = np.array([[0.0], [1.5], [3.0]])
+        together = model.predict(theta, plan)
+        for i in range(3):
+            assert model.predict(theta[i : i + 1], plan)[0] == pytest.approx(together[i], abs=1e-8)
+        assert together[0] == pytest.approx(chain.predict(np.zeros((1, 0)), plan)[0], abs=1e-8)
+
+
+def test_many_angles_and_few_give_the_same():
+    """Readings at as many angles as there are readings, and one by one: two routes to one number."""
+    base, theta = CHAINS["two_free"][0], thetas(3, 2)
+    plan = replace(plan_of(30, names=("boundary",)), orientation_rad=np.linspace(0, 6, 30))
+    together = base.predict(theta, plan)
+    for j in range(30):
+        assert base.predict(theta, plan.take(np.array([j])))[:, 0] == pytest.approx(together[:, j], abs=1e-8)
+
+
+def test_effects_on_the_noise_leave_the_prediction_alone():
+    base = CHAINS["one_free"][0]
+    plan, theta = plan_of(), np.concatenate([thetas(3, 1), [[1.0], [2.0], [3.0]]], axis=1)
+    chain = base.with_effects(LOUD)
+    assert np.array_equal(chain.predict(theta, plan), base.predict(theta[:, :-1], plan))
+    level = chain.noise_level(theta, plan, np.array([[0.5]]))
+    assert level.sd[:, 0].tolist() == [0.5, 1.0, 1.5]
+    assert level.rho.tolist() == [[0.0]]
+
+
+def test_effects_that_cannot_be_are_refused():
+    base = CHAINS["one_free"][0]
+    with pytest.raises(ParameterError, match="each name once"):
+        base.with_effects(GAIN, GAIN)
+    with pytest.raises(ParameterError, match="none at the footprint with a FieldSSF"):
+        CHAINS["field"][0].with_effects(SPREAD)
+
+
+def test_predicting_twice_gives_the_same_and_leaves_the_plan_alone(model):
+    sensor, draw = model
+    plan, theta = plan_of(), draw(3)
+    before = theta.copy()
+    first = sensor.predict(theta, plan)
+    first[:] = -1
+    assert not np.any(sensor.predict(theta, plan) == -1)
+    assert np.array_equal(theta, before)

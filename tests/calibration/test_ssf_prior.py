@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.calibration import SSFPrior, default_prior, scan_geometry
+from probewise.calibration import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Uniform
 from probewise.recordings import HalfPlane, Plan, Recording, paper_plan
@@ -112,3 +112,13 @@ def test_scans_that_stay_on_one_side_of_the_edge_are_refused() -> None:
     plan = paper_plan().take(np.arange(20))
     with pytest.raises(ParameterError, match="both sides"):
         default_prior(_recording(plan, np.linspace(10, 11, 20)), 1)
+
+
+def test_edges_in_one_direction_leave_the_axis_across_them_unseen() -> None:
+    """Scans at 0 and 180 degrees see x' only, those at 90 and 270 degrees y' only."""
+    whole = _edge_recording()
+    assert blind_axis_rad(whole) is None
+    assert blind_axis_rad(whole.take(np.arange(202))) is None
+    assert blind_axis_rad(whole.take(np.r_[0:101, 202:303])) == pytest.approx(math.pi / 2)
+    assert blind_axis_rad(whole.take(np.r_[101:202, 303:404])) == pytest.approx(0.0, abs=1e-9)
+    assert blind_axis_rad(whole.take(np.r_[0:101, 404:405])) is None

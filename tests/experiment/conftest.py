@@ -100,9 +100,9 @@ def small_experiment(**changes):
         "likelihood": Gaussian(),
         "noise_sd": 1.0,
         "grid": Grid(400.0, 300.0, 51, 39),
-        "n_live": 60,
-        "n_samples": 30,
-        "n_diversify": 200,
+        "n_live": 40,
+        "n_samples": 20,
+        "n_diversify": 50,
     }
     return Experiment(**{**options, **changes})
 

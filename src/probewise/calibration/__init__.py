@@ -8,7 +8,7 @@ from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_mo
 from probewise.calibration.fit import Calibration, OrderFit, calibrate, problem_for
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
 from probewise.calibration.prediction import predict
-from probewise.calibration.priors import PriorRow, ScanGeometry, SSFPrior, default_prior, scan_geometry
+from probewise.calibration.priors import PriorRow, ScanGeometry, SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "SSFPrior",
     "ScanGeometry",
     "ScanNoise",
+    "blind_axis_rad",
     "calibrate",
     "choose_pixel_mm",
     "default_prior",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -139,7 +140,7 @@ def mean_field(
     if widest / pixel_mm > max_pixels - 2:
         pixel_mm = _rounded_up(widest / (max_pixels - 2))
     u_mm, v_mm = _centers(low_u, high_u, pixel_mm), _centers(low_v, high_v, pixel_mm)
-    return field_of(f, u_mm=u_mm, v_mm=v_mm, weights=shares)
+    return replace(field_of(f, u_mm=u_mm, v_mm=v_mm, weights=shares), pixel_mm=pixel_mm)
 
 
 def _footprint(theta: FloatArray, n_gaussians: int) -> Footprint:

@@ -14,14 +14,14 @@ from probewise._display import ShowsItself
 from probewise.calibration.distinct import DistinctRows
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field, mixture_moments
 from probewise.calibration.noise import noise_by_scan, pooled_sd
-from probewise.calibration.priors import PriorRow, SSFPrior, default_prior, scan_geometry
+from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor, student_t
 from probewise.nested import NestedResult, State, run
 from probewise.recordings import Recording, fingerprint
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FreeLevels, FreeMixture, SSFField
+from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture, SSFField
 
 __all__ = ["Calibration", "OrderFit", "calibrate", "problem_for"]
 
@@ -114,7 +114,8 @@ def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | 
     groups = plan.scan if data_sets is None else np.asarray(data_sets)
     if groups.shape != (len(plan),):
         raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one a row")
-    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns))
+    # Curved edges to 1e-4 of the span: below a tenth of the least noise sd that is believed in.
+    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
     return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)
 
 
@@ -220,8 +221,15 @@ def _fitted(
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
     pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
+    blind = blind_axis_rad(recording)
     silent = _uninformed(samples, prior, rng)
-    if silent:
+    if blind is not None:
+        notes = (
+            *notes,
+            "all edges cross the sensor in one direction: nothing is learnt of the SSF along "
+            f"{math.degrees(blind):.3g} degrees in its frame; there the posterior is the prior",
+        )
+    elif silent:
         notes = (*notes, f"the recording says little about {', '.join(silent)}: there the posterior is the prior")
     n_left_out = len(plan) - int(usable.sum())
     if n_left_out:

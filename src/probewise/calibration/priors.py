@@ -9,6 +9,7 @@ comes from what the scans can resolve and contain. `SSFPrior(precision=Uniform(.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +17,14 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import LogUniform, Marginal, Uniform
-from probewise.recordings import Recording
+from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
+from probewise.recordings import Uniform as UniformPattern
 from probewise.scene import KnownScene
 
-__all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "default_prior", "scan_geometry"]
+__all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "blind_axis_rad", "default_prior", "scan_geometry"]
 
 _MAX_CORRELATION = 0.98
+_SAME_AXIS = 0.01  # chord of the doubled angle: 0.3 degrees
 _AMPLITUDE = Uniform(0.0, 1.0)
 _PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
 
@@ -236,6 +239,33 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
             ("levels", level),
         ),
     )
+
+
+def blind_axis_rad(recording: Recording) -> float | None:
+    """Find the axis of the sensor frame along which no edge told one part of the SSF from another.
+
+    Straight edges, stripes and ramps show the SSF's projection on their normal alone, turned into
+    the sensor frame. Where the normals of all usable rows agree, the recording says nothing of the
+    SSF along the axis at right angles to them: there the posterior is the prior.
+
+    Returns
+    -------
+    The axis, radians anticlockwise from x', 0 to pi; `None` where two directions or more were seen.
+    """
+    plan = recording.plan
+    angles: list[FloatArray] = []
+    for name, rows in plan.rows_by_pattern():
+        pattern, used = plan.patterns[name], rows[recording.usable[rows]]
+        if isinstance(pattern, HalfPlane | Ramp | Stripes):
+            angles.append(pattern.normal_rad - plan.orientation_rad[used])
+        elif used.size and not isinstance(pattern, UniformPattern):
+            return None
+    if not any(part.size for part in angles):
+        return None
+    seen = np.exp(2j * np.concatenate(angles))  # doubled angles: a normal and its opposite are one axis
+    if np.abs(seen - seen[0]).max() > _SAME_AXIS:
+        return None
+    return float((np.angle(seen[0]) / 2 + math.pi / 2) % math.pi)
 
 
 def _albedo_under(recording: Recording) -> FloatArray:

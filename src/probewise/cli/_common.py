@@ -29,7 +29,7 @@ __all__ = [
     "staged",
 ]
 
-DEFAULT_SEED = 2013  # printed with every run
+DEFAULT_SEED = 5  # printed with every run
 
 
 @dataclass(frozen=True)

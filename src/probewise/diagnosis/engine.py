@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,6 +29,7 @@ from probewise.diagnosis.noise import noise_statistics, steps_within_scans
 from probewise.diagnosis.repaired import ModelSamples, sample_model
 from probewise.diagnosis.search import Candidate, Search, search
 from probewise.diagnosis.templates import effect_templates
+from probewise.diagnosis.unknown import correct
 from probewise.diagnosis.verdict import (
     Diagnosis,
     EffectFound,
@@ -118,7 +119,8 @@ class _Diagnoser:
     def run(self) -> Diagnosis:
         self.usable: IntArray = np.flatnonzero(self.recording.usable)
         n = len(self.usable)
-        few = n < _LEAST_READINGS
+        constant = float(np.ptp(self.recording.readings[self.usable])) == 0.0
+        few = n < _LEAST_READINGS or constant
         self.search: Search = search(
             self.recording, self.built, sensor=self.sensor, sd_floor=self.floor, max_order=1 if n < 60 else 3
         )
@@ -139,6 +141,8 @@ class _Diagnoser:
         verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs))
         if few:
             verdict, combination = "cannot_tell", ()
+        if constant:
+            p_value = 1.0  # readings that never change carry no noise to measure a residual by
 
         mean_names = tuple(name for name in combination if name in self.built and name not in self.noise_names)
         noise_of = tuple(name for name in combination if name in self.noise_names) or (
@@ -147,7 +151,7 @@ class _Diagnoser:
         best = self.search.best(mean_names, noise_of) or null
         samples = sample_model(best.found, best.evidence[noise_of], self.recording, rng=self.rng)
         null_samples = sample_model(null.found, null.evidence[noise_of], self.recording, rng=self.rng)
-        effects = self._effects(probabilities, best, samples, noise_of)
+        effects = self._effects(hypotheses, best, samples, noise_of)
         after = Linearised.of(best.found, best.evidence[noise_of].whitener)
         favoured = [c for name in combination if name in self.built for c in self.built[name].covariates]
         where = places(
@@ -159,6 +163,11 @@ class _Diagnoser:
             favoured=favoured,
         )
         improvement = self._improvement(null, best, noise_of, after, p_value)
+        residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
+        if verdict == "unknown":
+            improvement, correction = self._corrected(null, problem, noise, improvement)
+            residuals_after = residuals_after - correction
+            change[self.usable] = correction
         reason = self._reason(verdict, combination, hypotheses, effects, p_value, few, pairs, where)
         predicted_before, predicted_after = (c.found.model.predict(c.found.z[None, :])[0] for c in (null, best))
         return Diagnosis(
@@ -180,9 +189,9 @@ class _Diagnoser:
             null=null_samples,
             repaired=samples,
             residuals_before=self._spread(null.found.residuals),
-            residuals_after=self._spread(best.found.residuals),
+            residuals_after=self._spread(residuals_after),
             predicted_before=predicted_before,
-            predicted_after=predicted_after,
+            predicted_after=predicted_after + change,
             order_probabilities=dict(self.search.order_probabilities),
             unknown_shares=dict(self.search.unknown_shares),
         )
@@ -218,14 +227,14 @@ class _Diagnoser:
 
     def _effects(
         self,
-        probabilities: Mapping[tuple[tuple[str, ...], tuple[str, ...]], float],
+        hypotheses: tuple[Hypothesis, ...],
         best: Candidate,
         samples: ModelSamples,
         noise_of: tuple[str, ...],
     ) -> tuple[EffectFound, ...]:
         out = []
         for name, effect in self.built.items():
-            p = sum(v for (mean, noise), v in probabilities.items() if name in (*mean, *noise))
+            p = sum(h.probability for h in hypotheses if name in h.effects)
             if p <= _LEAST_PROBABILITY:
                 continue
             if name in samples.effects:
@@ -313,6 +322,33 @@ class _Diagnoser:
         log_evidence = best.evidence[noise].log_z - null.evidence[()].log_z
         return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
 
+    def _corrected(
+        self, null: Candidate, problem: Linearised, noise: tuple[str, ...], plain: Improvement
+    ) -> tuple[Improvement, FloatArray]:
+        """Repair by bases without a name, and weigh that repair like any other."""
+        bases = self.search.unknown_bases
+        scan = self.recording.plan.scan[self.usable]
+        fixed = correct(null.found, problem, bases.columns, scan)
+        wider = replace(
+            null.found,
+            residuals=null.found.residuals - fixed.change,
+            slopes=np.concatenate([null.found.slopes, fixed.columns], axis=1),
+            z=np.concatenate([null.found.z, np.zeros(fixed.columns.shape[1])]),
+        )
+        after = Linearised.of(wider, problem.whitener)
+        columns, families = self._looks(null.found)
+        p_after = global_p_value(after, columns, families, after.draws(N_DRAWS // 2, rng=self.rng))
+        gain = replace(
+            plain,
+            log_evidence=self.search.unknown[noise],
+            heldout_log_density_per_reading=fixed.held_out.per_reading,
+            heldout_sd=fixed.held_out.sd,
+            heldout_by_scan=fixed.held_out.by_scan,
+            rms_after=float(np.sqrt(np.mean(wider.residuals**2))),
+            p_value_after=p_after,
+        )
+        return gain, fixed.change
+
     def _noise(self, best: Candidate, noise: tuple[str, ...], after: Linearised, samples: ModelSamples) -> NoiseFound:
         """Test the repaired model's residual for memory, heavy tails and a spread that follows the level."""
         steps = steps_within_scans(self.recording)
@@ -382,11 +418,15 @@ class _Diagnoser:
         where: Sequence[Any],
     ) -> str:
         n = len(self.usable)
+        if few and n >= _LEAST_READINGS:
+            return f"All {n} usable readings are equal: there is no signal to diagnose; scan across an edge."
         if few:
             return f"{n} usable readings are too few to tell; {_LEAST_READINGS} or more are needed."
         by_name = {effect.name: effect for effect in effects}
         if verdict == "clean":
-            return f"The model explains all {n} readings to within their noise (p = {p_value:.2g})."
+            order = max(self.search.order_probabilities, key=lambda k: self.search.order_probabilities[k])
+            ssf = "one Gaussian" if order == 1 else f"{order} Gaussians"
+            return f"The model, an SSF of {ssf}, explains all {n} readings to within their noise (p = {p_value:.2g})."
         if verdict == "unknown":
             place = f" It shows most in {where[0].covariate}." if where else ""
             return f"Something is missing (p = {p_value:.2g}) that no named effect explains.{place}"

@@ -261,6 +261,9 @@ class _Searcher:
             for i, names in enumerate(combinations):
                 of = scores[np.array(owners) == i]
                 screened[names, noise] = float(logsumexp(of)) - math.log(len(of))
+            if not bases.columns:
+                unknown[noise] = 0.0
+                continue
             by_family = _by_family(_log_bayes_factors(problem, bases.columns), bases.families)
             unknown[noise] = float(logsumexp(list(by_family.values()))) - math.log(len(by_family))
             if evidence is max(null.evidence.values(), key=lambda e: e.log_z):
@@ -386,7 +389,7 @@ class _Searcher:
             return
         first = weighed(search)
         ranked = sorted(first.probabilities, key=lambda key: -first.probabilities[key])
-        leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:3]
+        leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:2]
         for names in leaders:
             if sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-3:
                 continue
@@ -400,7 +403,7 @@ class _Searcher:
                 effects = source.found.model.effects
                 model = Model(sensor, effects, self.recording.plan)
                 own = source.found.z[source.found.model.sensor.n_params :]
-                candidate = self._weighed(model, np.concatenate([null.found.z, own])[None, :])
+                candidate = self._weighed(model, np.concatenate([null.found.z, own])[None, :], max_steps=15)
                 if _acts(candidate, null):
                     self._keep(candidate)
 

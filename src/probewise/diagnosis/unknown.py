@@ -20,7 +20,7 @@ from probewise.diagnosis.gain import HeldOut, compare_scans
 
 __all__ = ["Correction", "correct"]
 
-_MOST_BASES = 4
+_ABOUT_EQUAL = 5.0  # nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Correction:
 
 
 def correct(found: Fit, problem: Linearised, bases: Sequence[FloatArray], scan: IntArray) -> Correction:
-    """Correct a fit by the few most probable bases.
+    """Correct a fit by the most telling basis.
 
     Parameters
     ----------
@@ -46,9 +46,10 @@ def correct(found: Fit, problem: Linearised, bases: Sequence[FloatArray], scan: 
     """
     blocks = Blocks.of(problem, bases, [""] * len(bases))
     scores = block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_points)[:, 0]
-    best = np.argsort(-scores)[:_MOST_BASES]
-    best = best[scores[best] > scores[best[0]] - 5]
-    columns = np.concatenate([bases[i] for i in best], axis=1)
+    # Among bases of about equal evidence the one of fewest columns: what needs an amplitude for each scan
+    # says nothing of the next scan.
+    rivals = np.flatnonzero(scores > scores.max() - _ABOUT_EQUAL)
+    columns = bases[min(map(int, rivals), key=lambda i: (bases[i].shape[1], -float(scores[i])))]
     norms = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns[:, norms > 0] / norms[norms > 0]
     everything = np.ones(len(found.residuals), dtype=np.bool_)

@@ -186,7 +186,9 @@ def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 
 def _salvaged(path: str | Path, tail: bytes, index: int) -> Entry | None:
     """Recover the reading from a line without its end, or None where the reading itself is torn."""
-    head = tail.split(BELIEF.encode())[0]
+    head, mark = tail.split(BELIEF.encode())[0], BELIEF.encode()
+    torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
+    head = head[: len(head) - torn]
     # The covariates come last and are an object: only a whole first part closes with one more brace.
     try:
         entry = _entry(path, _parse(path, head + b"}", index + 1), index + 1)

@@ -21,7 +21,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.experiment.journal import (
     PATTERN,
     Belief,
-    Entry,
+    Journal,
     JournalWriter,
     read_journal,
     require_same_settings,
@@ -187,14 +187,15 @@ def explore(
     if max_readings < 1:
         raise ParameterError("max_readings", max_readings, "1 or more")
     seed = _child(rng)
-    writer: JournalWriter | None = None
-    replayed: tuple[Entry, ...] = ()
-    notes: tuple[str, ...] = ()
-    if journal is not None:
-        writer, replayed, notes, seed = _open_journal(Path(journal), experiment, seed)
-    if len(replayed) > max_readings:
-        raise ParameterError("max_readings", max_readings, f"the {len(replayed)} readings the journal holds, or more")
-    return _steps(instrument, experiment, seed, max_readings, writer, replayed, notes)
+    before = None if journal is None or not Path(journal).exists() else read_journal(journal)
+    if before is not None:
+        require_same_settings(before, experiment.settings(seed))
+        seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(before.settings["spawn_key"]))
+        if len(before.entries) > max_readings:
+            raise ParameterError(
+                "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
+            )
+    return _steps(instrument, experiment, seed, max_readings, None if journal is None else Path(journal), before)
 
 
 def run(
@@ -220,11 +221,11 @@ def _steps(
     experiment: Experiment,
     seed: np.random.SeedSequence,
     max_readings: int,
-    writer: JournalWriter | None,
-    replayed: tuple[Entry, ...],
-    notes: tuple[str, ...],
+    path: Path | None,
+    before: Journal | None,
 ) -> Iterator[Step]:
-    with contextlib.nullcontext() if writer is None else writer:
+    replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
+    with _writer(path, before, experiment, seed) as writer:
         reachable = np.asarray(instrument.reachable(experiment.grid.places_mm), dtype=np.bool_)
         first = _rng_of(seed, 0)
         prior_bits = prior_entropy(experiment.prior, rng=first)
@@ -248,26 +249,22 @@ def _steps(
             if writer is not None and (entry is None or entry.belief is None):
                 writer.belief(_belief(info, state.next_pose))
             if entry is not None:
-                info = dataclasses.replace(info, replayed=True, notes=(*info.notes, *notes))
-                notes = ()
+                info = dataclasses.replace(info, replayed=True)
                 # The journal decides, also where another machine's arithmetic would choose another place.
                 if entry.belief is not None:
                     state = dataclasses.replace(state, next_pose=entry.belief.next_pose)
+            if number == 1 and notes:
+                info = dataclasses.replace(info, notes=(*info.notes, *notes))
             stopped = info.stop_reason is not None
             yield info
 
 
-def _open_journal(
-    path: Path, experiment: Experiment, seed: np.random.SeedSequence
-) -> tuple[JournalWriter, tuple[Entry, ...], tuple[str, ...], np.random.SeedSequence]:
-    """Begin a journal, or take up the one that is there with its place in the seed sequence."""
-    settings = experiment.settings(seed)
-    if not path.exists():
-        return JournalWriter.begin(path, settings), (), (), seed
-    there = read_journal(path)
-    require_same_settings(there, settings)
-    seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(there.settings["spawn_key"]))
-    return JournalWriter.resume(there), there.entries, there.notes, seed
+def _writer(
+    path: Path | None, before: Journal | None, experiment: Experiment, seed: np.random.SeedSequence
+) -> contextlib.AbstractContextManager[JournalWriter | None]:
+    if before is not None:
+        return JournalWriter.resume(before)
+    return contextlib.nullcontext() if path is None else JournalWriter.begin(path, experiment.settings(seed))
 
 
 def _child(rng: np.random.Generator) -> np.random.SeedSequence:

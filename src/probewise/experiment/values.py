@@ -179,7 +179,7 @@ class Step(ShowsItself):
     Attributes
     ----------
     number, reading
-        The how manieth reading, from 1, and the reading.
+        Count of readings from 1, and the reading that this step is about.
     names, mean, sd
         Parameters, their posterior means and sds, each (n_params,). For a set of shapes: given
         the most probable one, and NaN for parameters that it does not have.

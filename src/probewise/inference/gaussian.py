@@ -89,7 +89,7 @@ class GaussianInferred:
 
 
 def log_prob_gaussian(readings: FloatArray, predicted: FloatArray, sd: FloatArray) -> FloatArray:
-    """Score hypotheses that each have their own sd, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
+    """Score hypotheses of their own sd each, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
     residual = residuals(readings, predicted)
     square = np.einsum("ij,ij->i", residual, residual)
     return np.asarray(-0.5 * square / sd**2 - readings.size * (np.log(sd) + 0.5 * _LOG_2PI))

@@ -137,7 +137,7 @@ class StudentT:
     @cached_property
     def _membership(self) -> FloatArray:
         """One where reading i belongs to data set j, (n_points, n_groups)."""
-        return (self.groups[:, None] == np.unique(self.groups)[None, :]).astype(np.float64)
+        return np.asarray(self.groups[:, None] == np.unique(self.groups)[None, :], dtype=np.float64)
 
     @cached_property
     def _sizes(self) -> FloatArray:

@@ -15,8 +15,8 @@ from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, Stop
 __all__ = [
     "Bound",
     "DiversifyTally",
-    "EvidenceChange",
     "Evaluator",
+    "EvidenceChange",
     "Move",
     "NestedResult",
     "Points",

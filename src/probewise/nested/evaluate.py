@@ -115,7 +115,7 @@ class Evaluator:
         values = np.asarray(raw, dtype=np.float64)
         if values.shape != (len(theta),):
             raise NotConvergedError(
-                f"the likelihood returned shape {values.shape}; allowed: ({len(theta)},), one number for each hypothesis"
+                f"the likelihood returned shape {values.shape}; allowed: ({len(theta)},), one number a hypothesis"
             )
         bad = np.isnan(values) | (values == np.inf)
         if bad.any():

@@ -25,7 +25,7 @@ class Evidence:
 
 
 def log_volumes(n_at_death: IntArray, log_start: float = 0.0) -> FloatArray:
-    """Expected log prior volume after each death, (n_dead,): E[log t] = -1/n with n points alive."""
+    """Give the expected log prior volume after each death, (n_dead,): E[log t] = -1/n with n points alive."""
     return np.asarray(log_start - np.cumsum(1.0 / n_at_death))
 
 

@@ -216,8 +216,6 @@ class SliceMove:
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 
 
-
-
 def _frames(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> FloatArray:
     """Draw rows of random orthogonal matrices, (n_chains, n_steps, n_params)."""
     n_frames = -(-n_steps // n_params)

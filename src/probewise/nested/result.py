@@ -10,9 +10,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
+from probewise._display import ShowsItself
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings.atomic import write_bytes_atomically
 
@@ -23,7 +23,7 @@ _ARRAYS = ("theta", "log_likelihood", "log_weight", "log_birth", "insertion_rank
 
 
 @dataclass(frozen=True, eq=False)
-class NestedResult:
+class NestedResult(ShowsItself):
     """Hold the evidence, the weighted samples and the record of how they came about.
 
     Attributes
@@ -106,7 +106,7 @@ class NestedResult:
             raise ParameterError("n", n, "1 or more")
         ladder = np.cumsum(self.weight)
         rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-        return self.theta[rng.permutation(np.minimum(rows, len(ladder) - 1))]
+        return np.asarray(self.theta[rng.permutation(np.minimum(rows, len(ladder) - 1))])
 
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
         """Posterior mean of the parameters, (n_params,), or of `f(theta)` (n_dead, ...), of the trailing shape."""
@@ -187,7 +187,8 @@ class NestedResult:
             If the file is damaged, or no result of this version of the format.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # Opened here, since np.load leaves a damaged file open.
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
                 head = json.loads(str(file["head"]))
                 arrays = {name: file[name] for name in _ARRAYS}
         except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Run nested sampling: remove the worst live points, count the volume lost, draw new ones above them (Skilling 2006)."""
+"""Run nested sampling (Skilling 2006): remove the worst live points, count the volume lost, draw new ones above."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ _PRIOR_VOLUME = 0.05
 # Below this probability of a run's insertion ranks the result is called doubtful: one false alarm in 10 000 runs.
 _DOUBTFUL_P_VALUE = 1e-4
 _FEW_EFFECTIVE = 30.0
+_STUCK_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +195,7 @@ def run(
         if dead:
             error.partial = finish("the likelihood failed", (*notes, f"the likelihood failed: {error}"))
         raise
-    if n_stuck:
+    if n_stuck > _STUCK_SHARE * len(dead) * n_replaced:
         notes = (*notes, f"{n_stuck} of {len(dead) * n_replaced} chains could not leave their start")
     result = finish(reason, notes)
     for note in result.warnings:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen, frozen_int, require_finite
+from probewise._display import ShowsItself
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import Pattern
 
@@ -125,7 +126,7 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(ShowsItself):
     """Hold a plan and what was read: `readings`, shape (n_points,), NaN where missing.
 
     `usable` is False where a reading is missing or outside the declared range; such rows

@@ -89,7 +89,7 @@ class Chain:
     of theta: the SSF's, the levels', the scene's, then the effects' as "effect.parameter".
 
     `n_nodes` is the number of quadrature nodes over curved edges (the default holds 1e-8 of the
-    span, `FAST_NODES` 1e-4 for footprints up to three times as long as wide).
+    span, `FAST_NODES` 1e-4).
     """
 
     ssf: SSFModel

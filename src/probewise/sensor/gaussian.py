@@ -369,7 +369,7 @@ def _seen_of_unit_disc(
 
 
 _BLOCK = 2048  # pairs at a time, times nodes: stays in the cache
-_SHARP = 0.8  # the sharpness that n_nodes are good for
+_SHARP = 1.2  # the sharpness that n_nodes are good for
 
 
 def _reach_of(n_nodes: int) -> float:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._display import ShowsItself
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor.stages import Footprint
 
@@ -161,7 +162,7 @@ class FixedMixture:
 
 
 @dataclass(frozen=True, eq=False)
-class SSFField:
+class SSFField(ShowsItself):
     """An SSF on square pixels: any SSF field (paper, the discrete SSF matrix).
 
     `values` (n_y, n_x) are the share of each pixel, normalised to sum one on construction (not

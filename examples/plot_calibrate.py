@@ -1,0 +1,35 @@
+"""
+A sensor model from a recording
+===============================
+
+Shows how many Gaussians the shipped recording asks for, what the sensor sees, and how well the model
+predicts what was recorded (the paper's figures of the data, of the SSF and of the predictions).
+"""
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+
+from probewise.calibration import calibrate, predict
+from probewise.recordings import read_recording, shipped
+from probewise.report import plots
+
+seed = 1
+print(f"seed {seed}")
+recording = read_recording(shipped("paper"))
+fig, ax = plt.subplots()
+plots.readings_by_orientation(recording, ax=ax)
+
+# %%
+# One Gaussian, with few live points so that it runs in seconds; `orders=(1, 2, 3, 4)` and
+# `n_live=300` are the paper's.
+calibration = calibrate(recording, orders=(1,), n_live=50, rng=np.random.default_rng(seed))
+print(calibration.summary())
+fig, ax = plt.subplots()
+plots.spatial_sensitivity(calibration.sensor.field, ax=ax)
+
+# %%
+# Standardised residuals: 95 % should lie between the dashed lines.
+prediction = predict(calibration.sensor, recording.plan, recording.readings)
+fig, ax = plt.subplots(figsize=(8, 3))
+plots.calibration_check(recording, prediction.mean, prediction.sd, ax=ax)

@@ -1,0 +1,40 @@
+"""
+What does the model leave out?
+==============================
+
+Shows how a recording that a plain sensor model does not explain is diagnosed: which physics is missing,
+where it shows, and what the repaired model gains on readings that were kept back.
+"""
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+
+from probewise.diagnosis import diagnose
+from probewise.recordings import read_recording, shipped
+from probewise.report import plots
+
+seed = 1
+print(f"seed {seed}")
+recording = read_recording(shipped("drifting"))
+diagnosis = diagnose(recording, rng=np.random.default_rng(seed))
+print(diagnosis.summary())
+
+# %%
+# Every hypothesis with its probability; they sum to one.
+fig, ax = plt.subplots(figsize=(8, 4))
+likely = [h for h in diagnosis.hypotheses if h.probability > 1e-3]
+plots.hypothesis_probabilities([h.label for h in likely], [h.probability for h in likely], ax=ax)
+fig.tight_layout()
+
+# %%
+# Residuals against the predicted reading, before and after the repair.
+fig, ax = plt.subplots(figsize=(8, 4))
+plots.residuals_against(
+    diagnosis.predicted_before,
+    diagnosis.residuals_before,
+    diagnosis.residuals_after,
+    label="predicted reading (LEGO units)",
+    unit="LEGO",
+    ax=ax,
+)

@@ -1,0 +1,47 @@
+"""
+The robot finds a circle
+========================
+
+Shows the robot's view of the field as it chooses its own measurements: the entropy map in copper,
+50 circles drawn from what is believed in blue, readings as squares, the next place in green.
+"""
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+
+from probewise.arm import SimulatedArm
+from probewise.experiment import Experiment, run
+from probewise.inference import GaussianKnown
+from probewise.recordings import Disc
+from probewise.report import exploration
+from probewise.scene import Circle, HypothesisScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.world import Blob, World, gaussian_spot
+
+seed = 4
+print(f"seed {seed}")
+rng = np.random.default_rng(seed)
+world = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]))
+hidden = Disc((600.0, 260.0), 120.0)
+
+# %%
+# The sensor model: one Gaussian, 4 mm by 2.5 mm, and two levels. The world above shares no code with it.
+circle = Circle(radius_mm=(50.0, 150.0), inside=True)
+mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
+model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
+experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, n_live=80, n_diversify=300)
+robot = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng))
+
+# %%
+# Measure, infer, inquire.
+with robot:
+    found = run(robot, experiment, rng=rng, max_readings=30)
+print(found.summary())
+places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
+
+# %%
+# The view in the middle of the search, and at its end.
+for n in (len(found.steps) // 2, len(found.steps)):
+    fig, ax = plt.subplots(figsize=(9, 5))
+    exploration.view(found.steps[n - 1], experiment, places[:n], levels=(10.0, 60.0), ax=ax)

@@ -1,0 +1,49 @@
+"""A sensor model made by hand, and recordings small enough for a test."""
+
+import numpy as np
+import pytest
+
+from probewise.calibration import FittedSensor, write_sensor
+from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
+from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
+from probewise.scene import KnownScene
+
+NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
+TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
+
+
+def hand_made_sensor() -> FittedSensor:
+    rng = np.random.default_rng(0)
+    spread = np.array([0.1, 0.02, 0.02, 0.0005, 0.001, 0.001, 0.03, 0.03])
+    axis = np.arange(-20.0, 20.5)
+    return FittedSensor(
+        names=NAMES,
+        samples=TRUTH + spread * rng.standard_normal((500, 8)),
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.6),
+        field=field_of(footprint_of(TRUTH[None, :6], 1), u_mm=axis, v_mm=axis),
+        instrumentation=Instrumentation(),
+    )
+
+
+def small_recording() -> Recording:
+    """Every fourth reading of the paper's plan, by the chain itself with noise of sd 0.6."""
+    plan = paper_plan()
+    plan = plan.take(np.arange(0, len(plan), 4))
+    chain = Chain(FixedMixture.from_parameters(TRUTH[:6]), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
+    noise = 0.6 * np.random.default_rng(1).standard_normal(len(plan))
+    return Recording(plan, chain.predict(np.empty((1, 0)), plan)[0] + noise)
+
+
+@pytest.fixture
+def sensor_file(tmp_path):
+    path = tmp_path / "sensor.json"
+    write_sensor(hand_made_sensor(), path)
+    return path
+
+
+@pytest.fixture
+def recording_file(tmp_path):
+    path = tmp_path / "small.csv"
+    write_recording(small_recording(), path)
+    return path

@@ -1,0 +1,158 @@
+"""Input that cannot be used: exit status 2, one line that says what, where and what is allowed, nothing written."""
+
+import json
+
+import pytest
+
+from probewise.cli import VERBS, main
+
+
+def refused(capsys, out, *arguments):
+    """Run, and return the one line of the refusal."""
+    before = sorted(out.parent.rglob("*"))
+    assert main([str(a) for a in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("probewise")
+    assert captured.err.count("\n") == 1, captured.err
+    assert sorted(out.parent.rglob("*")) == before
+    return captured.err
+
+
+def spoil(path, column, text, row=3):
+    """Write another text into one cell."""
+    lines = path.read_text().splitlines()
+    cells = lines[row - 1].split(",")
+    cells[lines[0].split(",").index(column)] = text
+    lines[row - 1] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [("x_mm", "ten"), ("y_mm", "nan"), ("x_mm", "inf"), ("pattern", "nobody"), ("reading", "bright"), ("x_mm", "")],
+)
+def test_a_cell_that_cannot_be_used_is_named_with_its_row_and_column(
+    verb, column, text, recording_file, tmp_path, capsys
+):
+    spoil(recording_file, column, text)
+    said = refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
+    assert recording_file.name in said
+    assert "row 3" in said
+    assert column in said
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
+@pytest.mark.parametrize("harm", ["no json", "torn json", "unknown kind", "no x_mm", "no rows", "empty", "binary"])
+def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, tmp_path, capsys):
+    description = recording_file.with_suffix(".json")
+    match harm:
+        case "no json":
+            description.unlink()
+        case "torn json":
+            description.write_text(description.read_text()[:40])
+        case "unknown kind":
+            content = json.loads(description.read_text())
+            content["patterns"]["boundary"]["kind"] = "spiral"
+            description.write_text(json.dumps(content))
+        case "no x_mm":
+            recording_file.write_text(recording_file.read_text().replace("x_mm", "where"))
+        case "no rows":
+            recording_file.write_text(recording_file.read_text().splitlines()[0] + "\n")
+        case "empty":
+            recording_file.write_bytes(b"")
+        case "binary":
+            recording_file.write_bytes(bytes(range(256)))
+    refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
+def test_a_recording_that_is_not_there_is_refused(verb, tmp_path, capsys):
+    said = refused(capsys, tmp_path / "out", verb, tmp_path / "nowhere.csv", "--out", tmp_path / "out")
+    assert "nowhere.csv" in said
+
+
+def test_a_recording_without_contrast_cannot_be_calibrated(recording_file, tmp_path, capsys):
+    lines = recording_file.read_text().splitlines()
+    at = lines[0].split(",").index("reading")
+    rows = [",".join([*line.split(",")[:at], "30", *line.split(",")[at + 1 :]]) for line in lines[1:]]
+    recording_file.write_text("\n".join([lines[0], *rows]) + "\n")
+    refused(capsys, tmp_path / "out", "calibrate", recording_file, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"format": "sensor/2"}', '{"format": "sensor/1"}', "\0\1"])
+@pytest.mark.parametrize("verb", ["predict", "explore", "diagnose"])
+def test_a_damaged_sensor_model_is_refused(verb, content, recording_file, tmp_path, capsys):
+    sensor, out = tmp_path / "damaged.json", tmp_path / "out"
+    sensor.write_text(content)
+    arguments = {
+        "predict": ["predict", sensor, recording_file, "--out", out],
+        "explore": ["explore", "--sensor", sensor, "--out", out],
+        "diagnose": ["diagnose", recording_file, "--sensor", sensor, "--out", out],
+    }[verb]
+    assert "damaged.json" in refused(capsys, out, *arguments)
+
+
+def test_a_sensor_model_with_a_field_missing_says_which(sensor_file, recording_file, tmp_path, capsys):
+    content = json.loads(sensor_file.read_text())
+    del content["noise"]
+    sensor_file.write_text(json.dumps(content))
+    said = refused(capsys, tmp_path / "o.csv", "predict", sensor_file, recording_file, "--out", tmp_path / "o.csv")
+    assert "noise" in said
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--truth", "1,2"),
+        ("--truth", "a,b,c"),
+        ("--truth", "spiral:1,2,3"),
+        ("--field", "10"),
+        ("--field", "-5,20"),
+        ("--field", "30,20"),
+        ("--shape", "spiral"),
+        ("--max-readings", "0"),
+        ("--seed", "-1"),
+        ("--seed", "x"),
+        ("--live", "1"),
+        ("--model", "perfect"),
+        ("--arm", "third"),
+        ("--resume",),
+        ("--unheard-of",),
+    ],
+)
+def test_an_option_out_of_range_is_refused(option, sensor_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, *option)
+
+
+@pytest.mark.parametrize("verb", [v.name for v in VERBS])
+def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, recording_file, tmp_path, capsys):
+    out = tmp_path / "taken"
+    out.write_text("mine")
+    arguments = {
+        "demo": ["demo", "--out", out],
+        "calibrate": ["calibrate", recording_file, "--out", out],
+        "predict": ["predict", sensor_file, recording_file, "--out", out / "p.csv"],
+        "explore": ["explore", "--sensor", sensor_file, "--out", out],
+        "diagnose": ["diagnose", recording_file, "--out", out],
+    }[verb]
+    refused(capsys, out, *arguments)
+    assert out.read_text() == "mine"
+
+
+def test_a_prediction_does_not_overwrite_its_plan(sensor_file, recording_file, tmp_path, capsys):
+    refused(capsys, tmp_path / "x", "predict", sensor_file, recording_file, "--out", recording_file)
+
+
+def test_a_run_that_stands_there_is_not_overwritten_by_a_new_one(sensor_file, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "journal.jsonl").write_text('{"format": "journal/1"}\n')
+    assert "--resume" in refused(capsys, out / "x", "explore", "--sensor", sensor_file, "--out", out)
+
+
+@pytest.mark.parametrize("arguments", [[], ["unheard-of"], ["calibrate"], ["predict", "only-one"]])
+def test_a_wrong_command_line_is_refused_in_one_line(arguments, tmp_path, capsys):
+    refused(capsys, tmp_path / "out", *arguments)

@@ -1,0 +1,132 @@
+"""Each verb writes what it promises, and nothing when it is stopped."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from probewise import __version__
+from probewise.calibration import predict, read_sensor
+from probewise.cli import VERBS, main
+from probewise.recordings import read_plan, read_plan_and_readings, read_prediction
+from probewise.report import exploration
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, recording_file, tmp_path, capsys):
+    out = tmp_path / "new" / "p.csv"
+    assert run("predict", sensor_file, recording_file, "--out", out) == 0
+    mean, sd, log_density = read_prediction(out)
+    plan, readings = read_plan_and_readings(recording_file)
+    direct = predict(read_sensor(sensor_file), plan, readings)
+    np.testing.assert_array_equal(mean, direct.mean)
+    np.testing.assert_array_equal(sd, direct.sd)
+    np.testing.assert_array_equal(log_density, direct.log_density)
+    np.testing.assert_array_equal(read_plan(recording_file).x_mm, plan.x_mm)
+    assert "chi-square" in capsys.readouterr().out
+
+
+def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run("calibrate", recording_file, "--out", out, "--orders", 1, "--live", 16, "--seed", 1) == 0
+    names = {p.name for p in out.iterdir()}
+    assert {"sensor.json", "report.html", "readings.png", "ssf_by_order.png", "predicted.png"} <= names
+    assert not any(name.startswith(".") for name in names)
+    mean = read_sensor(out / "sensor.json").mean()
+    assert mean["I_max"] == pytest.approx(60.0, abs=1.0)
+    assert "seed 1" in capsys.readouterr().out
+
+
+def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(exploration, "frame", lambda *_, **__: b"png")
+    options = ("--sensor", sensor_file, "--truth", "500,250,90", "--live", 30, "--quiet", "--seed", 3)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert run("explore", *options, "--out", whole, "--max-readings", 3) == 0
+    assert run("explore", *options, "--out", cut, "--max-readings", 2) == 0
+    assert run("explore", *options, "--out", cut, "--max-readings", 3, "--resume") == 0
+    lines = [(folder / "journal.jsonl").read_text().splitlines() for folder in (whole, cut)]
+    assert [json.loads(line)["reading"] for line in lines[0][1:]] == [
+        json.loads(line)["reading"] for line in lines[1][1:]
+    ]
+    assert (cut / "report.html").read_text().startswith("<!doctype html>")
+
+
+def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(exploration, "frame", stop)
+    out = tmp_path / "out"
+    assert run("explore", "--sensor", sensor_file, "--out", out, "--live", 30, "--quiet") == 130
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "journal.jsonl keeps 1 readings" in said
+    assert len((out / "journal.jsonl").read_text().splitlines()) == 2
+    assert not (out / "report.html").exists()
+
+
+def test_a_calibration_that_is_stopped_writes_nothing(recording_file, tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("probewise.calibration.calibrate", stop)
+    assert run("calibrate", recording_file, "--out", tmp_path / "out") == 130
+    assert "nothing was written" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_module_runs_as_the_command_does():
+    done = subprocess.run(
+        [sys.executable, "-m", "probewise", "--version"], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == f"probewise {__version__}\n"
+
+
+def test_help_does_not_load_the_numerical_libraries():
+    code = (
+        "import sys\nfrom probewise.cli import main\nmain(['--help'])\n"
+        "sys.exit(any(m in sys.modules for m in ('scipy', 'matplotlib', 'tqdm')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("verb", [v.name for v in VERBS])
+def test_every_verb_explains_itself(verb, capsys):
+    assert run(verb, "--help") == 0
+    assert "--out" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_diagnosis_keeps_to_its_schema_and_names_its_figures(tmp_path):
+    import jsonschema
+
+    from probewise.diagnosis import diagnosis_schema
+    from probewise.recordings import shipped
+
+    out = tmp_path / "out"
+    assert run("diagnose", shipped("drifting"), "--out", out, "--quiet") == 0
+    document = json.loads((out / "diagnosis.json").read_text())
+    jsonschema.validate(document, diagnosis_schema())
+    for place in document["where"]:
+        assert (out / place["witness"]).exists()
+    if document["next_measurement"] is not None:
+        assert len(read_plan(out / "next_plan.csv")) == document["next_measurement"]["readings"]
+    for name in ("sensor.json", "calibrated.json"):
+        assert len(read_sensor(out / name).samples) >= 500
+    assert run("predict", out / "sensor.json", shipped("drifting"), "--out", out / "p.csv", "--quiet") == 0
+
+
+@pytest.mark.slow
+def test_the_demo_does_all_of_it(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run("demo", "--out", out) == 0
+    said = capsys.readouterr().out
+    assert "naive" in said
+    assert "SSF" in said
+    assert "concealed was" in said
+    assert (out / "report.html").stat().st_size > 100_000

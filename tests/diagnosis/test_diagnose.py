@@ -1,0 +1,185 @@
+"""The whole road, on recordings of an independent world that shares no code with the model."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+
+import jsonschema
+import numpy as np
+import pytest
+
+from probewise.diagnosis import diagnose, diagnosis_json, diagnosis_schema
+from probewise.effects import VOCABULARY
+from probewise.errors import ParameterError
+from probewise.recordings import Recording, paper_plan, two_way_plan
+from probewise.world import concealed as hidden
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+NOISE_SD = 0.6
+
+
+@functools.cache
+def noise_free(plan_name: str, *concealed: hidden.Concealed) -> Recording:
+    plan = {"paper": paper_plan, "two_way": two_way_plan}[plan_name]()
+    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=0.5)
+    return Recording(plan, World(spot, concealed=concealed).expected(plan))
+
+
+def recording(plan_name: str, *concealed: hidden.Concealed, seed: int = 1) -> Recording:
+    found = noise_free(plan_name, *concealed)
+    rng = np.random.default_rng(seed)
+    return dataclasses.replace(found, readings=found.readings + NOISE_SD * rng.standard_normal(len(found)))
+
+
+def strict(diagnosis) -> dict:
+    document = diagnosis_json(diagnosis)
+    text = json.dumps(document, allow_nan=False)
+    jsonschema.validate(json.loads(text), diagnosis_schema())
+    assert sum(h["probability"] for h in document["hypotheses"]) == pytest.approx(1.0)
+    for effect in document["effects"]:
+        assert effect["name"] in VOCABULARY
+        holding = sum(h["probability"] for h in document["hypotheses"] if effect["name"] in h["effects"])
+        assert effect["probability"] == pytest.approx(holding)
+    return document
+
+
+def test_a_recording_without_effects_is_clean():
+    found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
+    document = strict(found)
+    assert found.verdict == "clean"
+    assert found.combination == ()
+    assert found.p_value > 0.01
+    assert found.repaired.theta.shape == (1000, 8)
+    assert document["next_measurement"]["readings"] >= 1
+    assert found.noise.parameters[0].interval95[0] < NOISE_SD < found.noise.parameters[0].interval95[1]
+
+
+def test_backlash_is_named_measured_located_and_repaired():
+    found = diagnose(recording("paper", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    document = strict(found)
+    assert found.verdict == "named"
+    assert found.combination == ("backlash",)
+    width = document["effects"][0]["parameters"][0]
+    assert width["interval95"][0] < 0.7 < width["interval95"][1]
+    assert found.p_value < 1e-6
+    assert found.where[0].covariate in VOCABULARY["backlash"].covariates
+    gain = found.improvement
+    assert gain.log_evidence > 10
+    assert gain.heldout_log_density_per_reading > 3 * gain.heldout_sd > 0
+    assert gain.rms_after < gain.rms_before
+    assert gain.p_value_after > 0.01
+    assert found.effects[0].size_lambda > 5
+    # One-way scans cannot tell play from a bent response well: the audit of this very plan says so.
+    assert any("backlash" in alias.effects for alias in found.aliases)
+    # The advised readings tell the rivals apart by more than three nats.
+    assert found.next_measurement is not None
+    assert found.next_measurement.expected_log_bayes_factor > 3
+    assert len(found.next_measurement.plan) <= 102
+    np.testing.assert_allclose(found.predicted_after + found.residuals_after, found.recording.readings)
+    sensor = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
+    assert sensor.effects == ("backlash",)
+    assert sensor.names[-1] == "backlash.width_mm"
+
+
+def test_too_few_readings_are_said_to_be_too_few():
+    few = recording("paper").take(np.arange(40, 60))
+    found = diagnose(few, rng=np.random.default_rng(0))
+    strict(found)
+    assert found.verdict == "cannot_tell"
+    assert "20 usable readings are too few" in found.reason
+
+
+CASES = [
+    (hidden.GainDrift(0.05, 200.0), ("gain_drift",)),
+    (hidden.AmbientGradient(0.012, 0.0), ("ambient_gradient",)),
+    (hidden.Saturation(57.0), ("saturation",)),
+    (hidden.Nonlinearity(1.08), ("nonlinearity",)),
+    (hidden.Backlash(0.4), ("backlash",)),
+    (hidden.CorrelatedNoise(0.5), ("correlated_noise",)),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "combination"), CASES)
+def test_each_effect_is_named_in_a_two_way_recording(effect, combination):
+    plan = two_way_plan()
+    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)])
+    made = World(spot, concealed=(effect,)).simulate(plan, rng=np.random.default_rng(3))
+    found = diagnose(made, rng=np.random.default_rng(0))
+    strict(found)
+    assert found.combination == combination
+    assert found.verdict == ("noise" if combination == ("correlated_noise",) else "named")
+
+
+@pytest.mark.slow
+def test_two_effects_are_both_named():
+    both = recording("two_way", hidden.Backlash(0.5), hidden.GainDrift(0.05, 200.0))
+    found = diagnose(both, rng=np.random.default_rng(0))
+    strict(found)
+    assert found.combination == ("backlash", "gain_drift")
+
+
+@pytest.mark.slow
+def test_what_is_not_in_the_vocabulary_is_unknown_and_still_repaired():
+    plain = recording("two_way")
+    wave = 0.8 * np.sin(plain.plan.time_s / 35.0)
+    found = diagnose(dataclasses.replace(plain, readings=plain.readings + wave), rng=np.random.default_rng(0))
+    document = strict(found)
+    assert found.verdict in ("unknown", "noise")
+    assert not {"backlash", "saturation", "nonlinearity"} & set(found.combination)
+    assert document["p_value"] < 0.05 or found.verdict == "noise"
+
+
+@pytest.mark.slow
+def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
+    plain = recording("two_way")
+    step = 1.0 * (plain.plan.direction[:, 0] > 0)
+    found = diagnose(dataclasses.replace(plain, readings=plain.readings + step), rng=np.random.default_rng(0))
+    strict(found)
+    assert found.verdict == "unknown"
+    assert found.improvement.log_evidence > 10
+    assert found.improvement.rms_after < found.improvement.rms_before
+    assert found.improvement.heldout_log_density_per_reading > 0
+    assert found.where[0].covariate in ("direction", "scan", "place")
+
+
+@pytest.mark.slow
+def test_false_alarms_stay_within_the_binomial():
+    """Forty clean recordings: more than eight p-values at or below 0.05 have a chance under 1e-4."""
+    alarms = [
+        diagnose(recording("paper", seed=100 + k), rng=np.random.default_rng(k)).p_value <= 0.05 for k in range(40)
+    ]
+    assert sum(alarms) <= 8
+
+
+def test_one_reading_or_equal_readings_are_no_error():
+    paper = recording("paper")
+    found = diagnose(paper.take(np.arange(50, 51)), rng=np.random.default_rng(0))
+    strict(found)
+    assert found.verdict == "cannot_tell"
+    same = dataclasses.replace(paper, readings=np.full(408, 5.0)).take(np.arange(30))
+    flat = diagnose(same, rng=np.random.default_rng(0))
+    strict(flat)
+    assert flat.verdict == "cannot_tell"
+    assert "equal" in flat.reason
+
+
+def test_no_usable_reading_is_an_error_that_says_so():
+    nothing = dataclasses.replace(noise_free("paper"), readings=np.full(408, np.nan))
+    with pytest.raises(ParameterError, match="usable readings"):
+        diagnose(nothing, rng=np.random.default_rng(0))
+
+
+def test_an_earlier_sensor_is_taken_as_the_prior():
+    first = diagnose(recording("paper", seed=5), rng=np.random.default_rng(0))
+    sensor = first.repaired.fitted_sensor(first.recording, rng=np.random.default_rng(0))
+    again = diagnose(recording("paper", seed=6), sensor=sensor, rng=np.random.default_rng(0))
+    strict(again)
+    assert again.verdict == "clean"
+    # Twice the readings: every level and place is known better by about the square root of two.
+    ratio = again.repaired.theta.std(axis=0)[1:3] / first.repaired.theta.std(axis=0)[1:3]
+    np.testing.assert_allclose(ratio, math.sqrt(0.5), rtol=0.25)

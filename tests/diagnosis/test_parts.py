@@ -1,0 +1,272 @@
+"""The parts of the diagnosis, each against a second route to the same number."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal
+
+from probewise.diagnosis.audit import Alias, surviving_cosine
+from probewise.diagnosis.coordinates import (
+    default_sensor,
+    effect_scores,
+    effect_values,
+    sensor_from_posterior,
+    theta_to_natural,
+)
+from probewise.diagnosis.covariates import Covariate
+from probewise.diagnosis.evidence import SCALES, Blocks, Linearised, block_log_bayes_factors
+from probewise.diagnosis.joining import join
+from probewise.diagnosis.locate import places, windows
+from probewise.diagnosis.noise import NoiseModel, Whitener, noise_statistics, steps_within_scans, white
+from probewise.diagnosis.verdict import Hypothesis, credible_set, decide
+from probewise.effects import VOCABULARY, CorrelatedNoise, Extent
+from probewise.errors import ParameterError
+from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform
+from probewise.sensor import footprint_of
+
+EXTENT = Extent(10.0, 60.0, 100.0, 600.0)
+
+
+def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
+    plan = Plan(
+        x_mm=np.tile(np.arange(n, dtype=float), scans),
+        y_mm=np.zeros(n * scans),
+        orientation_rad=np.zeros(n * scans),
+        time_s=np.arange(n * scans, dtype=float),
+        scan=np.repeat(np.arange(scans), n),
+        scan_names=tuple(f"s{k}" for k in range(scans)),
+        pattern=np.zeros(n * scans),
+        pattern_names=("edge",),
+        patterns={"edge": HalfPlane(0.0, 0.0)},
+        instrumentation=Instrumentation(unit=unit),
+    )
+    return Recording(plan, np.linspace(1.0, 2.0, n * scans), source=f"{unit}.csv")
+
+
+@pytest.mark.parametrize("n_gaussians", [1, 2, 3])
+def test_sensor_coordinates_round_trip(n_gaussians):
+    sensor = default_sensor(EXTENT, n_gaussians)
+    z = np.random.default_rng(n_gaussians).normal(size=(50, sensor.n_params))
+    theta = sensor.theta(z)
+    assert theta.shape == (50, 6 * n_gaussians + 2)
+    np.testing.assert_allclose(sensor.z(theta), z, atol=1e-8)
+    # The footprint's own conversion gives the same shares and widths.
+    footprint = footprint_of(theta[:, :-2], n_gaussians)
+    np.testing.assert_allclose(footprint.weight.sum(axis=-1), 1.0)
+    natural = theta_to_natural(theta, n_gaussians)
+    blocks = natural[:, n_gaussians - 1 : -2].reshape(50, n_gaussians, 5)
+    np.testing.assert_allclose(np.sqrt(footprint.var_u[:, 0]), np.exp(blocks[..., 2]))
+    rho = footprint.cov_uv / np.sqrt(footprint.var_u * footprint.var_v)
+    np.testing.assert_allclose(rho[:, 0], np.tanh(blocks[..., 4]))
+
+
+def test_an_amplitude_factor_changes_nothing():
+    """Only ratios of the a_n are identified."""
+    sensor = default_sensor(EXTENT, 2)
+    theta = sensor.theta(np.full((1, sensor.n_params), 0.3))
+    scaled = theta.copy()
+    scaled[:, [0, 6]] *= 7.0
+    np.testing.assert_allclose(theta_to_natural(scaled, 2), theta_to_natural(theta, 2))
+
+
+def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
+    sensor = default_sensor(EXTENT, 1)
+    rng = np.random.default_rng(0)
+    theta = sensor.theta(0.02 * rng.normal(size=(4000, sensor.n_params)))
+    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max", "backlash.width_mm")
+    theta = np.concatenate([theta, np.ones((4000, 1))], axis=1)
+    prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
+    drawn = prior.theta(rng.normal(size=(4000, 7)))
+    np.testing.assert_allclose(drawn[:, 1:].std(axis=0), theta[:, 1:8].std(axis=0), rtol=0.06)
+    with pytest.raises(ParameterError, match=r"sensor\.names"):
+        sensor_from_posterior(("x",), np.zeros(1), np.eye(1))
+
+
+@pytest.mark.parametrize("name", VOCABULARY)
+def test_effect_scores_invert_effect_values(name):
+    effect = VOCABULARY[name].for_extent(EXTENT)
+    z = np.random.default_rng(2).uniform(-4, 4, size=(20, len(effect.prior.names)))
+    np.testing.assert_allclose(effect_scores(effect, effect_values(effect, z)), z, atol=1e-6)
+
+
+def test_whitening_is_the_inverse_root_of_the_covariance():
+    """Likelihood of AR(1) noise with a missing reading: whitened, and by the full covariance matrix."""
+    recording = line(6)
+    readings = recording.readings.copy()
+    readings[2] = np.nan
+    recording = Recording(recording.plan, readings)
+    steps = steps_within_scans(recording)
+    np.testing.assert_array_equal(steps, [0, 1, 2, 1, 1, 0, 1, 1, 1, 1, 1])
+    model = NoiseModel.of([CorrelatedNoise()], recording)
+    node = 20
+    rho, whitener = model.settings[node, 0], model.whiteners[node]
+    rows = np.flatnonzero(recording.usable)
+    scan = recording.plan.scan[rows]
+    cov = np.where(scan[:, None] == scan[None, :], rho ** np.abs(rows[:, None] - rows[None, :]), 0.0)
+    r = np.random.default_rng(0).normal(size=len(rows))
+    by_whitening = -0.5 * np.sum(whitener(r) ** 2) - whitener.log_det() - 0.5 * len(r) * math.log(2 * math.pi)
+    assert by_whitening == pytest.approx(multivariate_normal(cov=cov).logpdf(r))
+    np.testing.assert_allclose(whitener(np.eye(len(r))) @ cov @ whitener(np.eye(len(r))).T, np.eye(len(r)), atol=1e-12)
+
+
+def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
+    """Route two: quadrature over the amplitude of the Student-t likelihood, for each scale."""
+    rng = np.random.default_rng(3)
+    n, p = 30, 2
+    slopes = rng.normal(size=(n, p)) * 1e4  # so informative that the parameters' prior plays no part
+    template = rng.normal(size=(n, 1))
+    r = rng.normal(size=n) + 0.5 * template[:, 0]
+    basis, _ = np.linalg.qr(np.concatenate([slopes, np.eye(p)]))
+    augmented = np.concatenate([r, np.zeros(p)])
+    residual = augmented - basis @ (basis.T @ augmented)
+    problem = Linearised(basis, residual, white(n), 1.0, n)
+    blocks = Blocks.of(problem, [template], ["t"])
+    found = block_log_bayes_factors(blocks, residual[:, None], n)[0, 0]
+
+    unit = problem.project(template / np.sqrt(np.mean(template**2)))[:, 0]
+    rss = float(residual @ residual)
+    total = 0.0
+    for scale in SCALES:
+        # Amplitude in units of the noise sd, whose marginal makes the likelihood (1 + ...)^(-n/2) at fixed ratio.
+        gain = float(unit @ unit)
+        t = float(unit @ residual) / math.sqrt(gain)
+
+        def density(log_s, t=t, gain=gain, scale=scale):
+            s2 = math.exp(2 * log_s)
+            spread = s2 * (1 + scale**2 * gain)
+            log_l = -0.5 * (rss - t * t) / s2 - 0.5 * t * t / spread - (n - 1) * log_s - 0.5 * math.log(spread)
+            return math.exp(log_l + 0.5 * n + 0.5 * n * math.log(rss / n))
+
+        def null(log_s):
+            return math.exp(-0.5 * rss / math.exp(2 * log_s) - n * log_s + 0.5 * n + 0.5 * n * math.log(rss / n))
+
+        center = 0.5 * math.log(rss / n)
+        total += quad(density, center - 3, center + 3)[0] / quad(null, center - 3, center + 3)[0]
+    assert found == pytest.approx(math.log(total / len(SCALES)), abs=1e-6)
+
+
+def test_null_draws_have_nothing_in_the_span_of_the_fit():
+    rng = np.random.default_rng(1)
+    basis, _ = np.linalg.qr(rng.normal(size=(40, 3)))
+    problem = Linearised(basis, np.zeros(40), white(37), 1.0, 37)
+    draws = problem.draws(200, rng=rng)
+    np.testing.assert_allclose(basis.T @ draws, 0.0, atol=1e-12)
+    assert np.mean(np.sum(draws**2, axis=0)) == pytest.approx(37, rel=0.05)
+
+
+def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
+    rng = np.random.default_rng(5)
+    slopes = rng.normal(size=(50, 2)) * 1e5
+    basis, _ = np.linalg.qr(np.concatenate([slopes, np.eye(2)]))
+    problem = Linearised(basis, np.zeros(52), white(50), 1.0, 50)
+    first = rng.normal(size=(50, 1))
+    second = 3 * first + slopes @ np.array([[1e-5], [2e-5]])
+    assert surviving_cosine(problem, first, second) == pytest.approx(1.0, abs=1e-6)
+    assert surviving_cosine(problem, first, slopes[:, :1]) == 0.0
+
+
+def test_windows_never_part_equal_values():
+    values = np.repeat(np.arange(10.0), 5)
+    columns, ends = windows(Covariate("place", values, np.arange(50)), 50)
+    assert columns.shape == (50, len(ends))
+    for column, (low, high) in zip(columns.T, ends, strict=True):
+        np.testing.assert_array_equal(column > 0, (values >= low) & (values <= high))
+
+
+def test_a_bump_is_found_where_it_is():
+    n, rng = 200, np.random.default_rng(0)
+    time = np.arange(n, dtype=float)
+    r = rng.normal(size=n) + 2.0 * ((time >= 60) & (time < 75))
+    basis, _ = np.linalg.qr(np.concatenate([np.ones((n, 1)) * 100, np.eye(1)]))
+    augmented = np.concatenate([r, [0.0]])
+    problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white(n), 1.0, n)
+    covariates = [Covariate("time", time, np.arange(n)), Covariate("level", rng.normal(size=n), np.arange(n))]
+    found = places(problem, covariates, ("s",), r, problem.draws(400, rng=rng))
+    assert found[0].covariate == "time"
+    assert found[0].start == pytest.approx(60, abs=8)
+    assert found[0].end == pytest.approx(75, abs=8)
+    assert found[0].p_value < 0.01
+    assert found[0].witness == "witness_time.png"
+    assert found[0].curve_mean.max() > 1.0
+
+
+def test_noise_statistics_see_memory_tails_and_level():
+    rng = np.random.default_rng(0)
+    n = 2000
+    level = np.linspace(0, 1, n)
+    steps = np.ones(n, dtype=np.int64)
+    steps[0] = 0
+    plain = rng.normal(size=n)
+    memory = np.convolve(plain, [1, 0.5], mode="same")
+    tails = rng.standard_t(3, size=n)
+    louder = plain * (1 + 3 * level)
+    lag, kurtosis, tilt = noise_statistics(np.stack([plain, memory, tails, louder], axis=1), steps, level)
+    assert abs(lag[0]) < 0.1 < lag[1]
+    assert abs(kurtosis[0]) < 0.5 < kurtosis[2]
+    assert abs(tilt[0]) < 5 < tilt[3]
+
+
+def test_white_noise_is_left_as_it_is():
+    r = np.arange(5.0)
+    np.testing.assert_array_equal(white(5)(r), r)
+    assert Whitener(np.full(5, 2.0), np.zeros(5)).log_det() == pytest.approx(5 * math.log(2))
+
+
+def test_joined_recordings_keep_scans_and_patterns_apart():
+    first, second = line(4), line(3)
+    other = Plan(
+        **{
+            name: getattr(second.plan, name)
+            for name in ("x_mm", "y_mm", "orientation_rad", "time_s", "scan", "scan_names", "pattern", "pattern_names")
+        },
+        patterns={"edge": Uniform(1.0)},
+    )
+    joined = join([first, Recording(other, second.readings), first])
+    assert len(joined) == 8 + 6 + 8
+    assert joined.plan.scan_names == ("s0", "s1", "s0 (2)", "s1 (2)", "s0 (3)", "s1 (3)")
+    assert joined.plan.pattern_names == ("edge", "edge (2)")
+    np.testing.assert_array_equal(joined.plan.pattern, [0] * 8 + [1] * 6 + [0] * 8)
+    assert joined.plan.patterns["edge (2)"] == Uniform(1.0)
+    assert join([first]) is first
+
+
+def test_recordings_of_other_units_are_not_joined():
+    with pytest.raises(ParameterError, match="volt"):
+        join([line(), line(unit="volt")])
+
+
+NOISE = frozenset({"correlated_noise"})
+
+
+def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
+    names = {"clean": ()}
+    found = [Hypothesis(names.get(k, tuple(k.split("__"))), p) for k, p in probability.items()]
+    return tuple(sorted(found, key=lambda h: -h.probability))
+
+
+@pytest.mark.parametrize(
+    ("probability", "verdict", "combination"),
+    [
+        ({"clean": 0.6, "lag": 0.4}, "clean", ()),
+        ({"clean": 0.2, "unknown": 0.6, "lag": 0.2}, "unknown", ("unknown",)),
+        ({"clean": 0.2, "backlash": 0.8}, "named", ("backlash",)),
+        ({"clean": 0.2, "backlash": 0.4, "lag": 0.4}, "cannot_tell", ("backlash",)),
+        ({"clean": 0.1, "backlash": 0.4, "glint": 0.3, "lag": 0.2}, "cannot_tell", ("backlash",)),
+        ({"clean": 0.1, "correlated_noise": 0.9}, "noise", ("correlated_noise",)),
+        ({"clean": 0.1, "backlash__correlated_noise": 0.9}, "named", ("backlash", "correlated_noise")),
+        ({"clean": 0.45, "glint": 0.3, "lag": 0.25}, "cannot_tell", ()),
+        ({"clean": 0.3, "glint": 0.4, "lag": 0.3}, "named", ("glint",)),
+    ],
+)
+def test_verdicts_follow_the_probabilities(probability, verdict, combination):
+    aliases = (Alias(("backlash", "lag"), 0.99, "scan backwards", 8),)
+    assert decide(hypotheses(**probability), NOISE, aliases) == (verdict, combination)
+
+
+def test_a_credible_set_is_the_fewest_that_hold_the_mass():
+    found = hypotheses(clean=0.02, backlash=0.7, backlash__lag=0.26, glint=0.02)
+    assert credible_set(found) == ("backlash", "backlash+lag")

@@ -1,0 +1,174 @@
+"""One JSON line a measurement: what is written, what survives, what is refused."""
+
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from probewise.arm.instrument import Pose, Reading
+from probewise.errors import FileError, ParameterError
+from probewise.experiment import (
+    Belief,
+    JournalWriter,
+    read_journal,
+    recording_of,
+    require_same_settings,
+    value_digest,
+)
+from probewise.recordings.patterns import Disc
+from probewise.recordings.plan import Instrumentation
+
+SETTINGS = {"shape": "Circle()", "seed": "7", "spawn_key": [0], "options": {"n_live": 60}}
+
+
+def reading(k):
+    return Reading(10.0 + k, Pose(1.5 * k, 2.0 * k, 0.25), 3.0 * k, {"battery_mv": 7900.0 + k})
+
+
+def belief(k):
+    return Belief({"x_mm": 1.0 / 3.0 + k}, {"x_mm": 2.0 / k}, 1.25 * k, Pose(0.1 * k, 7.0))
+
+
+def write(path, n):
+    with JournalWriter.begin(path, SETTINGS) as writer:
+        for k in range(1, n + 1):
+            writer.reading(k, reading(k))
+            writer.belief(belief(k))
+
+
+def test_a_journal_reads_back_every_bit_of_what_was_written(tmp_path):
+    path = tmp_path / "journal.jsonl"
+    write(path, 3)
+    journal = read_journal(path)
+    assert journal.settings["format"] == "journal/1"
+    assert journal.readings == (reading(1), reading(2), reading(3))
+    assert [entry.belief for entry in journal.entries] == [belief(1), belief(2), belief(3)]
+    assert journal.notes == ()
+
+
+def test_a_journal_is_one_json_object_a_line(tmp_path):
+    write(tmp_path / "j", 2)
+    lines = [json.loads(line) for line in (tmp_path / "j").read_text().splitlines()]
+    assert len(lines) == 3
+    assert set(lines[1]) == {"index", "pose", "time_s", "reading", "covariates", "belief"}
+    assert set(lines[1]["belief"]) == {"mean", "sd", "bits", "next"}
+
+
+def test_whatever_byte_the_writer_is_killed_at_no_whole_reading_is_lost(tmp_path):
+    """Cut the file at every byte of its last line: the reading counts from its closing brace on."""
+    path = tmp_path / "journal.jsonl"
+    write(path, 3)
+    whole = path.read_bytes()
+    last = whole.rindex(b"\n", 0, -1) + 1
+    reading_done = whole.index(b', "belief": ', last)
+    for n_bytes in range(last, len(whole)):
+        path.write_bytes(whole[:n_bytes])
+        journal = read_journal(path)
+        kept = 3 if n_bytes >= reading_done else 2
+        assert journal.readings == tuple(reading(k) for k in range(1, kept + 1)), n_bytes
+        assert len(journal.notes) == (n_bytes > last)
+        assert kept == 2 or journal.entries[2].belief is None
+
+
+def test_resuming_cuts_a_torn_line_off_and_goes_on_behind_it(tmp_path):
+    path = tmp_path / "journal.jsonl"
+    write(path, 3)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-20])
+    with JournalWriter.resume(read_journal(path)) as writer:
+        writer.reading(3, reading(3))
+        writer.belief(belief(3))
+    assert path.read_bytes() == whole
+
+
+def test_a_missing_reading_is_null_and_comes_back_as_nan(tmp_path):
+    with JournalWriter.begin(tmp_path / "j", SETTINGS) as writer:
+        writer.reading(1, Reading(math.nan, Pose(1.0, 2.0), 0.0))
+        writer.belief(belief(1))
+    assert "NaN" not in (tmp_path / "j").read_text()
+    assert math.isnan(read_journal(tmp_path / "j").readings[0].value)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "no whole first line"),
+        (b"x,y\n1,2\n", "no JSON"),
+        (b'{"format": "journal/2"}\n', r"journal/2.*journal/1"),
+        (b'[1]\n{"index": 1}\n', "JSON list"),
+        (b'{"format": "journal/1"}\n{"index": 1}\n', "row 2, column pose"),
+        (b'{"format": "journal/1"}\n\xff\xfe\n', "row 2"),
+    ],
+)
+def test_a_damaged_journal_says_which_file_which_row_and_what(tmp_path, content, says):
+    path = tmp_path / "bad.jsonl"
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=says) as caught:
+        read_journal(path)
+    assert "bad.jsonl" in str(caught.value)
+
+
+def test_a_line_that_is_missing_in_the_middle_is_found(tmp_path):
+    write(tmp_path / "j", 3)
+    lines = (tmp_path / "j").read_text().splitlines(keepends=True)
+    (tmp_path / "j").write_text("".join([*lines[:2], *lines[3:]]))
+    with pytest.raises(FileError, match=r"row 3: index 3; allowed: 2"):
+        read_journal(tmp_path / "j")
+
+
+def test_a_missing_journal_is_an_error_of_files(tmp_path):
+    with pytest.raises(FileError, match="cannot be read"):
+        read_journal(tmp_path / "nowhere")
+
+
+def test_a_new_journal_never_overwrites_a_file(tmp_path):
+    (tmp_path / "j").write_text("precious")
+    with pytest.raises(FileError, match="exists"):
+        JournalWriter.begin(tmp_path / "j", SETTINGS)
+    assert (tmp_path / "j").read_text() == "precious"
+
+
+def test_every_setting_that_differs_is_named(tmp_path):
+    write(tmp_path / "j", 1)
+    journal = read_journal(tmp_path / "j")
+    require_same_settings(journal, SETTINGS)
+    with pytest.raises(FileError, match=r"seed '7' there, '8' here; shape 'Circle\(\)' there, 'Square\(\)' here"):
+        require_same_settings(journal, {**SETTINGS, "seed": "8", "shape": "Square()"})
+
+
+def test_a_journal_becomes_a_recording_over_the_field(tmp_path):
+    write(tmp_path / "j", 3)
+    disc, lego = Disc((1.0, 2.0), 30.0), Instrumentation(min=1, max=100, step=1)
+    recording = read_journal(tmp_path / "j").recording(patterns={"field": disc}, instrumentation=lego)
+    np.testing.assert_array_equal(recording.readings, [11.0, 12.0, 13.0])
+    np.testing.assert_array_equal(recording.plan.y_mm, [2.0, 4.0, 6.0])
+    np.testing.assert_array_equal(recording.plan.orientation_rad, 0.25)
+    np.testing.assert_array_equal(recording.plan.covariates["battery_mv"], [7901.0, 7902.0, 7903.0])
+    assert recording.plan.rows_by_pattern()[0][0] == "field"
+    assert recording.plan.patterns["field"] == disc
+
+
+def test_a_covariate_that_one_reading_lacks_is_nan_there():
+    recording = recording_of([reading(1), Reading(5.0, Pose(0.0, 0.0), 1.0)])
+    assert np.isnan(recording.plan.covariates["battery_mv"]).tolist() == [False, True]
+
+
+@dataclass(frozen=True)
+class Holder:
+    values: object
+    name: str = "a"
+
+
+def test_a_digest_tells_values_by_type_fields_and_every_bit():
+    first = value_digest(Holder(np.array([1.0, 2.0])))
+    assert first == value_digest(Holder(np.array([1.0, 2.0])))
+    others = [np.array([1.0, np.nextafter(2.0, 3.0)]), np.array([[1.0, 2.0]]), (1.0, 2.0), [1, 2], {"a": 1.0}, None]
+    digests = {value_digest(Holder(other)) for other in others} | {first, value_digest(Holder(others[0], "b"))}
+    assert len(digests) == 8
+
+
+def test_a_value_that_cannot_be_recognised_again_is_refused():
+    with pytest.raises(ParameterError, match="frozen dataclasses"):
+        value_digest(Holder(lambda: 1))

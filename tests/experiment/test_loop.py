@@ -1,0 +1,396 @@
+"""Measure, infer, inquire: by hand, in a loop, killed and resumed, over what cannot be explained."""
+
+import math
+import os
+import runpy
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probewise.arm.instrument import Pose, Reading
+from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
+from probewise.experiment import Exploration, OneScan, begin, explore, read_journal, run, step
+from probewise.inference import GaussianKnown, StudentT
+from probewise.inquiry import Grid, gaussian_entropy, prior_entropy
+from probewise.scene.scenes import HypothesisScene
+from probewise.scene.shapes import AnyOf, Circle, Field, Rectangle
+from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
+
+
+def rng(seed=2013):
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """One run of the soft sensor, shared by the tests that only look at it."""
+    small = runpy.run_path(str(Path(__file__).with_name("conftest.py")))
+    return run(small["QuickArm"](), small["small_experiment"](), rng=rng()), small
+
+
+def test_the_robot_finds_the_circle_to_the_precision_it_states(found):
+    """Each parameter within five of its posterior sds: a right program fails once in a million."""
+    result, small = found
+    truth = np.array(small["QuickArm"]().truth)
+    assert result.reached
+    assert (result.last.sd < 4.0).all()
+    assert (np.abs(result.last.mean - truth) < 5 * result.last.sd).all()
+    assert result.stop_reason == "every length is known to better than 4 mm"
+
+
+def test_each_step_holds_what_its_reading_taught(found):
+    result, _ = found
+    for number, info in enumerate(result.steps, start=1):
+        assert info.number == number
+        assert info.samples.shape == (20, 3)
+        assert len(np.unique(info.samples, axis=0)) == 20
+        assert 0 <= info.map.highest <= math.log2(20)
+        assert np.isfinite([info.bits, info.log_z, info.p_value, info.posterior.log_z_error]).all()
+    poses = [info.next_pose for info in result.steps]
+    assert poses[-1] is None
+    assert poses[:-1] == [info.reading.pose for info in result.steps[1:]]
+
+
+def test_the_next_place_is_one_of_the_best_of_the_map(found):
+    for info in found[0].steps[:-1]:
+        best = info.map.grid.places_mm[info.map.best]
+        assert [info.next_pose.x_mm, info.next_pose.y_mm] in best.tolist()
+
+
+def test_the_samples_shown_are_drawn_from_the_posterior(found):
+    """Mean of 20 samples within 5 standard errors of the weighted mean."""
+    last = found[0].last
+    assert (np.abs(last.samples.mean(axis=0) - last.mean) < 5 * last.sd / math.sqrt(20)).all()
+
+
+def test_bits_agree_with_the_entropy_of_the_posterior_samples(found):
+    """Second route: prior's entropy minus that of the Gaussian with the posterior's covariance."""
+    result, _ = found
+    prior_bits = prior_entropy(result.experiment.prior, rng=rng())
+    samples = result.posterior.samples(2000, rng=rng(1))
+    error = 3 * result.posterior.log_z_error / math.log(2) + 1.0
+    assert result.last.bits == pytest.approx(prior_bits - gaussian_entropy(samples), abs=error)
+
+
+def test_the_summary_gives_bits_and_the_papers_count(found):
+    result, _ = found
+    text = result.summary()
+    assert f"{25 / len(result.steps):.2f} a reading" in text
+    assert f"{result.last.bits / len(result.steps):.2f} a reading" in text
+    assert "radius_mm" in text
+    assert result.steps[0].summary().startswith("reading 1: ")
+
+
+def test_the_readings_become_a_recording(found):
+    result, _ = found
+    np.testing.assert_array_equal(result.recording().readings, [r.value for r in result.readings])
+
+
+def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
+    naive = run(small.arm(sensor=small.sensor(0.0)), small.experiment(blur_mm=0.0), rng=rng(), max_readings=60)
+    assert naive.reached
+    assert all(info.map.highest <= 1.0 + 1e-12 for info in naive.steps)
+    assert len(naive.steps) > len(found[0].steps)
+
+
+def test_a_step_by_hand_is_a_step_of_the_loop(small):
+    experiment, arm = small.experiment(), small.arm()
+    first = next(iter(explore(arm, experiment, rng=rng())))
+    reachable = np.ones(experiment.grid.n_places, bool)
+    # explore() takes the first child of the generator's seed, and of that a child for each reading.
+    child = np.random.SeedSequence(2013).spawn(1)[0]
+    start, then = (
+        np.random.default_rng(np.random.SeedSequence(child.entropy, spawn_key=(*child.spawn_key, k))) for k in (0, 1)
+    )
+    prior_bits = prior_entropy(experiment.prior, rng=start)
+    state = begin(experiment, reachable, rng=start)
+    assert state.next_pose == first.reading.pose
+    state, info = step(
+        state, small.arm().measure(state.next_pose), experiment, reachable, prior_bits=prior_bits, rng=then
+    )
+    np.testing.assert_array_equal(info.samples, first.samples)
+    assert (info.bits, info.log_z, info.next_pose) == (first.bits, first.log_z, first.next_pose)
+    assert state.readings == (first.reading,)
+
+
+def same(a, b):
+    """Bit for bit, but for where the reading came from."""
+    return (
+        (a.number, a.reading, a.next_pose, a.bits, a.log_z, a.p_value, a.stop_reason)
+        == (b.number, b.reading, b.next_pose, b.bits, b.log_z, b.p_value, b.stop_reason)
+        and (a.samples == b.samples).all()
+        and (a.mean == b.mean).all()
+        and (a.map.values == b.map.values).all()
+    )
+
+
+def test_one_seed_gives_one_run_and_two_runs_of_a_generator_differ(small):
+    experiment = small.experiment()
+    one, again = (run(small.arm(), experiment, rng=rng(), max_readings=3) for _ in range(2))
+    assert all(same(a, b) for a, b in zip(one.steps, again.steps, strict=True))
+    shared = rng()
+    first, second = (run(small.arm(), experiment, rng=shared, max_readings=2) for _ in range(2))
+    assert first.readings[0].pose != second.readings[0].pose
+
+
+@pytest.mark.parametrize("n_before", [1, 4])
+def test_a_run_that_was_interrupted_goes_on_bit_for_bit(small, found, tmp_path, n_before):
+    whole, journal = found[0], tmp_path / "journal.jsonl"
+    for info in explore(small.arm(), small.experiment(), rng=rng(), journal=journal):
+        if info.number == n_before:
+            break
+    arm = small.arm()
+    resumed = run(arm, small.experiment(), rng=rng(), journal=journal)
+    assert len(arm.poses) == len(whole.steps) - n_before
+    assert all(same(a, b) for a, b in zip(whole.steps, resumed.steps, strict=True))
+    assert [info.replayed for info in resumed.steps] == [k < n_before for k in range(len(whole.steps))]
+
+
+def test_a_run_that_ended_is_replayed_without_asking_the_arm(small, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    first = run(small.arm(), small.experiment(), rng=rng(), max_readings=3, journal=journal)
+    text = journal.read_bytes()
+    arm = small.arm()
+    second = run(arm, small.experiment(), rng=rng(), max_readings=3, journal=journal)
+    assert arm.poses == []
+    assert journal.read_bytes() == text
+    assert all(same(a, b) for a, b in zip(first.steps, second.steps, strict=True))
+
+
+def test_a_run_that_ended_at_max_readings_can_be_extended(small, found, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    short = run(small.arm(), small.experiment(), rng=rng(), max_readings=2, journal=journal)
+    assert short.stop_reason.startswith("max_readings = 2 is reached; the widest length is known to ")
+    assert not short.reached
+    longer = run(small.arm(), small.experiment(), rng=rng(), journal=journal)
+    assert longer.readings == found[0].readings
+
+
+KILLED = """
+import runpy, sys
+import numpy as np
+from probewise.experiment import explore
+small = runpy.run_path(sys.argv[1])
+arm = small["QuickArm"](die_at=4)
+for info in explore(arm, small["small_experiment"](), rng=np.random.default_rng(2013), journal=sys.argv[2]):
+    sys.stdout.write(f"{info.number}\\n")
+"""
+
+
+def test_a_process_that_is_killed_loses_no_reading(small, found, tmp_path):
+    """SIGKILL while the fourth reading is being taken; the fifth is never asked for before the fourth is on disk."""
+    journal = tmp_path / "journal.jsonl"
+    conftest = str(Path(__file__).with_name("conftest.py"))
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, conftest, str(journal)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert len(read_journal(journal).entries) == 3
+    arm = small.arm()
+    resumed = run(arm, small.experiment(), rng=rng(), journal=journal)
+    assert len(arm.poses) == len(found[0].steps) - 3
+    assert all(same(a, b) for a, b in zip(found[0].steps, resumed.steps, strict=True))
+
+
+def test_a_run_killed_while_it_infers_keeps_the_reading_just_taken(small, found, tmp_path, monkeypatch):
+    journal = tmp_path / "journal.jsonl"
+    steps = explore(small.arm(), small.experiment(), rng=rng(), journal=journal)
+    next(steps)
+    monkeypatch.setattr("probewise.experiment.loop.run_nested", lambda *_, **__: os._exit(9))
+    pid = os.fork()
+    if pid == 0:
+        next(steps)  # measures, writes the reading, dies in the inference
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 9
+    monkeypatch.undo()
+    steps.close()
+    arm = small.arm()
+    resumed = run(arm, small.experiment(), rng=rng(), journal=journal)
+    assert len(arm.poses) == len(found[0].steps) - 2
+    assert any("the reading is kept" in note for note in resumed.steps[0].notes)
+    assert resumed.readings == found[0].readings
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"n_samples": 40}, "options"),
+        ({"noise_sd": 2.0}, "options"),
+        ({"blur_mm": 9.0}, "sensor"),
+        ({"grid": Grid(400.0, 300.0, 41, 31)}, "field"),
+    ],
+)
+def test_a_journal_of_other_settings_is_not_resumed(small, tmp_path, change, named):
+    journal = tmp_path / "journal.jsonl"
+    run(small.arm(), small.experiment(), rng=rng(), max_readings=1, journal=journal)
+    with pytest.raises(FileError, match=f"other settings: .*{named}"):
+        explore(small.arm(), small.experiment(**change), rng=rng(), journal=journal)
+
+
+def test_a_journal_of_another_seed_is_not_resumed(small, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    run(small.arm(), small.experiment(), rng=rng(), max_readings=1, journal=journal)
+    with pytest.raises(FileError, match="seed '2013' there, '5' here"):
+        explore(small.arm(), small.experiment(), rng=rng(5), journal=journal)
+
+
+def test_a_journal_with_more_readings_than_allowed_says_so(small, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    run(small.arm(), small.experiment(), rng=rng(), max_readings=2, journal=journal)
+    with pytest.raises(ParameterError, match=r"max_readings is 1; allowed: the 2 readings the journal holds"):
+        explore(small.arm(), small.experiment(), rng=rng(), max_readings=1, journal=journal)
+
+
+def test_a_broken_link_leaves_a_journal_to_resume_from(small, found, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    with pytest.raises(LinkError):
+        run(small.arm(fail_at=3), small.experiment(), rng=rng(), journal=journal)
+    assert run(small.arm(), small.experiment(), rng=rng(), journal=journal).readings == found[0].readings
+
+
+def test_only_places_within_reach_are_measured(small):
+    arm = small.arm(reach_mm=160.0)
+    run(arm, small.experiment(), rng=rng(), max_readings=4)
+    assert arm.reachable(np.array([[p.x_mm, p.y_mm] for p in arm.poses])).all()
+
+
+def test_a_field_out_of_reach_is_an_error(small):
+    with pytest.raises(ReachError, match="reachable places is 0"):
+        next(
+            iter(
+                explore(
+                    small.arm(reach_mm=0.0, truth=(9, 9, 30)),
+                    small.experiment(grid=Grid(399.0, 300.0, 4, 4)),
+                    rng=rng(),
+                )
+            )
+        )
+
+
+def test_readings_that_no_hypothesis_allows_are_flagged_and_never_nan(small):
+    """A surface brighter than any hypothesis predicts: 95 where 10 to 60 are possible."""
+
+    class Glaring(small.arm):
+        def measure(self, pose):
+            return replace(super().measure(pose), value=95.0)
+
+    result = run(Glaring(), small.experiment(), rng=rng(), max_readings=2)
+    assert len(result.steps) == 2
+    assert result.last.p_value < 1e-100
+    assert "no hypothesis explains the readings" in result.notes[-1]
+    assert "doubtful: no hypothesis" in result.summary()
+    assert np.isfinite(result.last.mean).all()
+
+
+def test_a_fitting_run_is_not_flagged(found):
+    assert all(info.p_value > 1e-6 for info in found[0].steps)
+
+
+def test_a_space_that_excludes_the_reading_altogether_is_an_error(small):
+    class Impossible:
+        def log_prob(self, readings, predicted):
+            return np.where(np.abs(readings - predicted).max(axis=1) < 5, 0.0, -np.inf)
+
+    class Black(small.arm):
+        def measure(self, pose):
+            return replace(super().measure(pose), value=95.0)
+
+    with pytest.raises(NotConvergedError, match="excludes what was measured"):
+        run(Black(), small.experiment(likelihood=Impossible()), rng=rng())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"stop_sd_mm": 0.0}, {"noise_sd": math.nan}, {"n_samples": 1}, {"n_diversify": -1}, {"stop_probability": 1.0}],
+)
+def test_an_option_out_of_range_is_refused_by_name(small, change):
+    with pytest.raises(ParameterError, match=next(iter(change))):
+        small.experiment(**change)
+
+
+def test_a_model_of_another_shape_is_refused(small):
+    with pytest.raises(ParameterError, match=r"model\.names"):
+        small.experiment(model=small.sensor(names=("x_mm", "y_mm")))
+
+
+def test_max_readings_below_one_is_refused(small):
+    with pytest.raises(ParameterError, match="max_readings"):
+        explore(small.arm(), small.experiment(), rng=rng(), max_readings=0)
+
+
+def test_a_growing_scan_has_the_student_t_of_one_data_set():
+    readings, predicted = rng().normal(30, 2, 7), rng(1).normal(30, 2, (5, 7))
+    expected = StudentT(np.zeros(7, int), 0.3, 10.0).log_prob(readings, predicted)
+    np.testing.assert_allclose(OneScan(0.3, 10.0).log_prob(readings, predicted), expected)
+
+
+def real_experiment(small, shape, **changes):
+    mixture = FixedMixture(np.array([1.0]), np.array([[2.0, 3.0]]), np.array([[[56.0, 4.0], [4.0, 30.0]]]))
+    chain = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(shape))
+    return small.experiment(shape=shape, model=chain, likelihood=GaussianKnown(1.0), **changes)
+
+
+class ChainArm:
+    """Reads a chain over a true shape, with noise by place."""
+
+    def __init__(self, chain, truth):
+        self.chain, self.truth = chain, np.array([truth])
+
+    def reachable(self, places_mm):
+        return np.ones(len(places_mm), bool)
+
+    def measure(self, pose):
+        plan = Grid(2.0, 2.0, 2, 2).plan("field").take(np.array([0]))
+        plan = replace(plan, x_mm=np.array([pose.x_mm]), y_mm=np.array([pose.y_mm]))
+        noise = rng([int(1000 * pose.x_mm), int(1000 * pose.y_mm)]).standard_normal()
+        return Reading(float(np.rint(self.chain.predict(self.truth, plan)[0, 0] + noise)), pose, 0.0)
+
+
+@pytest.mark.slow
+def test_of_a_set_of_shapes_the_robot_finds_which_and_where(small):
+    """Paper: "a general system that works for any expected shape or set of shapes"."""
+    field = Field(400.0, 300.0)
+    shape = AnyOf({"circle": Circle(field, (40.0, 100.0), True), "rectangle": Rectangle(field, (80.0, 180.0), True)})
+    experiment = real_experiment(small, shape, n_live=200, stop_sd_mm=6.0)
+    only = real_experiment(small, shape.shapes["rectangle"])
+    result = run(ChainArm(only.model, (210.0, 140.0, 150.0, 90.0, 0.4)), experiment, rng=rng(), max_readings=60)
+    assert result.reached
+    assert result.last.likely_shape == "rectangle"
+    assert result.last.shapes["rectangle"] > 0.95
+    assert "rectangle (p = " in result.last.summary()
+    columns = shape.prior.columns[1]
+    assert np.isnan(np.delete(result.last.mean, columns)).all()
+    error = result.last.mean[columns][:2] - [210.0, 140.0]
+    assert (np.abs(error) < 5 * result.last.sd[columns][:2]).all()
+
+
+def test_a_set_of_shapes_stops_on_the_lengths_of_the_most_probable(small):
+    field = Field(400.0, 300.0)
+    shape = AnyOf({"circle": Circle(field, (40.0, 100.0)), "rectangle": Rectangle(field, (80.0, 180.0))})
+    experiment = real_experiment(small, shape)
+    arm = ChainArm(real_experiment(small, Circle(field)).model, (210.0, 140.0, 70.0))
+    info = next(iter(explore(arm, experiment, rng=rng())))
+    likely = list(shape.shapes).index(info.likely_shape)
+    assert np.isfinite(info.mean).nonzero()[0].tolist() == sorted(shape.prior.columns[likely].tolist())
+    assert sum(info.shapes.values()) == pytest.approx(1.0)
+    known = np.where(np.isfinite(info.sd), 1.0, np.nan)
+    assert experiment.is_known(known, {"circle": 0.99, "rectangle": 0.01})
+    assert not experiment.is_known(known, {"circle": 0.6, "rectangle": 0.4})
+    assert not experiment.is_known(known * 5, {"circle": 0.99, "rectangle": 0.01})
+
+
+def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
+    field = Field(400.0, 300.0)
+    circle = Circle(field, (40.0, 100.0), inside=True)
+    model = NaiveSensor(FixedLevels(10.0, 60.0), HypothesisScene(circle))
+    result = run(
+        small.arm(sensor=small.sensor(0.0)), small.experiment(shape=circle, model=model), rng=rng(), max_readings=3
+    )
+    assert isinstance(result, Exploration)
+    assert all(info.map.highest <= 1.0 + 1e-12 for info in result.steps)
+    assert Pose(result.readings[0].pose.x_mm, result.readings[0].pose.y_mm) == result.readings[0].pose

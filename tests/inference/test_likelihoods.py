@@ -1,0 +1,217 @@
+"""Likelihoods against quadrature and by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.polynomial.legendre import leggauss
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.inference import (
+    GaussianInferred,
+    GaussianKnown,
+    Naive,
+    PooledSigma,
+    SensorProblem,
+    StudentT,
+    log_sigma_integral,
+    reading_span,
+    sd_ceiling,
+    sd_floor,
+    student_t,
+)
+from probewise.inference.gaussian import log_prob_gaussian
+from probewise.priors import LogUniform, Product, Uniform
+from probewise.recordings.plan import Instrumentation, Plan, Recording
+
+
+def recording(readings: list[float], scan: list[int] | None = None, **inst: float) -> Recording:
+    n = len(readings)
+    codes = [0] * n if scan is None else scan
+    plan = Plan(
+        x_mm=np.arange(n),
+        y_mm=np.zeros(n),
+        orientation_rad=np.zeros(n),
+        time_s=np.arange(n),
+        scan=codes,
+        scan_names=tuple(str(k) for k in range(max(codes) + 1)),
+        pattern=np.zeros(n, dtype=int),
+        pattern_names=("only",),
+        instrumentation=Instrumentation(**inst),
+    )
+    return Recording(plan, np.array(readings, dtype=float))
+
+
+class Line:
+    """A model of two parameters, for composing."""
+
+    names = ("slope", "start")
+
+    def predict(self, theta: np.ndarray, plan: Plan) -> np.ndarray:
+        return theta[:, :1] * plan.x_mm + theta[:, 1:2]
+
+
+def by_quadrature(square: float, n: int, low: float, high: float) -> float:
+    """The integral over ln sigma by Gauss and Legendre, in panels that widen away from the peak."""
+
+    def height(s: np.ndarray) -> np.ndarray:
+        return -n * s - 0.5 * square * np.exp(-2 * s)
+
+    a, b = math.log(low), math.log(high)
+    peak = min(max(0.5 * math.log(square / n), a), b) if square > 0 else a
+    width = 1 / max(math.sqrt(2 * n), abs(-n + square * math.exp(-2 * peak)))
+    marks = peak + width * np.concatenate([-(2.0 ** np.arange(40, -2, -1)), 2.0 ** np.arange(-1, 41)])
+    edges = np.unique(np.clip(np.concatenate([[a, b, peak], marks]), a, b))
+    node, weight = leggauss(40)
+    half = np.diff(edges)[:, None] / 2
+    top = float(height(np.array(peak)))
+    values = np.exp(height((edges[:-1, None] + half) + half * node) - top)
+    return top + math.log(float((values * weight * half).sum()))
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 14, 101, 404, 5000])
+@pytest.mark.parametrize("rms", [0.0, 1e-9, 1e-3, 0.04, 0.6, 5.0, 80.0, 3000.0])
+def test_the_integral_over_sigma_is_what_quadrature_gives(n: int, rms: float) -> None:
+    """From residuals that vanish to residuals far beyond the ceiling."""
+    got = float(log_sigma_integral(n * rms**2, n, 0.05, 60.0))
+    assert got == pytest.approx(by_quadrature(n * rms**2, n, 0.05, 60.0), rel=1e-9, abs=1e-8)
+
+
+def test_student_t_falls_smoothly_with_the_residual() -> None:
+    """No jump where the closed form changes branches."""
+    square = np.concatenate([[0.0], np.geomspace(1e-300, 1e300, 20_000)])
+    values = log_sigma_integral(square, 7, 0.1, 10.0)
+    assert np.isfinite(values).all()
+    assert (np.diff(values) <= 1e-9 * np.abs(values[1:])).all()
+
+
+def test_student_t_is_a_normalised_density_of_one_reading() -> None:
+    """With a proper prior of sigma one reading says something, and its density integrates to one."""
+    one = StudentT(np.zeros(1), 0.5, 20.0)
+
+    def density(reading: float) -> float:
+        return math.exp(one.log_prob(np.array([reading]), np.zeros((1, 1)))[0])
+
+    halves = [quad(density, a, b, epsabs=1e-10)[0] for a, b in ((0, 1), (1, 10), (10, 200))]
+    assert 2 * sum(halves) == pytest.approx(1.0, abs=1e-6)
+    assert density(0.0) > density(1.0) > density(5.0)
+
+
+def test_student_t_multiplies_over_data_sets() -> None:
+    """Paper: the joint likelihood is the product over data sets."""
+    rng = np.random.default_rng(1)
+    readings, predicted = rng.normal(size=9), rng.normal(size=(3, 9))
+    groups = np.array([4, 4, 9, 9, 9, 4, 2, 9, 4])
+    whole = StudentT(groups, 0.1, 10.0).log_prob(readings, predicted)
+    parts = sum(
+        StudentT(groups[groups == g], 0.1, 10.0).log_prob(readings[groups == g], predicted[:, groups == g])
+        for g in (2, 4, 9)
+    )
+    assert whole == pytest.approx(parts, abs=1e-12)
+
+
+def test_student_t_with_many_readings_ranks_as_the_paper_does() -> None:
+    """Far from both bounds the ratio of likelihoods is [S1 / S2]^(-N/2), paper's N - 1 being N with prior 1/sigma."""
+    readings = np.zeros(50)
+    predicted = np.array([1.0, 2.0])[:, None] * np.ones(50)
+    got = StudentT(np.zeros(50), 1e-3, 1e3).log_prob(readings, predicted)
+    assert got[0] - got[1] == pytest.approx(25 * math.log(4.0), abs=1e-9)
+
+
+def test_the_pooled_sigma_predicts_what_integrating_over_it_gives() -> None:
+    """Predictive density of a new reading, by quadrature over sigma."""
+    residual = np.array([0.3, -0.5, 0.2, 0.9, -0.1])
+    pooled = StudentT(np.array([0, 0, 1, 1, 2]), 0.05, 5.0).pooled(residual, np.zeros((1, 5)))
+    new = np.array([0.7, -2.0])
+    sigma = np.geomspace(0.05, 5.0, 200_001)
+    weight = sigma ** (-5.0) * np.exp(-0.5 * (residual**2).sum() / sigma**2)
+    weight /= weight.sum()
+    by_hand = [math.log(weight @ norm.pdf(x, 0, sigma)) for x in new]
+    assert pooled.log_density(new, np.zeros((1, 2)))[0] == pytest.approx(by_hand, abs=1e-4)
+    joint = math.log(weight @ (norm.pdf(new[0], 0, sigma) * norm.pdf(new[1], 0, sigma)))
+    assert pooled.log_prob(new, np.zeros((1, 2)))[0] == pytest.approx(joint, abs=1e-4)
+    assert pooled.sd()[0] == pytest.approx(math.sqrt(weight @ sigma**2), rel=1e-4)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
+def test_the_pooled_sigma_of_few_readings_has_an_sd(n: int) -> None:
+    sigma = np.geomspace(0.1, 10.0, 400_001)
+    weight = sigma ** (-float(n)) * np.exp(-0.5 * 0.4 / sigma**2) if n else np.ones_like(sigma)
+    square = np.array([0.4 if n else 0.0])
+    expected = math.sqrt((weight @ sigma**2) / weight.sum())
+    assert PooledSigma(square, n, 0.1, 10.0).sd()[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_gaussian_likelihoods_add_up_normal_densities() -> None:
+    rng = np.random.default_rng(2)
+    readings, predicted = rng.normal(size=6), rng.normal(size=(4, 6))
+    sd = rng.uniform(0.5, 2, 6)
+    expected = norm.logpdf(readings, predicted, sd).sum(axis=1)
+    assert GaussianKnown(sd).log_prob(readings, predicted) == pytest.approx(expected)
+    assert GaussianKnown(0.7).log_prob(readings, predicted) == pytest.approx(
+        norm.logpdf(readings, predicted, 0.7).sum(axis=1)
+    )
+    each = rng.uniform(0.5, 2, 4)
+    assert log_prob_gaussian(readings, predicted, each) == pytest.approx(
+        norm.logpdf(readings, predicted, each[:, None]).sum(axis=1)
+    )
+
+
+def test_an_inferred_sd_is_one_more_column() -> None:
+    """The wrapper agrees with the known-sd problem at each sd, and leaves unusable rows out."""
+    rec = recording([0.1, 1.2, float("nan"), 2.9])
+    sensor = Product({"slope": Uniform(0, 2), "start": Uniform(-1, 1)})
+    problem = GaussianInferred(sensor, Line(), rec, LogUniform(0.01, 10))
+    assert problem.prior.names == ("slope", "start", "noise.sd")
+    got = problem.log_likelihood(np.array([[1.0, 0.0, 0.3], [0.9, 0.1, 2.0]]))
+    for row, sd in ((0, 0.3), (1, 2.0)):
+        known = SensorProblem(sensor, Line(), GaussianKnown(sd), rec)
+        assert got[row] == pytest.approx(known.log_likelihood(np.array([[1.0, 0.0], [0.9, 0.1]]))[row])
+    assert problem.prior.from_unit_cube(np.full((1, 3), 0.5))[0] == pytest.approx([1.0, 0.0, math.sqrt(0.1)])
+
+
+def test_the_naive_likelihood_knows_two_levels() -> None:
+    """Paper, naive likelihood, with the exponent's sign and the square of sigma put right."""
+    naive = Naive(mu_black=10, sd_black=1, mu_white=60, sd_white=3)
+    readings = np.array([11.0, 58.0, 30.0])
+    predicted = np.array([[10.0, 60.0, 60.0], [10.0, 10.0, 10.0]])
+    got = naive.log_prob(readings, predicted)
+    assert got[0] == pytest.approx(norm.logpdf(11, 10, 1) + norm.logpdf(58, 60, 3) + norm.logpdf(30, 60, 3))
+    assert got[1] == pytest.approx(norm.logpdf(readings, 10, 1).sum())
+
+
+def test_the_naive_levels_come_from_known_black_and_white() -> None:
+    naive = Naive.estimated([10, 10, 10], [58, 60, 62], sd_floor=0.3)
+    assert (naive.mu_black, naive.sd_black, naive.mu_white, naive.sd_white) == (10, 0.3, 60, 2)
+    with pytest.raises(ParameterError, match="black"):
+        Naive.estimated([10], [58, 60], sd_floor=0.3)
+
+
+def test_the_floor_is_that_of_rounding_or_a_thousandth_of_the_span() -> None:
+    assert sd_floor(recording([10, 60], step=1)) == pytest.approx(1 / math.sqrt(12))
+    assert sd_floor(recording([10, 60])) == pytest.approx(0.05)
+    assert sd_floor(recording([0, 1000], step=1)) == pytest.approx(1.0)
+    assert sd_ceiling(recording([10, 60])) == 50
+    assert reading_span(recording([5, 5], min=0, max=100)) == 100
+    assert reading_span(recording([5, 5])) == 1
+
+
+def test_a_data_set_is_a_scan_unless_told_otherwise() -> None:
+    rec = recording([1, 2, float("nan"), 4], scan=[0, 0, 1, 1])
+    assert student_t(rec).groups.tolist() == [0, 0, 1]
+    assert student_t(rec, np.array([5, 6, 7, 8])).groups.tolist() == [5, 6, 8]
+
+
+def test_shapes_and_bounds_are_checked() -> None:
+    with pytest.raises(ParameterError, match="floor"):
+        StudentT(np.zeros(3), 1.0, 1.0)
+    with pytest.raises(ShapeError, match="4 readings against 3 groups"):
+        StudentT(np.zeros(3), 0.1, 1.0).log_prob(np.zeros(4), np.zeros((2, 4)))
+    with pytest.raises(ShapeError, match=r"\(n_samples, n_points\)"):
+        GaussianKnown(1.0).log_prob(np.zeros(4), np.zeros((2, 3)))
+    with pytest.raises(ParameterError, match="sd"):
+        GaussianKnown(0.0)

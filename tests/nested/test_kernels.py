@@ -1,0 +1,133 @@
+"""Independent proposals from kernels: the density they are drawn from, the distribution they leave."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, multivariate_normal
+
+from probewise.errors import ParameterError
+from probewise.nested.evaluate import Bound, Evaluator
+from probewise.nested.kernels import KernelMove, Kernels, diversify_by_kernels
+from probewise.nested.sampler import run
+from probewise.priors import Product, Uniform
+
+
+def cloud(n=300, seed=0):
+    return np.random.default_rng(seed).multivariate_normal([0.4, 0.6], [[0.01, 0.006], [0.006, 0.02]], size=n)
+
+
+def test_the_density_of_kernels_is_the_sum_of_their_gaussians():
+    """scipy's multivariate normal about every centre, half of the weight at a third of the width; up to a constant."""
+    kernels = Kernels.about(cloud(40), rng=np.random.default_rng(1))
+    points = kernels.draw(200, rng=np.random.default_rng(2))
+    centres = kernels.mean + kernels.centre_rows @ kernels.root.T
+    metric = kernels.root @ kernels.root.T * kernels.width**2
+    density = np.mean(
+        [
+            0.5 * multivariate_normal(c, metric).pdf(points) + 0.5 * multivariate_normal(c, metric / 9).pdf(points)
+            for c in centres
+        ],
+        axis=0,
+    )
+    difference = kernels.log_density(points) - np.log(density)
+    np.testing.assert_allclose(difference, difference[0], atol=1e-4)
+
+
+def test_far_points_do_not_underflow():
+    kernels = Kernels.about(cloud(), rng=np.random.default_rng(3))
+    far = kernels.log_density(np.array([[40.0, -30.0], [4000.0, 0.0]]))
+    assert np.isfinite(far).all()
+    assert far[1] < far[0] < -100
+
+
+class Crescent:
+    """A likelihood whose levels are crescents: bent, with empty corners."""
+
+    prior = Product({"a": Uniform(0.0, 1.0), "b": Uniform(0.0, 1.0)})
+
+    def log_likelihood(self, theta):
+        radius = np.hypot(theta[:, 0] - 0.5, theta[:, 1] - 0.1)
+        return -(((radius - 0.5) / 0.05) ** 2)
+
+
+def test_the_move_leaves_the_uniform_distribution_above_a_bound():
+    """Radius and angle of points above a level of the crescent, against a rejection sample; KS at 1e-6."""
+    problem, rng = Crescent(), np.random.default_rng(4)
+    evaluate, bound = Evaluator(problem), Bound(-1.0, 0.0)
+    exact = evaluate(rng.random((60_000, 2)), rng)
+    exact = exact.take(bound.admits(exact.log_likelihood, exact.label))
+    live = exact.take(slice(0, 200))
+    ends = []
+    move = KernelMove()
+    for _ in range(15):
+        start = live.take(rng.permutation(200)[:100])
+        new, tally = move.draw(start, bound, live.u, evaluate, rng)
+        move = move.adapted(tally)
+        assert bound.admits(new.log_likelihood, new.label).all()
+        ends.append(new.u)
+    found = np.concatenate(ends)
+    for of in (lambda u: np.hypot(u[:, 0] - 0.5, u[:, 1] - 0.1), lambda u: np.arctan2(u[:, 1] - 0.1, u[:, 0] - 0.5)):
+        assert kstest(of(found), of(exact.u)).pvalue > 1e-6
+
+
+def test_nested_sampling_by_kernels_finds_the_evidence_of_two_unequal_modes():
+    """Three against one, in three parameters; ln Z in closed form, within four of the run's own errors."""
+
+    class Modes:
+        prior = Product({name: Uniform(-10.0, 10.0) for name in "abc"})
+
+        def log_likelihood(self, theta):
+            one = -0.5 * (((theta - 3.0) / 0.2) ** 2).sum(axis=1) + np.log(0.75)
+            two = -0.5 * (((theta + 3.0) / 0.2) ** 2).sum(axis=1) + np.log(0.25)
+            return np.logaddexp(one, two)
+
+    result = run(Modes(), rng=np.random.default_rng(5), n_live=400, move=KernelMove())
+    exact = 3 * np.log(0.2 * np.sqrt(2 * np.pi) / 20.0)
+    assert result.log_z == pytest.approx(exact, abs=4 * result.log_z_error)
+    share = result.weight[result.theta[:, 0] > 0].sum()
+    assert share == pytest.approx(0.75, abs=0.25)
+    assert result.insertion_p_value > 1e-4
+
+
+def test_replications_become_samples_of_the_posterior():
+    """50 copies of two points, 1000 steps each: moments within five standard errors."""
+
+    class Normals:
+        prior = Product({"a": Uniform(-50.0, 50.0), "b": Uniform(-50.0, 50.0)})
+
+        def log_likelihood(self, theta):
+            return -0.5 * ((theta[:, 0] - 3.0) ** 2 + ((theta[:, 1] + 1.0) / 4.0) ** 2)
+
+    rng = np.random.default_rng(6)
+    start = np.repeat([[3.5, 2.0], [2.0, -3.0]], 25, axis=0)
+    around = rng.normal([3.0, -1.0], [1.0, 4.0], (200, 2))
+    theta, tally = diversify_by_kernels(start, around, Normals(), rng=rng, n_steps=1000)
+    assert tally.n_distinct == 50
+    assert tally.acceptance > 0.2
+    assert (np.abs(theta.mean(axis=0) - [3.0, -1.0]) < 5 * np.array([1.0, 4.0]) / np.sqrt(50)).all()
+    assert (np.abs(np.log(theta.std(axis=0) / [1.0, 4.0])) < 5 / np.sqrt(100)).all()
+
+
+def test_where_kernels_are_wasteful_chains_take_over():
+    """A thin shell in eight parameters: the proposals hardly ever land on it."""
+
+    class Shell:
+        prior = Product({f"p{k}": Uniform(-1.0, 1.0) for k in range(8)})
+
+        def log_likelihood(self, theta):
+            return -(((np.sqrt((theta**2).sum(axis=1)) - 0.7) / 1e-4) ** 2)
+
+    rng, evaluate = np.random.default_rng(7), Evaluator(Shell())
+    direction = rng.standard_normal((100, 8))
+    u = 0.5 + 0.35 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    live = evaluate(u, rng)
+    bound = Bound(-1.0, 0.5)
+    new, tally = KernelMove().draw(live.take(slice(0, 50)), bound, live.u, evaluate, rng)
+    assert bound.admits(new.log_likelihood, new.label).all()
+    assert tally.n_evaluated > 50 * 16
+    assert (new.u != live.u[:50]).any(axis=1).mean() > 0.9
+
+
+@pytest.mark.parametrize("change", [{"moves": 0.0}, {"n_proposals": 0}, {"patience": 0.5}])
+def test_an_option_out_of_range_is_refused(change):
+    with pytest.raises(ParameterError, match=next(iter(change))):
+        KernelMove(**change)

@@ -1,0 +1,288 @@
+"""Nested sampling against known evidences, and its behaviour where likelihoods misbehave."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import kstest
+
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested import (
+    Bound,
+    EvidenceChange,
+    Evaluator,
+    NestedResult,
+    Points,
+    PriorRejection,
+    RemainingEvidence,
+    SliceMove,
+    State,
+    run,
+)
+from probewise.nested.clusters import find_clusters
+from probewise.nested.evidence import insertion_p_value, integrate
+from probewise.nested.sampler import Live, step
+from probewise.priors import Empty
+
+problems = sys.modules["nested_problems"]
+
+# A right sampler is further off than this many of its own errors less than once in 10 000 runs.
+N_ERRORS = 3.9
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20240229)
+
+
+@pytest.mark.parametrize("name", ["shells 2-D", "Rosenbrock 2-D", "plateau", "naive steps", "slab and spike"])
+def test_the_evidence_is_right_within_its_own_error(name: str, rng: np.random.Generator) -> None:
+    problem = problems.PROBLEMS[name]()
+    result = run(problem, rng=rng, n_live=150)
+    assert abs(result.log_z - problem.log_z) < N_ERRORS * result.log_z_error
+    assert result.log_z_error < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*problems.PROBLEMS])
+def test_every_problem_is_solved(name: str, rng: np.random.Generator) -> None:
+    problem = problems.PROBLEMS[name]()
+    result = run(problem, rng=rng)
+    tolerance = 1.0 if name.startswith("SSF") else 0.05  # their truth is known to about half a nat only
+    assert abs(result.log_z - problem.log_z) < N_ERRORS * result.log_z_error + tolerance
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["plateau", "two far peaks", "Gaussian 10-D", "shells 2-D"])
+def test_the_claimed_error_is_the_scatter_between_seeds(name: str) -> None:
+    """Mean square of 24 standardised residuals: chi-square's 1e-4 and 1 - 1e-4 quantiles are 0.28 and 2.5."""
+    problem = problems.PROBLEMS[name]()
+    runs = [run(problem, rng=np.random.default_rng(seed), n_live=100) for seed in range(24)]
+    z = [(r.log_z - problem.log_z) / r.log_z_error for r in runs]
+    assert 0.28 < np.mean(np.square(z)) < 2.5
+    # Seven or more of 24 below 0.05 by chance: 1e-4.
+    assert sum(r.insertion_p_value < 0.05 for r in runs) < 7
+
+
+def test_the_posterior_of_a_gaussian_has_its_moments(rng: np.random.Generator) -> None:
+    problem = problems.gaussian(3, correlation=0.6)
+    result = run(problem, rng=rng, n_live=300)
+    k = 5 / math.sqrt(result.n_eff)
+    assert result.mean() == pytest.approx(np.zeros(3), abs=k)
+    assert result.sd() == pytest.approx(np.ones(3), abs=k)
+    assert result.covariance()[0, 1] == pytest.approx(0.6, abs=k)
+    low, high = result.interval(0.95)
+    assert low == pytest.approx(-1.96 * np.ones(3), abs=3 * k)
+    assert high == pytest.approx(1.96 * np.ones(3), abs=3 * k)
+    # Information of a Gaussian against a box: ln of the box's volume less the Gaussian's entropy.
+    entropy = 0.5 * math.log((2 * math.pi * math.e) ** 3 * np.linalg.det(result.covariance()))
+    assert result.information == pytest.approx(3 * math.log(10) - entropy, abs=4 * result.log_z_error)
+    assert result.mean(lambda t: t[:, 0] ** 2) == pytest.approx(1.0, abs=2 * k)
+
+
+def test_both_of_two_far_peaks_keep_their_share(rng: np.random.Generator) -> None:
+    result = run(problems.mixture_of_far_peaks(3), rng=rng, n_live=200)
+    share = float(result.mean(lambda t: t[:, 0] > 0.5))
+    assert share == pytest.approx(0.75, abs=0.15)
+
+
+def test_a_run_is_repeated_by_its_seed() -> None:
+    one, two = (run(problems.plateau(), rng=np.random.default_rng(5), n_live=50) for _ in range(2))
+    assert one.log_z == two.log_z
+    assert np.array_equal(one.theta, two.theta)
+    assert one.seed_state == two.seed_state
+
+
+def test_one_step_by_hand_counts_the_shrinkage(rng: np.random.Generator) -> None:
+    """Two of five die with five and four alive; their successors lie above the better of the two."""
+    problem = problems.box(1, 0, 1)
+    evaluate = Evaluator(problems.Known(problem, lambda t: t[:, 0], 0.0))
+    u = np.array([[0.1], [0.5], [0.3], [0.9], [0.7]])
+    live = Live(Points(u, u, u[:, 0], np.zeros(5)), np.full(5, -np.inf), 0.0)
+    after, dead, _ = step(live, PriorRejection(1.0), evaluate, n_replaced=2, rng=rng)
+    assert dead.points.theta[:, 0].tolist() == [0.1, 0.3]
+    assert dead.n_at_death.tolist() == [5, 4]
+    assert after.log_volume == pytest.approx(-1 / 5 - 1 / 4)
+    assert (after.points.log_likelihood > 0.3).all()
+    assert after.log_birth.tolist() == [-np.inf, -np.inf, -np.inf, 0.3, 0.3]
+    assert (dead.rank <= dead.n_ranked).all()
+    assert dead.n_ranked.tolist() == [3, 4]
+
+
+def test_every_point_lies_above_the_level_it_was_born_at(rng: np.random.Generator) -> None:
+    result = run(problems.plateau(), rng=rng, n_live=60)
+    assert (result.log_likelihood >= result.log_birth).all()
+    assert (np.diff(result.log_likelihood) >= 0).all()
+    assert np.exp(result.log_weight).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("clustered", [False, True])
+def test_slice_chains_leave_the_uniform_distribution_alone(clustered: bool, rng: np.random.Generator) -> None:
+    """Starts drawn uniformly above the bound end uniformly above it: positions and a plateau's labels."""
+
+    def function(theta: np.ndarray) -> np.ndarray:
+        x = theta[:, 0]
+        inside = (x < 0.1) | (x > 0.6) if clustered else x > 0.3
+        return np.where(inside, 1.0, 0.0) + np.where(x > 0.9, 1.0, 0.0)
+
+    evaluate = Evaluator(problems.Known(problems.box(2, 0, 1), function, 0.0))
+    bound = Bound(1.0, 0.25)
+    points = evaluate(rng.random((12_000, 2)), rng)
+    points = points.take(bound.admits(points.log_likelihood, points.label))
+    start, live = points.take(slice(3000)), points.u[3000:3300]
+    assert len(find_clusters(live)) == (2 if clustered else 1)
+    end, tally = SliceMove(steps_per_param=1, differences=0.3).draw(start, bound, live, evaluate, rng)
+    assert tally.n_stuck < 100
+    plain = end.log_likelihood == 1.0
+    assert (end.label[plain] > 0.25).all()
+    assert kstest(end.u[:, 1], "uniform").pvalue > 1e-4
+    assert kstest((end.label[plain] - 0.25) / 0.75, "uniform").pvalue > 1e-4
+    # Shares: a tenth of the prior above the plateau, the plateau thinned to three quarters by the label.
+    flat = 0.75 * ((0.1 + 0.3) if clustered else 0.6)
+    share = 0.1 / (0.1 + flat)
+    assert (~plain).mean() == pytest.approx(share, abs=4 * math.sqrt(share / 3000))
+    if clustered:
+        share = 0.75 * 0.1 / (0.1 + flat)
+        assert (end.u[:, 0] < 0.1).mean() == pytest.approx(share, abs=4 * math.sqrt(share / 3000))
+
+
+def test_the_bracket_never_leaves_the_unit_cube(rng: np.random.Generator) -> None:
+    seen = []
+
+    def function(theta: np.ndarray) -> np.ndarray:
+        seen.append(theta)
+        return -theta.sum(axis=1)
+
+    run(problems.Known(problems.box(3, 0, 1), function, 0.0), rng=rng, n_live=40)
+    everything = np.concatenate(seen)
+    assert everything.min() >= 0
+    assert everything.max() <= 1
+
+
+def test_zero_likelihood_is_allowed_and_counted(rng: np.random.Generator) -> None:
+    """Only one in twenty hypotheses is possible, all equally: the evidence is that share."""
+
+    def function(theta: np.ndarray) -> np.ndarray:
+        return np.where(theta[:, 0] < 0.05, 0.0, -np.inf)
+
+    result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100)
+    assert abs(result.log_z - math.log(0.05)) < N_ERRORS * result.log_z_error
+    assert (result.theta[:, 0] < 0.05).all()
+
+
+def test_rare_possible_hypotheses_are_doubtful_but_used(rng: np.random.Generator) -> None:
+    def function(theta: np.ndarray) -> np.ndarray:
+        return np.where(theta[:, 0] < 0.002, 0.0, -np.inf)
+
+    with pytest.warns(DoubtfulResultWarning, match="hypotheses drawn from the prior are possible"):
+        result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100)
+    assert abs(result.log_z - math.log(0.002)) < N_ERRORS * result.log_z_error
+    assert "doubtful" in result.summary()
+
+
+def test_a_hypothesis_space_that_excludes_the_readings_is_an_error(rng: np.random.Generator) -> None:
+    nothing = problems.Known(problems.box(2, 0, 1), lambda t: np.full(len(t), -np.inf), 0.0)
+    with pytest.raises(NotConvergedError, match="excludes what was measured"):
+        run(nothing, rng=rng, n_live=50)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda t: np.where(t[:, 0] > 0.9, np.nan, t[:, 0]), r"log likelihood is nan at p0 = 0\.9"),
+        (lambda t: np.where(t[:, 0] > 0.9, np.inf, t[:, 0]), r"log likelihood is inf at p0 = 0\.9"),
+        (lambda t: t[:, :1], r"shape \(50, 1\)"),
+        (lambda t: 1 / 0, "raised ZeroDivisionError"),
+    ],
+)
+def test_a_useless_answer_names_the_parameters(answer: object, message: str, rng: np.random.Generator) -> None:
+    with pytest.raises(NotConvergedError, match=message):
+        run(problems.Known(problems.box(2, 0, 1), answer, 0.0), rng=rng, n_live=50)
+
+
+def test_a_likelihood_that_fails_late_leaves_a_partial_result(rng: np.random.Generator) -> None:
+    def function(theta: np.ndarray) -> np.ndarray:
+        return np.where(theta[:, 0] > 0.9999, np.nan, theta[:, 0] * 50)
+
+    with pytest.raises(NotConvergedError, match="p0 = 0.9999") as caught:
+        run(problems.Known(problems.box(1, 0, 1), function, 0.0), rng=rng, n_live=50)
+    partial = caught.value.partial
+    assert isinstance(partial, NestedResult)
+    assert partial.n_dead > 50
+    assert any("nan" in note for note in partial.warnings)
+
+
+def test_the_call_limit_gives_a_doubtful_result(rng: np.random.Generator) -> None:
+    with pytest.warns(DoubtfulResultWarning, match="max_calls = 3000"):
+        result = run(problems.gaussian(2), rng=rng, n_live=100, max_calls=3000)
+    assert result.n_calls <= 3000
+    assert "max_calls" in result.stop_reason
+    assert result.samples(10, rng=rng).shape == (10, 2)
+
+
+def test_progress_is_told_every_round(rng: np.random.Generator) -> None:
+    states: list[State] = []
+    result = run(problems.plateau(), rng=rng, n_live=40, progress=states.append)
+    assert states[-1].n_calls == result.n_calls
+    assert all(a.log_volume > b.log_volume for a, b in zip(states, states[1:], strict=False))
+    assert all(a.log_z <= b.log_z for a, b in zip(states, states[1:], strict=False))
+    # The dead points' log Z counted on the way is the one summed up at the end, less the live points' share.
+    assert states[-1].log_z == pytest.approx(float(logsumexp(result.log_weight[:-40])) + result.log_z, abs=1e-9)
+
+
+def test_the_papers_stop_rule_goes_on_for_longer(rng: np.random.Generator) -> None:
+    problem = problems.gaussian(2)
+    short = run(problem, rng=rng, n_live=50)
+    long = run(problem, rng=rng, n_live=50, stop=EvidenceChange(1e-8))
+    assert long.n_dead > short.n_dead
+    assert "1e-08" in long.stop_reason
+    assert abs(long.log_z - problem.log_z) < N_ERRORS * long.log_z_error
+
+
+def test_a_problem_without_parameters_is_its_likelihood(rng: np.random.Generator) -> None:
+    result = run(problems.Known(Empty(), lambda t: np.full(len(t), -3.5), -3.5), rng=rng)
+    assert (result.log_z, result.log_z_error, result.theta.shape) == (-3.5, 0.0, (1, 0))
+    assert "log Z" in result.summary()
+
+
+@pytest.mark.parametrize("options", [{"n_live": 5}, {"n_replaced": 30, "n_live": 50}, {"max_calls": 10, "n_live": 50}])
+def test_options_out_of_range_are_named(options: dict[str, int], rng: np.random.Generator) -> None:
+    with pytest.raises(ParameterError, match="allowed"):
+        run(problems.plateau(), rng=rng, **options)
+    with pytest.raises(ParameterError, match="dlogz"):
+        RemainingEvidence(0.0)
+
+
+def test_the_integral_of_a_known_sequence_is_exact(rng: np.random.Generator) -> None:
+    """Likelihood exp(-X / s) along the expected volumes: Z = s (1 - exp(-1 / s))."""
+    n_live, s = 500, 1e-3
+    n_at_death = np.concatenate([np.full(6000, n_live), np.arange(n_live, 0, -1)])
+    volume = np.exp(-np.cumsum(1 / n_at_death))
+    evidence = integrate(-volume / s, n_at_death, rng=rng)
+    assert evidence.log_z == pytest.approx(math.log(s), abs=0.01)
+    assert evidence.log_z_error == pytest.approx(math.sqrt(evidence.information / n_live), rel=0.3)
+
+
+def test_insertion_ranks_of_a_wrong_sampler_are_found(rng: np.random.Generator) -> None:
+    m = np.full(2000, 99)
+    assert insertion_p_value(rng.integers(0, 100, 2000), m, rng=rng) > 1e-4
+    assert insertion_p_value(rng.integers(0, 90, 2000), m, rng=rng) < 1e-6
+    early = np.concatenate([rng.integers(0, 60, 200), rng.integers(0, 100, 1800)])
+    assert insertion_p_value(early, m, rng=rng) < 1e-4
+
+
+def test_clusters_are_found_where_they_are_and_not_where_they_are_not(rng: np.random.Generator) -> None:
+    ball = rng.standard_normal((300, 5))
+    ball *= rng.random((300, 1)) ** (1 / 5) / np.linalg.norm(ball, axis=1, keepdims=True)
+    assert len(find_clusters(ball)) == 1
+    assert len(find_clusters(rng.random((300, 5)))) == 1
+    two = np.concatenate([0.1 * ball[:220], 0.05 * ball[220:] + 0.5])
+    clusters = find_clusters(two)
+    assert len(clusters) == 2
+    home = clusters.assign(two)
+    assert len(np.unique(home[:220])) == len(np.unique(home[220:])) == 1
+    assert home[0] != home[-1]

@@ -1,0 +1,78 @@
+"""Pages are self-contained and escape what they are given."""
+
+from html.parser import HTMLParser
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, table
+from probewise.report.words import count, number, probability, signed
+
+PNG = b"\x89PNG fake"
+
+
+class Reader(HTMLParser):
+    """Collect text and addresses, and check that every element is closed in order."""
+
+    VOID = frozenset({"meta", "img", "br"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.text, self.addresses = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def read(markup):
+    reader = Reader()
+    reader.feed(markup)
+    reader.close()
+    assert reader.open == []
+    return reader
+
+
+@given(st.text(alphabet=st.characters(exclude_categories=("Cs", "Cc"))))
+def test_text_comes_out_as_it_went_in_whatever_it_holds(text):
+    assert "".join(read(paragraph(text)).text) == text
+
+
+def test_a_page_needs_nothing_from_outside():
+    made = page(
+        "a <title>",
+        answer="5 < 6",
+        key_figure=figure(PNG, 'a "caption"'),
+        sections=[Section("more", (table(("a", "b"), [("1", "<x>")]),))],
+    )
+    reader = read(made)
+    assert all(address.startswith("data:") for address in reader.addresses)
+    assert "5 < 6" in "".join(reader.text)
+    assert "http" not in made
+    assert 'name="viewport"' in made
+
+
+def test_the_answer_and_its_picture_come_before_everything_else():
+    made = page("t", answer="the answer", key_figure=figure(PNG, "key"), sections=[Section("later", ())])
+    body = made[made.index("<body>") :]
+    assert body.index("the answer") < body.index("<img") < body.index("later")
+
+
+def test_markup_is_not_escaped_twice():
+    assert fragment(Markup("<b>x</b>"), "<") == "<b>x</b>&lt;"
+    assert element("td", "a", class_="number") == '<td class="number">a</td>'
+
+
+def test_numbers_are_written_as_people_read_them():
+    assert number(-1.25, 1) == "−1.2"
+    assert number(float("nan"), 1) == "–"
+    assert signed(-0.01, 1) == "0.0"
+    assert (count(1, "reading"), count(2, "reading")) == ("1 reading", "2 readings")
+    assert (probability(1e-9), probability(0.5), probability(1.0)) == ("< 0.001", "0.500", "> 0.999")

@@ -1,0 +1,54 @@
+"""Results show themselves in a notebook, with a picture."""
+
+import numpy as np
+import pytest
+
+from probewise._display import ShowsItself, render_html
+from probewise.calibration import calibrate
+from probewise.nested import run
+from probewise.priors import Product, Uniform
+from probewise.recordings import Recording, paper_plan, read_recording, shipped
+from probewise.sensor import SSFField
+
+
+class Bell:
+    prior = Product({"x_mm": Uniform(-5.0, 5.0), "y_mm": Uniform(-5.0, 5.0)})
+
+    def log_likelihood(self, theta):
+        return -0.5 * (theta**2).sum(axis=1)
+
+
+def small_calibration():
+    recording = read_recording(shipped("paper"))
+    few = recording.take(np.arange(0, len(recording), 4))
+    return calibrate(few, orders=(1,), n_live=16, rng=np.random.default_rng(0))
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+def test_a_calibration_its_sensor_and_its_nested_run_show_themselves():
+    calibration = small_calibration()
+    for value in (calibration, calibration.sensor, calibration.sensor.field):
+        shown = value._repr_html_()
+        assert "data:image/png;base64" in shown
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: run(Bell(), rng=np.random.default_rng(0), n_live=50),
+        lambda: SSFField(np.ones((5, 5)), 1.0, (-2.0, -2.0)),
+        lambda: Recording(paper_plan(), np.linspace(10, 60, 408)),
+    ],
+    ids=["nested result", "SSF field", "recording"],
+)
+def test_a_value_shows_a_picture(make):
+    assert "data:image/png;base64" in make()._repr_html_()
+
+
+def test_a_value_without_a_renderer_shows_its_escaped_repr():
+    class Plain(ShowsItself):
+        def __repr__(self):
+            return "<plain>"
+
+    assert Plain()._repr_html_() == "<pre>&lt;plain&gt;</pre>"
+    assert render_html(3) == "<pre>3</pre>"

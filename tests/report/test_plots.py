@@ -1,0 +1,114 @@
+"""Figures show the data that they are given, and leave nothing behind."""
+
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+from probewise.recordings import Recording, paper_plan, read_recording, shipped
+from probewise.report import plots
+from probewise.report.plots.readings import tracks
+from probewise.sensor import SSFField
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return read_recording(shipped("paper"))
+
+
+def blob():
+    x = np.arange(-20.0, 21.0)
+    return SSFField(np.exp(-(x[None, :] ** 2) / 32 - x[:, None] ** 2 / 18), 1.0, (-20.0, -20.0))
+
+
+def test_the_papers_plan_has_four_lines_and_four_readings_alone():
+    found, alone = tracks(paper_plan())
+    assert [len(t.rows) for t in found] == [101] * 4
+    assert [t.label for t in found] == ["0°", "90°", "180°", "270°"]
+    assert len(alone) == 4
+    for track in found:
+        np.testing.assert_allclose(np.sort(track.along_mm), np.arange(-50.0, 51.0), atol=1e-9)
+
+
+def test_every_usable_reading_on_a_line_is_drawn(recording):
+    ax = plots.readings_by_orientation(recording)
+    assert sum(len(line.get_xdata()) for line in ax.lines) == 404
+    assert "mm" in ax.get_xlabel()
+    assert "LEGO" in ax.get_ylabel()
+
+
+def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording):
+    axes = plots.predicted_against_recorded(recording, recording.readings, np.ones(len(recording)))
+    assert sum(ax.get_visible() for ax in axes.flat) == 5
+
+
+def test_many_scans_are_thinned_to_eight_panels():
+    plan = read_recording(shipped("drifting")).plan
+    flat = Recording(plan, np.full(len(plan), 30.0))
+    axes = plots.predicted_against_recorded(flat, flat.readings, np.ones(len(flat)))
+    assert sum(ax.get_visible() for ax in axes.flat) <= 8
+
+
+def test_the_field_shows_readings_by_brightness_and_the_next_place():
+    x, y = np.linspace(0, 1048, 131), np.linspace(0, 520, 65)
+    utility = np.ones((65, 131))
+    utility[:5] = np.nan
+    ax = plots.playing_field(
+        utility,
+        x,
+        y,
+        outlines_mm=[np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [0.0, 0.0]])],
+        places_mm=np.array([[100.0, 100.0], [200.0, 100.0]]),
+        readings=np.array([10.0, 60.0]),
+        levels=(10.0, 60.0),
+        next_mm=(300.0, 100.0),
+    )
+    squares, green = ax.collections[1:]
+    np.testing.assert_allclose(squares.get_facecolors()[:, :3], [[0, 0, 0], [1, 1, 1]])
+    np.testing.assert_allclose(green.get_offsets(), [[300.0, 100.0]])
+    assert "mm" in ax.get_xlabel()
+
+
+def test_an_ssf_is_drawn_about_its_place_in_the_sensor_frame():
+    ax = plots.spatial_sensitivity(blob())
+    left, right = ax.get_xlim()
+    assert left == -right
+    assert plots.ssf_by_order({1: blob(), 2: blob()}, {1: -5.0, 2: -7.0}, {1: 0.1, 2: 0.1}).shape == (1, 2)
+
+
+def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
+    ax = plots.hypothesis_probabilities([str(k) for k in range(20)], np.full(20, 0.05), most=8)
+    widths = [bar.get_width() for bar in ax.patches]
+    assert len(widths) == 9
+    assert sum(widths) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plots.posterior_widths({"a": np.array([50.0, 8.0, 3.0])}),
+        lambda: plots.information_gained({"a": np.array([1.0, 2.5])}),
+        lambda: plots.log_evidences([1, 2], [-3.0, -5.0], [0.1, 0.2]),
+        lambda: plots.witness(np.arange(4.0), np.zeros(4), np.ones(4), label="time (s)", unit="LEGO", span=(1.0, 2.0)),
+        lambda: plots.residuals_against(
+            np.arange(40.0), np.zeros(40), np.full(40, np.nan), label="time (s)", unit="LEGO"
+        ),
+    ],
+    ids=["widths", "information", "evidence", "witness", "residuals"],
+)
+def test_a_figure_returns_its_axes_and_renders(draw):
+    ax = draw()
+    assert isinstance(ax, Axes)
+    assert plots.png(ax).startswith(b"\x89PNG")
+
+
+def test_drawing_on_given_axes_makes_no_figure_of_its_own(recording):
+    given = plots.grid_of_axes(1, 1, size_in=(4, 3))[0, 0]
+    assert plots.readings_by_orientation(recording, ax=given) is given
+
+
+def test_figures_leave_no_global_state():
+    plots.posterior_widths({"a": np.array([5.0])})
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or pyplot.get_fignums() == []

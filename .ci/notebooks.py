@@ -29,12 +29,15 @@ def cells_of(script: Path) -> nbformat.NotebookNode:
 
 def execute(notebook: nbformat.NotebookNode) -> None:
     """Run every cell in a fresh kernel; an error in a cell is an error here."""
-    NotebookClient(notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(EXAMPLES)}}).execute()
+    NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(EXAMPLES)}}
+    ).execute()
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)  # times of day: they would change on every run
 
 
 def main() -> None:
+    """Make or check every notebook."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true", help="run the notebooks as they stand and write nothing")
     check = parser.parse_args().check

@@ -43,8 +43,8 @@ def test_bits_to_know_a_circle_to_four_millimetres():
 
 def test_the_radius_range_that_25_bits_would_mean():
     """Counting cells of 1 mm and of 4 mm over the field."""
-    assert 2**25 / (1048 * 520) == pytest.approx(61.6, abs=0.1)
-    assert 4 * 2**25 / (1048 * 520 / 16) == pytest.approx(3941, abs=1)
+    assert pytest.approx(61.6, abs=0.1) == 2**25 / (1048 * 520)
+    assert pytest.approx(3941, abs=1) == 4 * 2**25 / (1048 * 520 / 16)
 
 
 def test_a_b_c_are_half_the_inverse_covariance():

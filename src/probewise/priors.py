@@ -61,9 +61,11 @@ class Uniform:
             raise ParameterError("Uniform(low, high)", (self.low, self.high), "finite, low < high")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape: `u` in 0..1 -> low..high."""
         return self.low + (self.high - self.low) * u
 
     def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape; -inf outside the bounds."""
         inside = (value >= self.low) & (value <= self.high)
         return np.where(inside, -math.log(self.high - self.low), -np.inf)
 
@@ -83,9 +85,11 @@ class LogUniform:
             raise ParameterError("LogUniform(low, high)", (self.low, self.high), "0 < low < high, finite")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape: equal steps of `u` are equal ratios."""
         return np.asarray(self.low * (self.high / self.low) ** u)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape; -inf outside the bounds."""
         inside = (value >= self.low) & (value <= self.high)
         safe = np.where(inside, value, self.low)
         return np.where(inside, -np.log(safe) - math.log(math.log(self.high / self.low)), -np.inf)
@@ -106,9 +110,11 @@ class Normal:
             raise ParameterError("Normal(mean, sd)", (self.mean, self.sd), "finite, sd > 0")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape; 0 and 1 map to the infinities."""
         return self.mean + self.sd * np.asarray(ndtri(u))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape."""
         z = (value - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - math.log(self.sd * math.sqrt(2 * math.pi)))
 
@@ -124,13 +130,16 @@ class Product:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """The marginals' names, in order."""
         return tuple(self.marginals)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map each coordinate by its own marginal, (n_samples, n_params) both ways."""
         _require_columns(u, self.names)
         return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Sum of the marginals, (n_samples, n_params) -> (n_samples,)."""
         _require_columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
@@ -146,13 +155,16 @@ class Joint:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """The parts' names, in order."""
         return tuple(name for part in self.parts for name in part.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map each part's coordinates by that part, (n_samples, n_params) both ways."""
         _require_columns(u, self.names)
         return np.concatenate([p.from_unit_cube(c) for p, c in self._split(u)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Sum of the parts, (n_samples, n_params) -> (n_samples,)."""
         _require_columns(theta, self.names)
         total = np.zeros(len(theta))
         for part, columns in self._split(theta):
@@ -170,12 +182,15 @@ class Empty:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """None."""
         return ()
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Return the points: they have no coordinates."""
         return u
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Zero for each sample: the one hypothesis is certain."""
         return np.zeros(len(theta))
 
 

@@ -48,11 +48,15 @@ def test_the_calibration_says_what_it_rests_on(calibration: Calibration, recordi
     json.loads(sensor.to_json())
 
 
-def test_the_amplitude_of_a_single_gaussian_keeps_its_prior(calibration: Calibration) -> None:
-    """Only ratios of the a_n reach the data: a_1 stays uniform, its sd that of U(0, 1)."""
-    a = calibration.sensor.samples[:, 0]
-    assert abs(a.mean() - 0.5) < 0.25
-    assert abs(a.std() - 1 / math.sqrt(12)) < 0.12
+def test_the_light_of_a_single_gaussian_keeps_its_prior(calibration: Calibration) -> None:
+    """Only ratios of the a_n reach the data: the mass stays uniform from 0 to its unit."""
+    unit = calibration.chosen.prior.unit_mass_mm2
+    assert unit is not None
+    a, _, _, p, q, c = calibration.sensor.samples[:, :6].T
+    mass = a / (unit * np.sqrt(p * q - c * c))
+    assert 0 <= mass.min() <= mass.max() <= 1
+    assert abs(mass.mean() - 0.5) < 0.25
+    assert abs(mass.std() - 1 / math.sqrt(12)) < 0.12
 
 
 def test_predictions_of_the_recording_leave_noise_alone(calibration: Calibration, recording: Recording) -> None:

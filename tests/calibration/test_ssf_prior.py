@@ -22,9 +22,10 @@ def _edge_recording(scale_mm: float = 1.0) -> Recording:
     return _recording(plan, 10 + 50 / (1 + np.exp(-plan.x_mm / scale_mm / 4)))
 
 
-def test_the_density_integrates_to_one_over_a_single_gaussian() -> None:
+@pytest.mark.parametrize("unit_mass_mm2", [None, 1 / 3])
+def test_the_density_integrates_to_one_over_a_single_gaussian(unit_mass_mm2: float | None) -> None:
     """Importance sampling from a wider box, an independent route to the normalisation."""
-    prior = SSFPrior(1, Uniform(-2, 2), LogUniform(0.1, 3), Uniform(0, 1), Uniform(4, 5))
+    prior = SSFPrior(1, Uniform(-2, 2), LogUniform(0.1, 3), Uniform(0, 1), Uniform(4, 5), unit_mass_mm2=unit_mass_mm2)
     rng = np.random.default_rng(1)
     n = 400_000
     low = np.array([0, -2, -2, 0.1, 0.1, -3, 0, 4])
@@ -65,6 +66,7 @@ def test_the_prior_scales_with_the_recording() -> None:
     near, far = default_prior(_edge_recording(), 1), default_prior(_edge_recording(0.05), 1)
     u = np.random.default_rng(4).random((100, 8))
     theta, small = near.from_unit_cube(u), far.from_unit_cube(u)
+    np.testing.assert_allclose(small[:, 0], theta[:, 0])
     np.testing.assert_allclose(small[:, 1:3], 0.05 * theta[:, 1:3])
     np.testing.assert_allclose(small[:, 3:6], theta[:, 3:6] / 0.05**2)
     np.testing.assert_allclose(small[:, 6:], theta[:, 6:], rtol=1e-6)
@@ -122,3 +124,13 @@ def test_edges_in_one_direction_leave_the_axis_across_them_unseen() -> None:
     assert blind_axis_rad(whole.take(np.r_[0:101, 202:303])) == pytest.approx(math.pi / 2)
     assert blind_axis_rad(whole.take(np.r_[101:202, 303:404])) == pytest.approx(0.0, abs=1e-9)
     assert blind_axis_rad(whole.take(np.r_[0:101, 404:405])) is None
+
+
+def test_the_light_that_a_gaussian_holds_does_not_depend_on_its_width() -> None:
+    """Mass is a pi / sqrt(A B - C^2); uniform for the default prior, whatever the shape."""
+    prior = default_prior(_edge_recording(), 1)
+    theta = prior.from_unit_cube(np.random.default_rng(5).random((20_000, 8)))
+    mass = theta[:, 0] / np.sqrt(theta[:, 3] * theta[:, 4] - theta[:, 5] ** 2)
+    assert abs(np.corrcoef(mass, np.log(theta[:, 3]))[0, 1]) < 4 / math.sqrt(20_000)
+    assert np.quantile(mass, 0.25) / np.quantile(mass, 0.75) == pytest.approx(1 / 3, rel=0.05)
+    assert theta[:, 0].max() <= 1.0

@@ -5,8 +5,8 @@ import pytest
 
 from probewise.calibration import FittedSensor, write_sensor
 from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
-from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
 from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
 
 NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
 TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])

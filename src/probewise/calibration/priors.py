@@ -4,7 +4,10 @@ The paper assigns uniform priors and prints no bounds. Uniform belief in A and B
 of it on footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A lies within
 a factor 1.4 of the smallest sd), and the evidence for an order then weighs that accident. Here a
 width is a scale that is unknown by orders of magnitude, so A and B are log-uniform; every bound
-comes from what the scans can resolve and contain. `SSFPrior(precision=Uniform(...))` is the paper's.
+comes from what the scans can resolve and contain. Likewise a uniform amplitude a gives a narrow Gaussian
+next to no light, and an order one Gaussian too high hides it there at little cost; so here the light that
+a Gaussian holds (its mass, a pi / sqrt(A B - C^2)) is uniform. `SSFPrior(precision=Uniform(...),
+unit_mass_mm2=None)` is the paper's.
 """
 
 from __future__ import annotations
@@ -59,9 +62,12 @@ class SSFPrior:
     i_min, i_max
         Priors of the readings over albedo 0 and 1, in the reading's unit.
     amplitude
-        Prior of a_n; only ratios of the a_n reach the data.
+        Prior of each Gaussian's mass in units of pi `unit_mass_mm2`, so of a / (unit_mass_mm2 sqrt(A B - C^2));
+        only ratios reach the data.
+    unit_mass_mm2
+        That unit, mm^2; `None`: `amplitude` is the prior of a itself, as in the paper.
     max_correlation
-        Largest |C| / sqrt(A B), below 1.
+        Largest abs(C) / sqrt(A B), below 1.
     """
 
     n_gaussians: int
@@ -70,6 +76,7 @@ class SSFPrior:
     i_min: Marginal
     i_max: Marginal
     amplitude: Marginal = _AMPLITUDE
+    unit_mass_mm2: float | None = None
     max_correlation: float = _MAX_CORRELATION
     reasons: tuple[tuple[str, str], ...] = ()
 
@@ -78,6 +85,8 @@ class SSFPrior:
             raise ParameterError("n_gaussians", self.n_gaussians, "1 or more")
         if not 0 < self.max_correlation < 1:
             raise ParameterError("max_correlation", self.max_correlation, "above 0, below 1")
+        if self.unit_mass_mm2 is not None and not self.unit_mass_mm2 > 0:
+            raise ParameterError("unit_mass_mm2", self.unit_mass_mm2, "greater than 0, or None")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -97,6 +106,7 @@ class SSFPrior:
             g[:, 3] = self.precision.from_unit(x[:, 3])
             g[:, 4] = self.precision.from_unit(x[:, 4])
             g[:, 5] = self.max_correlation * (2 * x[:, 5] - 1) * np.sqrt(g[:, 3] * g[:, 4])
+            g[:, 0] *= self._amplitude_scale(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
         out[:, -2] = self.i_min.from_unit(u[:, -2])
         out[:, -1] = self.i_max.from_unit(u[:, -1])
         return out
@@ -107,19 +117,27 @@ class SSFPrior:
         total = self.i_min.log_prob(theta[:, -2]) + self.i_max.log_prob(theta[:, -1])
         for n in range(self.n_gaussians):
             a, u, v, p, q, c = theta[:, 6 * n : 6 * n + 6].T
-            total = total + self.amplitude.log_prob(a) + self.offset_mm.log_prob(u) + self.offset_mm.log_prob(v)
+            total = total + self.offset_mm.log_prob(u) + self.offset_mm.log_prob(v)
             total = total + self.precision.log_prob(p) + self.precision.log_prob(q)
             scale = np.sqrt(np.maximum(p, 0) * np.maximum(q, 0))
             inside = (scale > 0) & (np.abs(c) <= self.max_correlation * scale * (1 + 1e-12))
             safe = np.where(inside, scale, 1.0)
             total = total + np.where(inside, -np.log(2 * self.max_correlation * safe), -np.inf)
+            a_scale = self._amplitude_scale(np.where(inside, p * q - c * c, 1.0))
+            total = total + self.amplitude.log_prob(a / a_scale) - np.log(a_scale)
         return total
 
     def describe(self) -> tuple[PriorRow, ...]:
         """Return the table of priors for the report, one row a kind of parameter."""
         why = dict(self.reasons)
+        by_mass = self.unit_mass_mm2 is not None
         rows = (
-            ("a_n", "1", str(self.amplitude), "only ratios of the a_n reach the data"),
+            (
+                "a_n",
+                "1",
+                f"{self.amplitude}" + (f" times {self.unit_mass_mm2:.3g} sqrt(A_n B_n - C_n^2)" if by_mass else ""),
+                ("the light that each Gaussian holds is uniform; " if by_mass else "") + "only ratios reach the data",
+            ),
             ("u_n, v_n", "mm", str(self.offset_mm), why.get("offset_mm", "given")),
             ("A_n, B_n", "mm^-2", str(self.precision), why.get("precision", "given")),
             (
@@ -132,6 +150,12 @@ class SSFPrior:
             ("I_max", "reading", str(self.i_max), why.get("levels", "given")),
         )
         return tuple(PriorRow(*row) for row in rows)
+
+    def _amplitude_scale(self, determinant: FloatArray) -> FloatArray:
+        """Amplitude of a Gaussian of unit mass, for A B - C^2 of shape (n_samples,)."""
+        if self.unit_mass_mm2 is None:
+            return np.ones_like(determinant)
+        return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, np.finfo(float).tiny))
 
     def _require_columns(self, values: FloatArray) -> None:
         if values.ndim != 2 or values.shape[1] != len(self.names):
@@ -205,7 +229,7 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
     an edge contains the transition; conditional sds from half a step (nothing finer is resolved) to
     a quarter of the span (nothing wider is contained); each level within half the reading range of
     where the readings, scaled to albedo 0 and 1, place it. Directions in which the recording says
-    nothing, such as along a single edge, keep this prior.
+    nothing, such as along a single edge, keep this prior. The mass of each Gaussian is uniform.
 
     Raises
     ------
@@ -229,6 +253,7 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
         precision=LogUniform(1 / (2 * widest**2), 1 / (2 * finest**2)),
         i_min=Uniform(black - half, black + half),
         i_max=Uniform(white - half, white + half),
+        unit_mass_mm2=2 * finest**2,  # the narrowest Gaussian of full mass has a = 1
         reasons=(
             ("offset_mm", f"a quarter of the scans' span of {g.span_mm:g} mm either side of the mechanical origin"),
             (

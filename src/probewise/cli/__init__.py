@@ -82,6 +82,11 @@ def _one_line(error: Exception) -> str:
 
 
 def _one_line_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: object = None, line: object = None
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: object = None,
 ) -> None:
     sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")

@@ -22,6 +22,7 @@ __all__ = [
     "add_common",
     "add_out_directory",
     "add_quiet",
+    "check_live",
     "check_out_directory",
     "check_out_file",
     "positive_int",
@@ -126,6 +127,14 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
             raise ParameterError("--out", str(path), f"another file than the input {taken}")
     check_out_directory(path.parent)
     return path
+
+
+def check_live(n_live: int, n_params: int) -> int:
+    """Refuse, before any work, too few live points for so many parameters."""
+    least = max(2 * n_params, 10)
+    if n_live < least:
+        raise ParameterError("--live", n_live, f"{least} or more for {n_params} parameters")
+    return n_live
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import Never
 
 from tqdm import tqdm
 
@@ -15,7 +16,7 @@ __all__ = ["nested_progress"]
 @contextlib.contextmanager
 def nested_progress(*, quiet: bool) -> Iterator[Callable[[int, State], None]]:
     """Yield what `calibrate` calls after every round: a line for each number of Gaussians."""
-    bars: dict[int, tqdm[None]] = {}
+    bars: dict[int, tqdm[Never]] = {}
 
     def show(n_gaussians: int, state: State) -> None:
         if n_gaussians not in bars:

@@ -27,11 +27,21 @@ from probewise.scene import (
     Rectangle,
     RegularPolygon,
     Shape,
+    outlines,
 )
 from probewise.sensor import Chain, FixedLevels, NaiveSensor, footprint_of, mean_mixture
 from probewise.world import Oval, Spot, Surface, World
 
-__all__ = ["SHAPES", "experiment_for", "field_arm", "parse_field", "parse_truth", "shape_named", "surface_of", "world_like"]
+__all__ = [
+    "SHAPES",
+    "experiment_for",
+    "field_arm",
+    "parse_field",
+    "parse_truth",
+    "shape_named",
+    "surface_of",
+    "world_like",
+]
 
 SHAPES: Mapping[str, Callable[[Field], Shape]] = {
     "circle": lambda field: Circle(field),
@@ -101,7 +111,9 @@ def world_like(sensor: FittedSensor) -> World:
     return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=float(sensor.noise_sd.mean()))
 
 
-def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> tuple[str, FloatArray]:
+def parse_truth(
+    text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator
+) -> tuple[str, FloatArray]:
     """Read "[SHAPE:]V,V,...", the parameters of what lies there; without a text draw it from the prior.
 
     Returns
@@ -136,7 +148,8 @@ def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
             return Disc((center[0], center[1]), axes[0])
         return Oval((center[0], center[1]), (axes[0], axes[1]), float(region.angle_rad[0]))
     if isinstance(region, PolygonRegion):
-        return Polygon(tuple((float(x), float(y)) for x, y in region.vertices_mm[0]))
+        corners = outlines(region)[0][:-1]
+        return Polygon(tuple((float(x), float(y)) for x, y in corners))
     raise ParameterError("shape", name, "one whose outline is an ellipse or a polygon")
 
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, positive_int, say, staged
+from probewise.cli._common import (
+    Verb,
+    add_common,
+    add_out_directory,
+    check_live,
+    check_out_directory,
+    positive_int,
+    say,
+    staged,
+)
 
 __all__ = ["VERB"]
 
@@ -40,11 +49,12 @@ def run(arguments: argparse.Namespace) -> int:
     out = check_out_directory(arguments.out)
     recording = read_recording(arguments.recording)
     orders = tuple(sorted(set(arguments.orders)))
+    n_live = check_live(arguments.live, 6 * max(orders) + 2)
     with nested_progress(quiet=arguments.quiet) as progress:
         result = calibrate(
             recording,
             orders=orders,
-            n_live=arguments.live,
+            n_live=n_live,
             rng=np.random.default_rng(arguments.seed),
             progress=progress,
         )

@@ -6,7 +6,16 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, positive_int, say, staged
+from probewise.cli._common import (
+    Verb,
+    add_common,
+    add_out_directory,
+    check_live,
+    check_out_directory,
+    positive_int,
+    say,
+    staged,
+)
 from probewise.errors import FileError
 
 if TYPE_CHECKING:
@@ -75,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         model=arguments.model,
         n_live=arguments.live,
     )
+    check_live(arguments.live, len(experiment.names))
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
     arm = simulation.field_arm(
@@ -85,10 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
         taken=taken,
     )
     means = sensor.mean()
-    drawing = {
-        "levels": (means["I_min"], means["I_max"]),
-        "truth_mm": outlines(simulation.SHAPES[name](field).region(truth[None, :]))[0],
-    }
+    levels = (means["I_min"], means["I_max"])
+    truth_mm = outlines(simulation.SHAPES[name](field).region(truth[None, :]))[0]
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     folder = out / "frames"
     folder.mkdir(parents=True, exist_ok=True)
@@ -102,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
                 steps.append(step)
                 pose = step.reading.pose
                 readings.append((pose.x_mm, pose.y_mm, step.reading.value))
-                frames.append(report.frame(step, experiment, readings, **drawing))
+                frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
                 write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
                 bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
                 bar.update()

@@ -59,7 +59,7 @@ def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
         raw = np.linalg.norm(problem.whitener(columns)) / problem.sd
         projected = problem.project(columns)
         # What the fit absorbs to within a thousandth is not there to be compared.
-        if np.linalg.norm(projected) < 1e-3 * raw:
+        if np.linalg.norm(projected) <= 1e-3 * raw:
             return 0.0
         u, lengths, _ = np.linalg.svd(projected, full_matrices=False)
         bases.append(u[:, lengths > 1e-3 * lengths[0]])

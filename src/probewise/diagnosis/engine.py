@@ -51,6 +51,7 @@ __all__ = ["SensorPrior", "diagnose"]
 N_DRAWS = 999
 _LEAST_PROBABILITY = 1e-3
 _LEAST_READINGS = 24
+_ALARM = 0.01
 
 
 class SensorPrior(Protocol):
@@ -139,7 +140,8 @@ class _Diagnoser:
         p_value = global_p_value(problem, columns, families, draws)
         pairs = self._aliases(problem, null.found)
         verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs))
-        if few:
+        # Physics is named only where the test that counts every look has raised an alarm too.
+        if few or (verdict == "named" and p_value > _ALARM):
             verdict, combination = "cannot_tell", ()
         if constant:
             p_value = 1.0  # readings that never change carry no noise to measure a residual by

@@ -182,7 +182,7 @@ def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int
     Log Bayes factors, shape (n_blocks, n_draws).
     """
     scores = (blocks.u.T @ residuals) ** 2
-    total = np.sum(residuals**2, axis=0)
+    total = np.maximum(np.sum(residuals**2, axis=0), 1e-300)
     terms = np.empty((len(SCALES), len(blocks.starts), residuals.shape[1]))
     for k, scale in enumerate(SCALES):
         ratio = scale**2 * blocks.gain

@@ -152,8 +152,8 @@ def places(
         Windows less surprising than this are not reported.
     """
     out: list[Place] = []
-    norms = np.sqrt(np.sum(draws**2, axis=0) / problem.n_points)
-    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_points)
+    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_points)
+    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_points) or 1.0
     for covariate in covariates:
         columns, ends = windows(covariate, problem.n_points)
         if not ends:

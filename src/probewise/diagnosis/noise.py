@@ -118,7 +118,7 @@ def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) 
     -------
     Correlation of neighbours, excess kurtosis, and correlation of the squares with the level.
     """
-    r = residuals / np.sqrt(np.mean(residuals**2, axis=0))
+    r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
     neighbours = np.flatnonzero(steps == 1)
     lag_1 = (r[neighbours] * r[neighbours - 1]).mean(axis=0) if neighbours.size else np.zeros(r.shape[1])
     kurtosis = (r**4).mean(axis=0) - 3

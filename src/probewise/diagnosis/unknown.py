@@ -69,11 +69,15 @@ def _without(
     sd, p = problem.sd, found.slopes.shape[1]
     design = np.concatenate([found.slopes, columns], axis=1)
     center = np.concatenate([-found.z, np.zeros(columns.shape[1])])
-    # An amplitude's prior is that of a rms of a few noise sd: wide, and known to be needed by now.
-    precision = np.concatenate([np.ones(p), np.full(columns.shape[1], 1 / (sd * SCALES[5]) ** 2)])
-    normal = design[kept].T @ design[kept] / sd**2 + np.diag(precision)
-    covariance = np.linalg.inv(normal)
-    amount = covariance @ (design[kept].T @ found.residuals[kept] / sd**2 + precision * center)
+    # Amplitudes start from a wide prior, then take their own common size as its scale (empirical Bayes):
+    # a scan that was never seen is as uncertain as the seen ones differ.
+    size = sd * SCALES[5]
+    for _ in range(3):
+        precision = np.concatenate([np.ones(p), np.full(columns.shape[1], size**-2)])
+        covariance = np.linalg.inv(design[kept].T @ design[kept] / sd**2 + np.diag(precision))
+        amount = covariance @ (design[kept].T @ found.residuals[kept] / sd**2 + precision * center)
+        if columns.shape[1] > 1:
+            size = max(float(np.sqrt(np.mean(amount[p:] ** 2))), 1e-3 * sd)
     return (
         found.residuals[asked] - design[asked] @ amount,
         np.asarray(np.einsum("ij,jk,ik->i", design[asked], covariance, design[asked])),

@@ -24,7 +24,7 @@ _N_SCALES = 9
 class HeavyTailed:
     """Mix normal distributions about zero whose sd run from 0.05 to 25 times a typical size.
 
-    The weights are equal, so the density falls about as 1/|x| over three decades and is
+    The weights are equal, so the density falls about as 1/abs(x) over three decades and is
     proper at both ends. With `positive` only the upper half is kept.
     """
 

@@ -202,12 +202,12 @@ class SliceMove:
             low[active] = np.where(t > 0, a, t)
             # A bracket that has shrunk to nothing (a point alone on its line) ends the step where it began.
             done = active[ok | hop | (high[active] - low[active] < 1e-13)]
-            if done.size:
-                step[done] += 1
-                ended = step[done] >= n_steps
-                if ended.any():
-                    active = active[step[active] < n_steps]
-                begin(done[~ended])
+            step[done] += 1
+            more = done[step[done] < n_steps]
+            if more.size < done.size:
+                active = active[step[active] < n_steps]
+            if more.size:
+                begin(more)
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def adapted(self, tally: Tally) -> SliceMove:

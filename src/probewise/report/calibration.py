@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import PurePath
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from probewise.report.plots import (
     spatial_sensitivity,
     ssf_by_order,
 )
-from probewise.report.words import count, number, signed
+from probewise.report.words import count, number, signed, unit_name
 
 __all__ = ["answer", "evidence_table", "figures", "parameter_table", "sections", "write_page"]
 
@@ -35,7 +36,7 @@ def answer(sensor: FittedSensor) -> str:
     return (
         f"{said}: centred at ({signed(center_x, 1)}, {signed(center_y, 1)}) mm on the sensor, "
         f"{number(widths[0], 1)} by {number(widths[1], 1)} mm (sd), "
-        f"noise {number(float(sensor.noise_sd.mean()), 2)} {sensor.instrumentation.unit} units a reading."
+        f"noise {number(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} a reading."
     )
 
 
@@ -98,7 +99,7 @@ def sections(
                 ),
                 paragraph(
                     f"Chi-square a reading is {number(float(np.mean(z**2)), 3)} over {count(int(ok.sum()), 'reading')} "
-                    "(near 1 where the model and its noise are right; the same readings were fitted, so a little below)."
+                    "(near 1 where the model and its noise are right; they were fitted, so a little below)."
                 ),
                 figure(drawn["residuals.png"], "Standardised residuals in the order of taking."),
             ),
@@ -118,7 +119,7 @@ def sections(
             (
                 definition_list(
                     (
-                        ("recording", sensor.source or "unnamed"),
+                        ("recording", PurePath(sensor.source).name or "unnamed"),
                         ("its fingerprint", sensor.fingerprint),
                         ("seed", str(seed)),
                         ("version", f"probewise {sensor.version}"),
@@ -165,7 +166,7 @@ def write_page(
 ) -> str:
     """Write the whole page."""
     return page(
-        f"Calibration of {calibration.sensor.source or 'a sensor'}",
+        f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
         answer=answer(calibration.sensor),
         key_figure=figure(drawn["ssf.png"], "Spatial sensitivity function: the weight of each point below the sensor."),
         sections=sections(calibration.sensor, recording, prediction, drawn, seed=seed),

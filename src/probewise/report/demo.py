@@ -32,7 +32,17 @@ __all__ = [
 
 FIRST = 3  # the paper shows the first three measurements side by side
 LATER = 7  # and the map after seven
-HEADER = ("sensor model", "readings", "until the first white", "bits", "bits a reading", "the paper's count", "largest error", "errors")
+AFTER_WHITE = 4  # the telling moment: the circle is met, and not yet known
+HEADER = (
+    "sensor model",
+    "readings",
+    "until the first white",
+    "bits",
+    "bits a reading",
+    "the paper's count",
+    "largest error",
+    "errors",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +82,9 @@ def answer(searches: Sequence[Search]) -> str:
     naive, ssf = searches
     n_naive, n_ssf = len(naive.run.steps), len(ssf.run.steps)
     return (
-        f"Knowing what its sensor sees, the robot found the hidden circle with {n_ssf} readings "
-        f"instead of {n_naive}, to {number(ssf.largest_error_mm, 1)} mm."
+        f"Once it had met the circle, the robot that knows what its sensor sees needed {n_ssf - ssf.first_white} more "
+        f"readings, the naive one {n_naive - naive.first_white}; in all {n_ssf} and {n_naive}, with errors up to "
+        f"{number(ssf.largest_error_mm, 1)} and {number(naive.largest_error_mm, 1)} mm."
     )
 
 
@@ -113,6 +124,7 @@ def figures(
     """Draw all figures but the diagnosis's: PNG by file name."""
     drawn = calibration_report.figures(calibration, recording, prediction)
     drawn["first_three.png"] = png(_views(searches, [(k, k) for k in range(1, FIRST + 1)]))
+    drawn["found.png"] = png(_views(searches, [tuple(s.first_white + AFTER_WHITE for s in searches)]))
     drawn["after_seven.png"] = png(_views(searches, [tuple(min(LATER, len(s.run.steps)) for s in searches)]))
     names = [f"{s.model} model" for s in searches]
     drawn["precision.png"] = png(
@@ -176,6 +188,7 @@ def write_page(
                     "cut the field into cells of equal entropy, at most one bit; with the SSF model their edges "
                     "are worth most.",
                 ),
+                figure(drawn["after_seven.png"], "The same after seven measurements."),
             ),
         ),
     ]
@@ -197,14 +210,14 @@ def write_page(
         ),
     )
     caption = (
-        "The robot's view after seven readings, naive model left, SSF model right: in copper where a reading would tell "
-        "most, blue the 50 circles drawn from what is believed, squares the readings by their brightness, green the "
-        "place chosen next, dashed white the hidden circle; grey is out of the arm's reach."
+        "The robot's view soon after it met the circle, naive model left, SSF model right: in copper where a "
+        "reading would tell most, blue the 50 circles drawn from what is believed, squares the readings by "
+        "their brightness, green the place chosen next, dashed white the hidden circle; grey is out of the arm's reach."
     )
     return page(
         "Modeling a sensor to improve its efficacy",
         answer=answer(searches),
-        key_figure=figure(drawn["after_seven.png"], caption),
+        key_figure=figure(drawn["found.png"], caption),
         sections=[*robot, *diagnosis, *sensor, closing],
     )
 

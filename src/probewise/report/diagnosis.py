@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from probewise.diagnosis import Diagnosis, Place
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import hypothesis_probabilities, png, residuals_against, witness
-from probewise.report.words import count, number, probability
+from probewise.report.words import count, number, probability, unit_name
 
 __all__ = ["answer", "figures", "sections", "write_page"]
 
@@ -56,7 +56,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
                 diagnosis.predicted_before,
                 diagnosis.residuals_before,
                 diagnosis.residuals_after,
-                label=f"predicted reading ({unit} units)",
+                label=f"predicted reading ({unit_name(unit)})",
                 unit=unit,
             )
         ),
@@ -85,8 +85,8 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
             (
                 figure(drawn["hypotheses.png"], "Probability of each hypothesis; they sum to one."),
                 paragraph(
-                    f"The smallest set that holds 95 %: {', '.join(diagnosis.credible)}. Probability of data like these "
-                    f"if nothing were missing from the mean: p = {diagnosis.p_value:.2g}."
+                    f"The smallest set that holds 95 %: {', '.join(diagnosis.credible)}. Probability of data like "
+                    f"these if nothing were missing from the mean: p = {diagnosis.p_value:.2g}."
                 ),
                 *_effects(diagnosis),
             ),
@@ -104,11 +104,13 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
                         ("log evidence", f"{number(gain.log_evidence, 1)} nats"),
                         (
                             "readings kept back",
-                            f"{number(gain.heldout_log_density_per_reading, 4)} ± {number(gain.heldout_sd, 4)} nats each",
+                            f"{number(gain.heldout_log_density_per_reading, 4)} ± "
+                            f"{number(gain.heldout_sd, 4)} nats each",
                         ),
                         (
                             "rms of the residuals",
-                            f"{number(gain.rms_before, 3)} before, {number(gain.rms_after, 3)} after ({unit} units)",
+                            f"{number(gain.rms_before, 3)} before, {number(gain.rms_after, 3)} after "
+                            f"({unit_name(unit)})",
                         ),
                         ("something still missing", f"p = {gain.p_value_after:.2g}"),
                     )
@@ -193,7 +195,11 @@ def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         table(
             ("alike under this plan", "cosine", "what would settle it"),
             (
-                (" and ".join(a.effects).replace("_", " "), number(a.cosine, 3), f"{a.settle_by} ({a.readings} readings)")
+                (
+                    " and ".join(a.effects).replace("_", " "),
+                    number(a.cosine, 3),
+                    f"{a.settle_by} ({a.readings} readings)",
+                )
                 for a in diagnosis.aliases
             ),
         ),
@@ -206,7 +212,8 @@ def _next(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         return (paragraph("No further reading is needed to decide."),)
     return (
         paragraph(
-            f"{plan.description.rstrip('.')}: {count(len(plan.plan), 'reading')}, about {number(plan.minutes, 0)} minutes, "
+            f"{plan.description.rstrip('.')}: {count(len(plan.plan), 'reading')}, "
+            f"about {number(plan.minutes, 0)} minutes, "
             f"expected to tell {number(plan.expected_log_bayes_factor, 1)} nats between the leading hypotheses. "
             "The plan is in next_plan.csv."
         ),

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.experiment import Experiment, Exploration, Step
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import information_gained, playing_field, png, posterior_widths
-from probewise.report.words import count, number
+from probewise.report.words import count, number, signed
 from probewise.scene import AnyOf, outlines
 
 __all__ = ["answer", "errors_text", "frame", "steps_table", "view", "write_page"]
@@ -76,7 +76,7 @@ def frame(
 def errors_text(step: Step, truth: Mapping[str, float]) -> str:
     """Say how far from the truth the estimates are."""
     return ", ".join(
-        f"{_plain(name)} {number(float(mean) - truth[name], 1)} ± {number(float(sd), 1)}"
+        f"{_plain(name)} {signed(float(mean) - truth[name], 1)} ± {number(float(sd), 1)}"
         for name, mean, sd in zip(step.names, step.mean, step.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )

@@ -97,7 +97,7 @@ def page(title: str, *, answer: str, key_figure: Markup, sections: Sequence[Sect
 _STYLE = """
 :root { color-scheme: light; --ink: #1b1b1b; --soft: #5a5a5a; --line: #d8d8d8; --paper: #ffffff; --accent: #0072b2; }
 * { box-sizing: border-box; }
-body { margin: 0; background: var(--paper); color: var(--ink); font: 16px/1.55 system-ui, "Segoe UI", Roboto, sans-serif; }
+body { margin: 0; background: var(--paper); color: var(--ink); font: 16px/1.55 system-ui, Roboto, sans-serif; }
 main { max-width: 60rem; margin: 0 auto; padding: 1rem 1.1rem 4rem; }
 h1 { font-size: 1.05rem; font-weight: 600; color: var(--soft); margin: .3rem 0 0; }
 h2 { font-size: 1.25rem; margin: 2.4rem 0 .5rem; border-top: 1px solid var(--line); padding-top: 1.1rem; }
@@ -114,6 +114,8 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; f
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
-@media (max-width: 34rem) { p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; } }
+@media (max-width: 34rem) {
+  p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
+}
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }
 """

@@ -44,22 +44,24 @@ def _(value: SSFField) -> str:
 
 @render_html.register
 def _(value: Recording) -> str:
-    said = f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
+    said = (
+        f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
+    )
     return _card(figure(png(readings_by_orientation(value), dpi=DPI), said))
 
 
 @render_html.register
 def _(value: FittedSensor) -> str:
     picture = figure(png(spatial_sensitivity(value.field), dpi=DPI), "Mean SSF field")
-    return _card(
-        paragraph(calibration_report.answer(value)), picture, calibration_report.parameter_table(value)
-    )
+    return _card(paragraph(calibration_report.answer(value)), picture, calibration_report.parameter_table(value))
 
 
 @render_html.register
 def _(value: Calibration) -> str:
     drawn = ssf_by_order(
-        value.fields, {o.n_gaussians: o.log_z for o in value.orders}, {o.n_gaussians: o.log_z_error for o in value.orders}
+        value.fields,
+        {o.n_gaussians: o.log_z for o in value.orders},
+        {o.n_gaussians: o.log_z_error for o in value.orders},
     )
     return _card(
         paragraph(calibration_report.answer(value.sensor)),

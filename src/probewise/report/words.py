@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["count", "number", "probability", "signed"]
+__all__ = ["count", "number", "probability", "signed", "unit_name"]
 
 
 def number(value: float, digits: int) -> str:
@@ -20,6 +20,11 @@ def signed(value: float, digits: int) -> str:
 def count(n: int, noun: str) -> str:
     """Write a count with its noun, plural where it must be."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def unit_name(unit: str) -> str:
+    """Name a unit behind a number: the LEGO brick's are "LEGO units", every other stands for itself."""
+    return "LEGO units" if unit == "LEGO" else unit
 
 
 def probability(p: float) -> str:

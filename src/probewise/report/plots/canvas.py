@@ -6,7 +6,7 @@ Figures are made without pyplot: no global state, no window, nothing to close.
 from __future__ import annotations
 
 import io
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
 __all__ += ["AxesGrid", "axes_or_new", "grid_of_axes", "png", "tidy"]
 
-AxesGrid: TypeAlias = NDArray[np.object_]
+AxesGrid: TypeAlias = NDArray[Any]
 
 # Okabe and Ito's palette: told apart with any common colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
@@ -47,11 +47,13 @@ def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], *
 
 def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110) -> bytes:
     """Render the figure that holds a drawing."""
-    if isinstance(drawing, np.ndarray):
-        drawing = drawing.flat[0]
-    sheet = drawing if isinstance(drawing, Figure) else drawing.figure.figure  # type: ignore[union-attr]
+    if isinstance(drawing, Figure):
+        sheet = drawing
+    else:
+        ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
+        sheet = cast(Figure, ax.figure)  # none of our figures has subfigures
     buffer = io.BytesIO()
-    sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight")  # type: ignore[union-attr]
+    sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight")
     return buffer.getvalue()
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLUE, AxesGrid, grid_of_axes
 

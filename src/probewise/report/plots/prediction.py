@@ -9,6 +9,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Recording
 from probewise.report.plots.canvas import BLACK, BLUE, GREY, VERMILLION, AxesGrid, axes_or_new, grid_of_axes, tidy
 from probewise.report.plots.readings import Track, along_label, tracks
+from probewise.report.words import unit_name
 
 __all__ = ["calibration_check", "predicted_against_recorded", "residuals_against"]
 
@@ -16,7 +17,7 @@ MAX_PANELS = 8
 
 
 def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: FloatArray) -> AxesGrid:
-    """Draw recorded (red) and predicted (black, with its 95 % band) readings, a panel each scan (paper, last MoG figure).
+    """Draw recorded (red) and predicted (black, with its 95 % band) readings, a panel each scan (paper, figure 7).
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: Float
     for ax in list(axes.flat)[n_panels:]:
         ax.set_visible(False)
     for ax in axes[:, 0]:
-        ax.set_ylabel(f"reading ({unit} units)")
+        ax.set_ylabel(f"reading ({unit_name(unit)})")
     for k in range(max(n_panels - n_columns, 0), len(shown)):
         axes.flat[k].set_xlabel(along_label(shown).replace(", white side positive", ""))
     axes.flat[0].legend(frameon=False, fontsize="small")
@@ -50,7 +51,7 @@ def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: Float
 
 
 def _spread(n: int, most: int) -> IntArray:
-    """Indices of at most `most` out of n, evenly spread."""
+    """Pick at most `most` indices out of n, evenly spread."""
     return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).round().astype(np.int64))[:n]
 
 
@@ -125,11 +126,13 @@ def residuals_against(
         ax.plot(center, average, color=colour, linewidth=2.0, label=name)
     ax.axhline(0, color=BLACK, linewidth=0.7)
     ax.legend(frameon=False, fontsize="small")
-    return tidy(ax, x=label, y=f"recorded − predicted ({unit} units)")
+    return tidy(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")
 
 
 def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means of groups of about one twentieth of the points, neighbours in x."""
+    if x.size == 0:
+        return x, y
     order = np.argsort(x, kind="stable")
     groups = np.array_split(order, max(1, min(20, len(x) // 4)))
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

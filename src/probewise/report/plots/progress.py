@@ -14,9 +14,7 @@ from probewise.report.plots.canvas import BLACK, CYCLE, axes_or_new, tidy
 __all__ = ["information_gained", "posterior_widths"]
 
 
-def posterior_widths(
-    widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None
-) -> Axes:
+def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
     """Draw the widest parameter's posterior sd after each reading, and the precision asked for.
 
     Parameters

@@ -12,6 +12,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Plan, Recording
 from probewise.recordings.patterns import HalfPlane
 from probewise.report.plots.canvas import CYCLE, axes_or_new, tidy
+from probewise.report.words import unit_name
 
 __all__ = ["Track", "readings_by_orientation", "tracks"]
 
@@ -114,4 +115,4 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
         )
     if 0 < len(found) <= MAX_NAMED:
         ax.legend(title="orientation", frameon=False, fontsize="small", title_fontsize="small")
-    return tidy(ax, x=along_label(found), y=f"reading ({recording.plan.instrumentation.unit} units)")
+    return tidy(ax, x=along_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")

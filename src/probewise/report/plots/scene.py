@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, COPPER, SKY, axes_or_new
@@ -105,9 +106,9 @@ def _add_lego_scale(ax: Axes) -> None:
     lego.tick_params(labelsize="small")
 
 
-def _to_lego(mm: FloatArray) -> FloatArray:
-    return np.asarray(mm) / LEGO_UNIT_MM
+def _to_lego(mm: ArrayLike) -> FloatArray:
+    return np.asarray(mm, dtype=np.float64) / LEGO_UNIT_MM
 
 
-def _from_lego(units: FloatArray) -> FloatArray:
-    return np.asarray(units) * LEGO_UNIT_MM
+def _from_lego(units: ArrayLike) -> FloatArray:
+    return np.asarray(units, dtype=np.float64) * LEGO_UNIT_MM

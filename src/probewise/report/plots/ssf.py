@@ -35,7 +35,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     peak = float(values.max())
     ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
     ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
-    reach = _reach(values, x, y)
+    reach = _reach(values, x, y, field.pixel_mm)
     ax.set_xlim(-reach, reach)
     ax.set_ylim(-reach, reach)
     ax.set_aspect("equal")
@@ -43,11 +43,12 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     return tidy(ax, x="x' (mm)", y="y' (mm)", title=title)
 
 
-def _reach(values: FloatArray, x: FloatArray, y: FloatArray) -> float:
-    """Half width of a square about the origin that holds all that matters, in whole 5 mm."""
+def _reach(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
+    """Half width of a square about the origin that holds all that matters, rounded up to a half of its decade."""
     matters = values > 0.01 * values.max()
-    far = max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max())
-    return float(5 * np.ceil(1.1 * far / 5))
+    far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
+    unit = 0.5 * 10 ** np.floor(np.log10(far))
+    return float(unit * np.ceil(far / unit))
 
 
 def ssf_by_order(

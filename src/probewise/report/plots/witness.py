@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, BLUE, GREY, VERMILLION, axes_or_new, tidy
+from probewise.report.words import unit_name
 
 __all__ = ["witness"]
 
@@ -42,4 +43,4 @@ def witness(
     ax.axhline(0, color=BLACK, linewidth=0.7)
     if np.size(at):
         ax.legend(frameon=False, fontsize="small")
-    return tidy(ax, x=label, y=f"recorded − predicted ({unit} units)")
+    return tidy(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import html
 import importlib
+from typing import Protocol
 
 __all__ = ["ShowsItself", "render_html"]
 
@@ -19,11 +20,28 @@ def render_html(value: object) -> str:
     return f"<pre>{html.escape(repr(value))}</pre>"
 
 
+class Printer(Protocol):
+    """What IPython hands over to be written on."""
+
+    def text(self, text: str, /) -> None:
+        """Write text."""
+        ...
+
+
 class ShowsItself:
-    """Give a value the `_repr_html_` that notebooks look for."""
+    """Give a value the `_repr_html_` that notebooks look for, and a text for terminals that is no wall of numbers."""
 
     __slots__ = ()
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # IPython prefers a class's own __repr__, which dataclass makes, to a base's _repr_pretty_.
+        cls._repr_pretty_ = ShowsItself._repr_pretty_  # type: ignore[method-assign]
 
     def _repr_html_(self) -> str:
         importlib.import_module("probewise.report.notebook")
         return render_html(self)
+
+    def _repr_pretty_(self, printer: Printer, cycle: bool) -> None:
+        summary = getattr(self, "summary", None)
+        printer.text(summary() if callable(summary) else f"<{type(self).__name__}>")

@@ -1,5 +1,7 @@
 """Results show themselves in a notebook, with a picture."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -43,6 +45,13 @@ def test_a_calibration_its_sensor_and_its_nested_run_show_themselves():
 )
 def test_a_value_shows_a_picture(make):
     assert "data:image/png;base64" in make()._repr_html_()
+
+
+def test_in_a_terminal_a_result_shows_its_summary():
+    written = []
+    result = run(Bell(), rng=np.random.default_rng(0), n_live=50)
+    result._repr_pretty_(SimpleNamespace(text=written.append), False)
+    assert written == [result.summary()]
 
 
 def test_a_value_without_a_renderer_shows_its_escaped_repr():

@@ -6,13 +6,19 @@ its own; calibration sees the readings alone.
 
 from __future__ import annotations
 
+import argparse
+import datetime
 import json
 import math
+import multiprocessing
 import os
 from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from probewise._arrays import FloatArray
 from probewise._version import __version__
@@ -88,6 +94,7 @@ def coverage(
     *,
     rng: np.random.Generator,
     n_live: int = 300,
+    executor: Executor | None = None,
     progress: Callable[[Coverage], None] | None = None,
 ) -> Coverage:
     """Calibrate one Gaussian on many simulated recordings and count the intervals that hold the truth.
@@ -97,32 +104,83 @@ def coverage(
     n_recordings
         How many.
     rng
-        Source of randomness for truths, noise and fits.
+        Source of randomness for truths, noise and fits: a stream for each recording.
     n_live
         Live points of each fit.
+    executor
+        Where the fits run; by default here, one after another. The counts do not depend on it.
     progress
         Called after each recording with the counts so far.
     """
     if n_recordings < 1:
         raise ParameterError("n_recordings", n_recordings, "1 or more")
     held: dict[str, int] = {}
-    for k, stream in enumerate(rng.spawn(n_recordings)):
-        truth = draw_truth(rng=stream)
-        recording = simulate_truth(truth, rng=stream)
-        samples = calibrate(recording, orders=(1,), n_live=n_live, rng=stream).sensor.samples
-        found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
-        for name, value in _quantities(truth).items():
-            low, high = _interval(found[name])
-            held[name] = held.get(name, 0) + int(low <= value <= high)
+    each = map if executor is None else executor.map
+    for k, one in enumerate(each(_held, rng.spawn(n_recordings), [n_live] * n_recordings)):
+        held = {name: held.get(name, 0) + int(inside) for name, inside in one.items()}
         if progress is not None:
-            progress(Coverage(k + 1, dict(held), n_live))
+            progress(Coverage(k + 1, held, n_live))
     return Coverage(n_recordings, held, n_live)
+
+
+def _held(rng: np.random.Generator, n_live: int) -> dict[str, bool]:
+    """Simulate and calibrate one recording; tell for each quantity whether its interval holds the truth."""
+    truth = draw_truth(rng=rng)
+    samples = calibrate(simulate_truth(truth, rng=rng), orders=(1,), n_live=n_live, rng=rng).sensor.samples
+    found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
+    held = {}
+    for name, value in _quantities(truth).items():
+        low, high = _interval(found[name])
+        held[name] = bool(low <= value <= high)
+    return held
 
 
 def order_lead(truth: Truth, *, rng: np.random.Generator, n_live: int = 300) -> tuple[float, float]:
     """Simulate a single-Gaussian recording; return log Z of one Gaussian less that of two, and its error."""
     one, two = calibrate(simulate_truth(truth, rng=rng), orders=(1, 2), n_live=n_live, rng=rng).orders
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
+
+
+def _drawn_lead(rng: np.random.Generator, n_live: int) -> tuple[float, float]:
+    return order_lead(draw_truth(rng=rng), rng=rng, n_live=n_live)
+
+
+def main() -> None:
+    """Run both campaigns, `python -m probewise.calibration.coverage --help`, and write their JSON files."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder of the two JSON files")
+    parser.add_argument("--recordings", type=int, default=100, help="for the coverage of N = 1 (default 100)")
+    parser.add_argument("--orders", type=int, default=20, help="for the order, N = 1 against 2 (default 20)")
+    parser.add_argument("--live", type=int, default=300, help="live points (default 300)")
+    parser.add_argument("--seed", type=int, default=20, help="seed (default 20)")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    asked = parser.parse_args()
+    about = {
+        "command": "python -m probewise.calibration.coverage "
+        f"--recordings {asked.recordings} --orders {asked.orders} --live {asked.live} --seed {asked.seed}",
+        "seed": asked.seed,
+        "date": datetime.date.today().isoformat(),
+    }
+    with ProcessPoolExecutor(asked.workers, mp_context=multiprocessing.get_context("spawn")) as executor:
+        streams = np.random.default_rng([asked.seed, 2]).spawn(asked.orders)
+        found = executor.map(_drawn_lead, streams, [asked.live] * asked.orders)
+        leads = [(round(d, 3), round(e, 3)) for d, e in tqdm(found, total=asked.orders, desc="order")]
+        with tqdm(total=asked.recordings, desc="coverage") as bar:
+
+            def count(_: Coverage) -> None:
+                bar.update()
+
+            counts = coverage(
+                asked.recordings,
+                rng=np.random.default_rng([asked.seed, 1]),
+                n_live=asked.live,
+                executor=executor,
+                progress=count,
+            )
+    counts.save(asked.out / "calibration_coverage.json", **about)
+    wins = sum(d > 0 for d, _ in leads)
+    rows = {"n_live": asked.live, "version": __version__, "prefer_one": wins, "of": asked.orders, "leads_nats": leads}
+    write_text_atomically(asked.out / "calibration_order.json", json.dumps({**about, **rows}, indent=1) + "\n")
 
 
 def wilson_interval(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
@@ -148,3 +206,7 @@ def _quantities(truth: Truth) -> dict[str, float]:
 def _interval(samples: FloatArray) -> tuple[float, float]:
     low, high = np.quantile(samples, [0.5 - _MASS / 2, 0.5 + _MASS / 2])
     return float(low), float(high)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 
 import numpy as np
 
@@ -247,7 +248,7 @@ def _fitted(
             residuals, plan.scan[usable], plan.scan_names, sd_floor=floor, sd_ceiling=ceiling, rng=rng
         ),
         fingerprint=fingerprint(recording),
-        source=recording.source,
+        source=PurePath(recording.source).name,
         priors=prior.describe(),
         notes=(*notes, *result.warnings),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import PurePath
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class ModelSamples:
             effects=self.effects,
             scan_noise=scan_noise,
             fingerprint=fingerprint(recording),
-            source=recording.source,
+            source=PurePath(recording.source).name,
         )
 
 

@@ -16,7 +16,7 @@ from probewise.report import plots
 
 seed = 1
 print(f"seed {seed}")
-recording = read_recording(shipped("drifting"))
+recording = read_recording(shipped("concealed"))
 diagnosis = diagnose(recording, rng=np.random.default_rng(seed))
 print(diagnosis.summary())
 

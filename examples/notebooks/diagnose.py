@@ -8,7 +8,7 @@ from probewise.recordings import read_recording, shipped
 
 seed = 1
 print(f"seed {seed}")
-recording = read_recording(shipped("drifting"))
+recording = read_recording(shipped("concealed"))
 diagnosis = diagnose(recording, rng=np.random.default_rng(seed))
 diagnosis
 

@@ -109,7 +109,7 @@ def test_a_diagnosis_keeps_to_its_schema_and_names_its_figures(tmp_path):
     from probewise.recordings import shipped
 
     out = tmp_path / "out"
-    assert run("diagnose", shipped("drifting"), "--out", out, "--quiet") == 0
+    assert run("diagnose", shipped("concealed"), "--out", out, "--quiet") == 0
     document = json.loads((out / "diagnosis.json").read_text())
     jsonschema.validate(document, diagnosis_schema())
     for place in document["where"]:
@@ -118,7 +118,7 @@ def test_a_diagnosis_keeps_to_its_schema_and_names_its_figures(tmp_path):
         assert len(read_plan(out / "next_plan.csv")) == document["next_measurement"]["readings"]
     for name in ("sensor.json", "calibrated.json"):
         assert len(read_sensor(out / name).samples) >= 500
-    assert run("predict", out / "sensor.json", shipped("drifting"), "--out", out / "p.csv", "--quiet") == 0
+    assert run("predict", out / "sensor.json", shipped("concealed"), "--out", out / "p.csv", "--quiet") == 0
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def test_jitter_keeps_the_order_and_the_pace():
         jittered(plan, rng=np.random.default_rng(1), share=2)
 
 
-@pytest.mark.parametrize(("name", "n_points"), [("paper", 408), ("drifting", 961)])
+@pytest.mark.parametrize(("name", "n_points"), [("paper", 408), ("concealed", 961)])
 def test_the_shipped_recordings_can_be_read(name, n_points):
     recording = read_recording(shipped(name))
     assert len(recording) == n_points
@@ -60,5 +60,5 @@ def test_the_shipped_recordings_can_be_read(name, n_points):
 
 
 def test_a_recording_that_does_not_ship_is_refused():
-    with pytest.raises(ParameterError, match="'paper' or 'drifting'"):
+    with pytest.raises(ParameterError, match="'paper' or 'concealed'"):
         shipped("other")

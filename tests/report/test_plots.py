@@ -44,7 +44,7 @@ def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording
 
 
 def test_many_scans_are_thinned_to_eight_panels():
-    plan = read_recording(shipped("drifting")).plan
+    plan = read_recording(shipped("concealed")).plan
     flat = Recording(plan, np.full(len(plan), 30.0))
     axes = plots.predicted_against_recorded(flat, flat.readings, np.ones(len(flat)))
     assert sum(ax.get_visible() for ax in axes.flat) <= 8

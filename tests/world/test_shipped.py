@@ -16,14 +16,14 @@ def made_again(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", ["paper", "drifting"])
+@pytest.mark.parametrize("name", ["paper", "concealed"])
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
 def test_the_shipped_files_are_made_again_byte_for_byte(made_again, name, suffix):
     assert (made_again / f"{name}{suffix}").read_bytes() == shipped(name).with_suffix(suffix).read_bytes()
 
 
 def test_the_files_do_not_tell_what_they_conceal():
-    text = shipped("drifting").with_suffix(".json").read_text()
+    text = shipped("concealed").with_suffix(".json").read_text()
     assert not any(effect.name in text for effect in CANDIDATES)
 
 
@@ -34,7 +34,7 @@ def test_a_recording_that_does_not_ship_cannot_be_made():
 
 def test_the_paper_recording_conceals_nothing_and_the_other_one_thing():
     assert truth("paper").concealed == ()
-    assert len(truth("drifting").concealed) == 1
+    assert len(truth("concealed").concealed) == 1
 
 
 PLAN = two_way_plan()

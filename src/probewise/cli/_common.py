@@ -30,7 +30,7 @@ __all__ = [
     "staged",
 ]
 
-DEFAULT_SEED = 5  # printed with every run
+DEFAULT_SEED = 2013  # the year of the paper; printed with every run
 
 
 @dataclass(frozen=True)

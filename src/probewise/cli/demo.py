@@ -10,11 +10,12 @@ from probewise.cli._common import Verb, add_common, add_out_directory, check_out
 if TYPE_CHECKING:
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis
-    from probewise.experiment import Exploration
+    from probewise.experiment import Exploration, Model
+    from probewise.scene import Circle
 
 __all__ = ["VERB"]
 
-MODELS = ("naive", "ssf")
+MODELS: tuple[Model, ...] = ("naive", "ssf")
 N_LIVE = 100  # of the calibration; --full takes the paper's 300
 N_LIVE_ROBOT = 100
 MAX_READINGS = 80
@@ -37,13 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from probewise.calibration import predict, write_sensor
-    from probewise.cli import _simulation as simulation
     from probewise.cli import diagnose as diagnose_verb
     from probewise.cli._workers import two_workers
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
-    from probewise.scene import Field, outlines
+    from probewise.scene import outlines
     from probewise.world.shipped import truth as world_behind
 
     started = time.monotonic()
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     sensor = calibration.sensor
     prediction = predict(sensor, recording.plan, recording.readings)
     means = sensor.mean()
-    circle = simulation.SHAPES["circle"](Field())
+    circle = hypothesis()
     searches = [
         report.Search(
             {"naive": "naive", "ssf": "SSF"}[model],
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     drawn = report.figures(calibration, recording, prediction, searches)
     diagnosis_drawn = diagnosis_report.figures(diagnosis)
-    concealed = ", ".join(effect.name for effect in world_behind("drifting").concealed)
+    concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     seconds = time.monotonic() - started
     with staged(out) as stage:
         write_sensor(sensor, stage / "sensor.json")
@@ -112,14 +112,18 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def hidden_circle(seed: int) -> tuple[float, ...]:
-    """Draw the circle to be found, wholly on the field: x, y, radius in mm."""
-    import numpy as np
-
+def hypothesis() -> Circle:
+    """Say what the robot is told and the hidden circle drawn from: wholly on the field, radius 50 to 150 mm."""
     from probewise.scene import Circle
 
-    prior = Circle(radius_mm=(50.0, 150.0), inside=True).prior
-    drawn = prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
+    return Circle(radius_mm=(50.0, 150.0), inside=True)
+
+
+def hidden_circle(seed: int) -> tuple[float, ...]:
+    """Draw the circle to be found: x, y, radius in mm."""
+    import numpy as np
+
+    drawn = hypothesis().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     return tuple(float(v) for v in drawn)
 
 
@@ -137,19 +141,17 @@ def _calibrate(seed: int, full: bool) -> Calibration:
     )
 
 
-def _search(sensor: FittedSensor, model: str, truth: tuple[float, ...], seed: int) -> Exploration:
+def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
     import numpy as np
 
-    from probewise.cli import _simulation as simulation
-    from probewise.experiment import run
+    from probewise.experiment import arm_over, experiment_for, run, surface_of
     from probewise.scene import Field
     from probewise.world.shipped import truth as world_behind
 
     field = Field()
-    shape = simulation.shape_named(["circle"], field)
-    experiment = simulation.experiment_for(sensor, shape, field, model=model, n_live=N_LIVE_ROBOT)
-    surface = simulation.surface_of("circle", np.array(truth), field)
-    with simulation.field_arm(world_behind("paper"), surface, field, seed=seed) as arm:
+    experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT)
+    surface = surface_of("circle", np.array(truth), field)
+    with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         return run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
 
 
@@ -159,7 +161,7 @@ def _diagnose(seed: int) -> Diagnosis:
     from probewise.diagnosis import diagnose
     from probewise.recordings import read_recording, shipped
 
-    return diagnose(read_recording(shipped("drifting")), rng=np.random.default_rng([seed, 4]))
+    return diagnose(read_recording(shipped("concealed")), rng=np.random.default_rng([seed, 4]))
 
 
 VERB = Verb("demo", "Do all of it: calibrate, find a hidden circle with two models, diagnose.", add_arguments, run)

@@ -65,8 +65,9 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
     from tqdm import tqdm
 
+    from probewise import experiment as posing
     from probewise.calibration import read_sensor
-    from probewise.cli import _simulation as simulation
+    from probewise.cli._geometry import parse_field, parse_truth
     from probewise.experiment import Exploration, explore
     from probewise.recordings import write_bytes_atomically
     from probewise.report import exploration as report
@@ -74,12 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = check_out_directory(arguments.out)
     sensor = read_sensor(arguments.sensor)
-    field = simulation.parse_field(arguments.field)
+    field = parse_field(arguments.field)
     run_rng, truth_rng = np.random.default_rng(arguments.seed).spawn(2)
-    name, truth = simulation.parse_truth(arguments.truth, arguments.shape, field, rng=truth_rng)
-    experiment = simulation.experiment_for(
+    name, truth = parse_truth(arguments.truth, arguments.shape, field, rng=truth_rng)
+    experiment = posing.experiment_for(
         sensor,
-        simulation.shape_named(arguments.shape, field),
+        posing.shape_named(arguments.shape, field),
         field,
         model=arguments.model,
         n_live=arguments.live,
@@ -87,16 +88,16 @@ def run(arguments: argparse.Namespace) -> int:
     check_live(arguments.live, len(experiment.names))
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
-    arm = simulation.field_arm(
-        simulation.world_like(sensor),
-        simulation.surface_of(name, truth, field),
+    arm = posing.arm_over(
+        posing.world_like(sensor),
+        posing.surface_of(name, truth, field),
         field,
         seed=arguments.seed,
         taken=taken,
     )
     means = sensor.mean()
     levels = (means["I_min"], means["I_max"])
-    truth_mm = outlines(simulation.SHAPES[name](field).region(truth[None, :]))[0]
+    truth_mm = outlines(posing.SHAPES[name](field).region(truth[None, :]))[0]
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     folder = out / "frames"
     folder.mkdir(parents=True, exist_ok=True)
@@ -118,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
             kept = f"{journal} keeps {len(steps)} readings; go on with --resume"
             raise KeyboardInterrupt(kept) from stop
     result = Exploration(experiment, tuple(steps))
-    prior_names = simulation.SHAPES[name](field).prior.names
+    prior_names = posing.SHAPES[name](field).prior.names
     known = _truth_by_name(name, dict(zip(prior_names, truth.tolist(), strict=True)), experiment.names)
     with staged(out) as stage:
         page = report.write_page(result, frames, seed=arguments.seed, model=arguments.model, truth=known)

@@ -10,6 +10,7 @@ from typing import Any
 
 from probewise.effects.gain import GainDrift
 from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
+from probewise.effects.known import Known
 from probewise.effects.noise import CorrelatedNoise
 from probewise.effects.offsets import AmbientGradient
 from probewise.effects.pose import Backlash
@@ -33,6 +34,7 @@ __all__ = [
     "Extent",
     "GainDrift",
     "HeavyTailed",
+    "Known",
     "LogHeavyTailed",
     "NamedEffect",
     "Nonlinearity",

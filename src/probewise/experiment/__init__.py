@@ -11,25 +11,41 @@ from probewise.experiment.journal import (
     require_same_settings,
 )
 from probewise.experiment.loop import begin, explore, run, step
+from probewise.experiment.simulation import (
+    SHAPES,
+    Model,
+    arm_over,
+    experiment_for,
+    shape_named,
+    surface_of,
+    world_like,
+)
 from probewise.experiment.values import PAPER_BITS, Experiment, Exploration, OneScan, State, Step
 
 __all__ = [
     "PAPER_BITS",
+    "SHAPES",
     "Belief",
     "Entry",
     "Experiment",
     "Exploration",
     "Journal",
     "JournalWriter",
+    "Model",
     "OneScan",
     "State",
     "Step",
+    "arm_over",
     "begin",
+    "experiment_for",
     "explore",
     "read_journal",
     "recording_of",
     "require_same_settings",
     "run",
+    "shape_named",
     "step",
+    "surface_of",
     "value_digest",
+    "world_like",
 ]

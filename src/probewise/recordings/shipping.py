@@ -9,14 +9,14 @@ from probewise.errors import ParameterError
 
 __all__ = ["SHIPPED", "shipped"]
 
-SHIPPED = ("paper", "drifting")
+SHIPPED = ("paper", "concealed")
 
 
 def shipped(name: str) -> Path:
     """Find a recording that comes with the package, its JSON beside it.
 
     `paper`: the paper's 404 readings over the black-and-white boundary and four over the quadrants.
-    `drifting`: 961 readings, scans out and back, with one effect that a plain sensor model leaves out;
+    `concealed`: 961 readings, scans out and back, with one effect that a plain sensor model leaves out;
     the effect was drawn from a seed, and the name does not give it away.
     Both are simulated (world/shipped.py).
 

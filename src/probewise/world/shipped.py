@@ -37,11 +37,11 @@ BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)
 
 BLACK, WHITE, NOISE_SD = 10.0, 60.0, 0.6
 
-SEEDS = {"paper": 408, "drifting": 9844}
+SEEDS = {"paper": 408, "concealed": 9844}
 
 _DESCRIPTIONS = {
     "paper": "Simulated readings over the black-and-white boundary and four quadrants, as in the paper",
-    "drifting": "Simulated readings, scans out and back; something is not as a plain sensor has it",
+    "concealed": "Simulated readings, scans out and back; something is not as a plain sensor has it",
 }
 
 CANDIDATES: tuple[Concealed, ...] = (
@@ -52,7 +52,7 @@ CANDIDATES: tuple[Concealed, ...] = (
     Nonlinearity(1.1),
     Saturation(57.5),
 )
-"""What `drifting` may conceal; each at a size lambda of about 20 there (diagnosis, size of an effect)."""
+"""What `concealed` may conceal; each at a size lambda of about 20 there (diagnosis, size of an effect)."""
 
 
 def truth(name: str) -> World:

@@ -1,18 +1,20 @@
-"""Put a simulated arm over a simulated field, and pose the experiment that its sensor model makes."""
+"""Pose the experiment that a fitted sensor makes, and put a simulated arm over a simulated field."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Pose, Reach, Reading, SimulatedArm
 from probewise.calibration import FittedSensor
+from probewise.effects import Known
 from probewise.errors import ParameterError
-from probewise.experiment import Experiment
+from probewise.experiment.values import Experiment
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid
 from probewise.recordings import Disc, Polygon
@@ -29,19 +31,12 @@ from probewise.scene import (
     Shape,
     outlines,
 )
-from probewise.sensor import Chain, FixedLevels, NaiveSensor, footprint_of, mean_mixture
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, NaiveSensor, Stage, footprint_of, mean_mixture
 from probewise.world import Oval, Spot, Surface, World
 
-__all__ = [
-    "SHAPES",
-    "experiment_for",
-    "field_arm",
-    "parse_field",
-    "parse_truth",
-    "shape_named",
-    "surface_of",
-    "world_like",
-]
+__all__ = ["SHAPES", "Model", "arm_over", "experiment_for", "shape_named", "surface_of", "world_like"]
+
+Model: TypeAlias = Literal["ssf", "naive"]
 
 SHAPES: Mapping[str, Callable[[Field], Shape]] = {
     "circle": lambda field: Circle(field),
@@ -52,29 +47,23 @@ SHAPES: Mapping[str, Callable[[Field], Shape]] = {
 }
 
 
-def parse_field(text: str) -> Field:
-    """Read "WIDTH,HEIGHT" in mm."""
-    try:
-        width, height = (float(cell) for cell in text.split(","))
-    except ValueError as error:
-        raise ParameterError("--field", text, "WIDTH,HEIGHT in mm, such as 1048,520") from error
-    return Field(width, height)
-
-
 def shape_named(names: Sequence[str], field: Field) -> Shape:
     """Build the hypothesis: one shape, or a set of shapes."""
     chosen = {name: SHAPES[name](field) for name in dict.fromkeys(names)}
     return AnyOf(chosen) if len(chosen) > 1 else next(iter(chosen.values()))
 
 
-def experiment_for(sensor: FittedSensor, shape: Shape, field: Field, *, model: str, n_live: int) -> Experiment:
+def experiment_for(
+    sensor: FittedSensor, shape: Shape, field: Field, *, model: Model = "ssf", n_live: int = 200
+) -> Experiment:
     """Pose the experiment: a known sensor over a shape that is not known.
 
     Parameters
     ----------
     sensor
         As calibrated. The SSF model takes the mixture with the mean and covariance of its mean field, so that
-        closed forms stand in for the sum over pixels; the naive model takes its two levels.
+        closed forms stand in for the sum over pixels, and its effects at their posterior means; the naive
+        model takes its two levels.
     shape
         What may lie on the field.
     field
@@ -87,18 +76,23 @@ def experiment_for(sensor: FittedSensor, shape: Shape, field: Field, *, model: s
     means = sensor.mean()
     levels = FixedLevels(means["I_min"], means["I_max"])
     scene = HypothesisScene(shape)
-    noise_sd = lego_noise_sd(sensor)
+    noise_sd = _lego_noise_sd(sensor)
     grid = Grid(field.width_mm, field.height_mm)
     if model == "naive":
         likelihood = Naive(levels.i_min, noise_sd, levels.i_max, noise_sd)
         return Experiment(shape, NaiveSensor(levels, scene), likelihood, noise_sd, grid, n_live=n_live)
     n = sensor.n_gaussians
     mixture = mean_mixture(footprint_of(sensor.samples[:, : 6 * n], n), n_gaussians=n)
-    chain = Chain(mixture, levels, scene)
+    effects = tuple(
+        Known(effect, tuple(means[f"{effect.name}.{name}"] for name in effect.prior.names))
+        for effect in sensor.carried_effects
+        if effect.stage is not Stage.NOISE  # readings far apart in place and time share no noise
+    )
+    chain = Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES)
     return Experiment(shape, chain, GaussianKnown(noise_sd), noise_sd, grid, n_live=n_live)
 
 
-def lego_noise_sd(sensor: FittedSensor) -> float:
+def _lego_noise_sd(sensor: FittedSensor) -> float:
     """Sd of one reading in whole LEGO units: the calibrated noise, and that of rounding to one unit."""
     return math.hypot(float(sensor.noise_sd.mean()), 1 / math.sqrt(12))
 
@@ -109,34 +103,6 @@ def world_like(sensor: FittedSensor) -> World:
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
     spot = Spot(np.asarray(field.values), field.pixel_mm, corner)
     return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=float(sensor.noise_sd.mean()))
-
-
-def parse_truth(
-    text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator
-) -> tuple[str, FloatArray]:
-    """Read "[SHAPE:]V,V,...", the parameters of what lies there; without a text draw it from the prior.
-
-    Returns
-    -------
-    Name of the shape, and its parameters, shape (n_params,).
-    """
-    if text is None:
-        name = names[int(rng.integers(len(names)))]
-        prior = SHAPES[name](field).prior
-        return name, prior.from_unit_cube(rng.random((1, len(prior.names))))[0]
-    name, _, listed = text.rpartition(":")
-    name = name or names[0]
-    if name not in SHAPES:
-        raise ParameterError("--truth", text, f"a shape of {', '.join(SHAPES)} before the colon")
-    prior = SHAPES[name](field).prior
-    allowed = f"{len(prior.names)} numbers within their bounds, {','.join(prior.names)}"
-    try:
-        theta = np.array([float(cell) for cell in listed.split(",")])
-    except ValueError as error:
-        raise ParameterError("--truth", text, allowed) from error
-    if theta.shape != (len(prior.names),) or not np.isfinite(theta).all():
-        raise ParameterError("--truth", text, allowed)
-    return name, theta
 
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
@@ -153,9 +119,7 @@ def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
     raise ParameterError("shape", name, "one whose outline is an ellipse or a polygon")
 
 
-def field_arm(
-    world: World, surface: Surface, field: Field, *, seed: int, taken: Sequence[Reading] = ()
-) -> SimulatedArm:
+def arm_over(world: World, surface: Surface, field: Field, *, seed: int, taken: Sequence[Reading] = ()) -> SimulatedArm:
     """Stand the simulated arm over a surface.
 
     Parameters

@@ -1,0 +1,52 @@
+"""An effect whose parameters are known: nothing is left to infer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.priors import Empty
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Effect, Stage
+
+__all__ = ["Known"]
+
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Known(Effect[V]):
+    """Fix an effect's parameters, so that a repaired sensor is as known to the robot as any other.
+
+    `values` are in the order of `effect.prior.names`.
+    """
+
+    effect: Effect[V]
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.values) != len(self.effect.prior.names):
+            raise ParameterError("values", self.values, f"one number for each of {self.effect.prior.names}")
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        """The effect's stage."""
+        return self.effect.stage
+
+    @property
+    def prior(self) -> Empty:
+        """Nothing to infer."""
+        return Empty()
+
+    def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
+        """Apply with the known values; theta has no columns, (n_samples, 0)."""
+        return self.effect.apply(value, np.array([self.values]), plan)

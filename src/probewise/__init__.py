@@ -7,6 +7,15 @@ posterior), `inquiry` (where to measure next), `experiment` (the loop), `calibra
 (what the model leaves out), `effects`, `report`; `world` is the simulated world apart.
 """
 
+from probewise._display import before_first_display
 from probewise._version import __version__
 
 __all__ = ["__version__"]
+
+
+def _load_renderers() -> None:
+    """Let results show themselves with pictures; matplotlib is loaded no sooner."""
+    import probewise.report.notebook  # noqa: F401
+
+
+before_first_display(_load_renderers)

@@ -1,17 +1,25 @@
 """How results show themselves in a notebook: the values stand low, the pictures high.
 
 A value derives from `ShowsItself` and knows nothing of pages or plots; `report.notebook`,
-which stands above, registers how to draw it. The first display imports that module.
+which stands above, registers how to draw it. The package hands over the function that loads
+those renderers, and the first display calls it.
 """
 
 from __future__ import annotations
 
 import functools
 import html
-import importlib
+from collections.abc import Callable
 from typing import Protocol
 
-__all__ = ["ShowsItself", "render_html"]
+__all__ = ["ShowsItself", "before_first_display", "render_html"]
+
+_waiting: list[Callable[[], object]] = []
+
+
+def before_first_display(load: Callable[[], object]) -> None:
+    """Call `load` once, when a value is first shown: drawing is not loaded for nothing."""
+    _waiting.append(load)
 
 
 @functools.singledispatch
@@ -39,7 +47,8 @@ class ShowsItself:
         cls._repr_pretty_ = ShowsItself._repr_pretty_  # type: ignore[method-assign]
 
     def _repr_html_(self) -> str:
-        importlib.import_module("probewise.report.notebook")
+        while _waiting:
+            _waiting.pop()()
         return render_html(self)
 
     def _repr_pretty_(self, printer: Printer, cycle: bool) -> None:

@@ -146,41 +146,51 @@ def _drawn_lead(rng: np.random.Generator, n_live: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Run both campaigns, `python -m probewise.calibration.coverage --help`, and write their JSON files."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder of the two JSON files")
-    parser.add_argument("--recordings", type=int, default=100, help="for the coverage of N = 1 (default 100)")
-    parser.add_argument("--orders", type=int, default=20, help="for the order, N = 1 against 2 (default 20)")
+    """Run one of the two campaigns and write its JSON file; see `python -m probewise.calibration.coverage --help`."""
+    parser = argparse.ArgumentParser(prog="python -m probewise.calibration.coverage", description=__doc__)
+    parser.add_argument(
+        "campaign",
+        choices=("coverage", "order"),
+        help="intervals of N = 1 that hold the truth, or evidence of N = 1 over 2",
+    )
+    parser.add_argument("--recordings", type=int, required=True, help="how many recordings are simulated")
     parser.add_argument("--live", type=int, default=300, help="live points (default 300)")
     parser.add_argument("--seed", type=int, default=20, help="seed (default 20)")
-    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--workers", type=int, default=2, help="processes; they change no result (default 2)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
     asked = parser.parse_args()
     about = {
-        "command": "python -m probewise.calibration.coverage "
-        f"--recordings {asked.recordings} --orders {asked.orders} --live {asked.live} --seed {asked.seed}",
+        "command": f"{parser.prog} {asked.campaign} --recordings {asked.recordings} --live {asked.live} "
+        f"--seed {asked.seed} --out {asked.out.name}",
         "seed": asked.seed,
         "date": datetime.date.today().isoformat(),
     }
-    with ProcessPoolExecutor(asked.workers, mp_context=multiprocessing.get_context("spawn")) as executor:
-        streams = np.random.default_rng([asked.seed, 2]).spawn(asked.orders)
-        found = executor.map(_drawn_lead, streams, [asked.live] * asked.orders)
-        leads = [(round(d, 3), round(e, 3)) for d, e in tqdm(found, total=asked.orders, desc="order")]
-        with tqdm(total=asked.recordings, desc="coverage") as bar:
+    rng = np.random.default_rng(asked.seed)
+    with (
+        ProcessPoolExecutor(asked.workers, mp_context=multiprocessing.get_context("spawn")) as executor,
+        tqdm(total=asked.recordings, desc=asked.campaign) as bar,
+    ):
+        if asked.campaign == "coverage":
 
             def count(_: Coverage) -> None:
                 bar.update()
 
-            counts = coverage(
-                asked.recordings,
-                rng=np.random.default_rng([asked.seed, 1]),
-                n_live=asked.live,
-                executor=executor,
-                progress=count,
-            )
-    counts.save(asked.out / "calibration_coverage.json", **about)
-    wins = sum(d > 0 for d, _ in leads)
-    rows = {"n_live": asked.live, "version": __version__, "prefer_one": wins, "of": asked.orders, "leads_nats": leads}
-    write_text_atomically(asked.out / "calibration_order.json", json.dumps({**about, **rows}, indent=1) + "\n")
+            counts = coverage(asked.recordings, rng=rng, n_live=asked.live, executor=executor, progress=count)
+            counts.save(asked.out, **about)
+            return
+        leads = []
+        for lead, error in executor.map(_drawn_lead, rng.spawn(asked.recordings), [asked.live] * asked.recordings):
+            leads.append((round(lead, 3), round(error, 3)))
+            bar.update()
+    preferred = sum(lead > 0 for lead, _ in leads)
+    rows = {
+        "n_live": asked.live,
+        "version": __version__,
+        "prefer_one": preferred,
+        "of": len(leads),
+        "leads_nats": leads,
+    }
+    write_text_atomically(asked.out, json.dumps({**about, **rows}, indent=1) + "\n")
 
 
 def wilson_interval(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:

@@ -178,8 +178,8 @@ def test_few_nodes_are_enough_for_the_robot(shape):
     """Stated error of FAST_NODES: 1e-4 of the span; of the default: 1e-8. Footprint sd 3 and 10 mm."""
     ssf = FixedMixture([1.0], [[1.0, 2.0]], [[[100.0, 0.0], [0.0, 9.0]]])
     levels, scene = FixedLevels(10, 50), HypothesisScene(shape)
-    theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((200, len(shape.prior.names))))
-    plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
+    theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((60, len(shape.prior.names))))
+    plan = replace(plan_of(40), x_mm=np.linspace(0, 1048, 40), y_mm=np.linspace(0, 520, 40)[::-1])
     full = Chain(ssf, levels, scene, n_nodes=256).predict(theta, plan)
     for n_nodes, error in ((FAST_NODES, 1e-4), (ACCURATE_NODES, 1e-8)):
         fast = Chain(ssf, levels, scene, n_nodes=n_nodes).predict(theta, plan)

@@ -7,6 +7,7 @@ the stop rule on consecutive values of log Z).
 
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import run, step
@@ -17,6 +18,7 @@ __all__ = [
     "DiversifyTally",
     "Evaluator",
     "EvidenceChange",
+    "KernelMove",
     "Move",
     "NestedResult",
     "Points",
@@ -27,6 +29,7 @@ __all__ = [
     "StopRule",
     "Tally",
     "diversify",
+    "diversify_by_kernels",
     "run",
     "step",
 ]

@@ -243,8 +243,10 @@ class _View:
 
     @classmethod
     def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _View:
-        row = np.argmax((live[None, :, :] == u[:, None, :]).all(axis=2), axis=1)
-        return cls(clusters, clusters.without(u, home), home.copy(), row)
+        same = (live[None, :, :] == u[:, None, :]).all(axis=2)
+        # A start that is no live point is in no cluster's measure either.
+        own_home = np.where(same.any(axis=1), home, -1)
+        return cls(clusters, clusters.without(u, home), own_home, np.argmax(same, axis=1))
 
     def measures(self, rows: IntArray, home: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Mean, root, inverse root and log determinant of cluster `home` as chains `rows` see it."""

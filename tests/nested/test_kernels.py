@@ -49,15 +49,18 @@ class Crescent:
         return -(((radius - 0.5) / 0.05) ** 2)
 
 
-def test_the_move_leaves_the_uniform_distribution_above_a_bound():
-    """Radius and angle of points above a level of the crescent, against a rejection sample; KS at 1e-6."""
+@pytest.mark.parametrize("move", [KernelMove(), KernelMove(patience=1.0)], ids=["kernels", "chains after kernels"])
+def test_the_move_leaves_the_uniform_distribution_above_a_bound(move):
+    """Radius and angle of points above a level of the crescent, against a rejection sample; KS at 1e-6.
+
+    The chains that take over begin where the kernels ended, which is no live point.
+    """
     problem, rng = Crescent(), np.random.default_rng(4)
     evaluate, bound = Evaluator(problem), Bound(-1.0, 0.0)
     exact = evaluate(rng.random((60_000, 2)), rng)
     exact = exact.take(bound.admits(exact.log_likelihood, exact.label))
     live = exact.take(slice(0, 200))
     ends = []
-    move = KernelMove()
     for _ in range(15):
         start = live.take(rng.permutation(200)[:100])
         new, tally = move.draw(start, bound, live.u, evaluate, rng)

@@ -121,9 +121,12 @@ def test_every_point_lies_above_the_level_it_was_born_at(rng: np.random.Generato
     assert np.exp(result.log_weight).sum() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("starts_live", [True, False])
 @pytest.mark.parametrize("clustered", [False, True])
-def test_slice_chains_leave_the_uniform_distribution_alone(clustered: bool, rng: np.random.Generator) -> None:
-    """Starts drawn uniformly above the bound end uniformly above it: positions and a plateau's labels."""
+def test_slice_chains_leave_the_uniform_distribution_alone(
+    clustered: bool, starts_live: bool, rng: np.random.Generator
+) -> None:
+    """Starts drawn uniformly above the bound, live points or not, end uniformly above it: places and labels."""
 
     def function(theta: np.ndarray) -> np.ndarray:
         x = theta[:, 0]
@@ -139,7 +142,8 @@ def test_slice_chains_leave_the_uniform_distribution_alone(clustered: bool, rng:
         start = points.take(slice(300 * k, 300 * k + 300))
         assert (len(find_clusters(start.u)) > 1) == clustered
         move = SliceMove(steps_per_param=1, differences=0.3)
-        part, tally = move.draw(start, bound, start.u, evaluate, rng)
+        live = start if starts_live else points.take(slice(3000 + 60 * k, 3060 + 60 * k))
+        part, tally = move.draw(start, bound, live.u, evaluate, rng)
         assert tally.n_stuck < 15
         ends.append(part)
     end = Points.join(*ends)

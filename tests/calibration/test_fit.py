@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -187,3 +188,13 @@ def test_a_simulated_recording_holds_the_readings_of_its_truth() -> None:
     truth = draw_truth(rng=rng)
     recording = simulate_truth(truth, rng=rng)
     assert abs(recording.readings[:20].mean() - truth.black) < 1.0
+
+
+def test_orders_run_elsewhere_give_the_same_result(recording):
+    """Every order has a stream of its own: here one after another, there on an executor."""
+    here, there = (
+        calibrate(recording, orders=(1, 2), n_live=30, rng=np.random.default_rng(3), executor=executor)
+        for executor in (None, ThreadPoolExecutor(2))
+    )
+    assert [o.log_z for o in here.orders] == [o.log_z for o in there.orders]
+    np.testing.assert_array_equal(here.sensor.samples, there.sensor.samples)

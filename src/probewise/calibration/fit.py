@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import PurePath
 
 import numpy as np
@@ -131,6 +133,7 @@ def calibrate(
     data_sets: IntArray | None = None,
     pixel_mm: float | None = None,
     n_samples: int = _N_SAMPLES,
+    executor: Executor | None = None,
 ) -> Calibration:
     """Fit SSFs of several orders to a recording and weigh them by their evidence (paper, section on MoG estimation).
 
@@ -145,7 +148,7 @@ def calibrate(
     rng
         Source of randomness; every order draws from a stream of its own.
     progress
-        Called with the order and the sampler's state after every round.
+        Called with the order and the sampler's state after every round; not across processes.
     prior
         Makes the prior from the recording and an order.
     data_sets
@@ -154,6 +157,8 @@ def calibrate(
         Pixel of the mean fields; default by `choose_pixel_mm`, 1 mm or finer.
     n_samples
         Equally weighted posterior samples to keep, 500 or more.
+    executor
+        Where the orders run; by default here, one after another. The result does not depend on it.
 
     Returns
     -------
@@ -173,23 +178,23 @@ def calibrate(
     wanted = tuple(dict.fromkeys(int(n) for n in orders))
     if not wanted or min(wanted) < 1:
         raise ParameterError("orders", tuple(orders), "one or more whole numbers from 1")
-    geometry = scan_geometry(recording)
-    n_usable = int(recording.usable.sum())
-    fits = []
-    for n_gaussians, stream in zip(wanted, rng.spawn(len(wanted)), strict=True):
-        notes: tuple[str, ...] = ()
-        if n_usable < 6 * n_gaussians + 2:
-            notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the prior decides much",)
-            warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=2)
-        belief = prior(recording, n_gaussians)
-        problem = problem_for(recording, belief, data_sets=data_sets)
-        # One Gaussian has one mode, so half the live points can go in one round: a batch costs the same whatever its
-        # size. Several have many, and there smaller rounds with fresher survivors found the evidence more reliably.
-        n_replaced = max(1, n_live // (2 if n_gaussians == 1 else 4))
-        told = None if progress is None else _told(progress, n_gaussians)
-        result = run(problem, rng=stream, n_live=n_live, n_replaced=n_replaced, progress=told)
-        sensor = _fitted(recording, problem, result, n_samples, pixel_mm, geometry.step_mm, notes, stream)
-        fits.append(OrderFit(n_gaussians, belief, result, sensor))
+    one = partial(
+        _fit_order,
+        recording,
+        n_live=n_live,
+        progress=progress,
+        prior=prior,
+        data_sets=data_sets,
+        pixel_mm=pixel_mm,
+        n_samples=n_samples,
+    )
+    streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
+    if executor is None:
+        fits = [one(n, stream) for n, stream in streams.items()]
+    else:
+        # The dearest order first, so that no worker waits for it at the end.
+        running = {n: executor.submit(one, n, streams[n]) for n in sorted(wanted, reverse=True)}
+        fits = [running[n].result() for n in wanted]
     table = tuple(OrderEvidence(fit.n_gaussians, fit.log_z, fit.log_z_error) for fit in fits)
     close = _close_call(table)
     return Calibration(
@@ -198,6 +203,36 @@ def calibrate(
             replace(fit, sensor=replace(fit.sensor, orders=table, notes=(*fit.sensor.notes, *close))) for fit in fits
         ),
     )
+
+
+def _fit_order(
+    recording: Recording,
+    n_gaussians: int,
+    rng: np.random.Generator,
+    *,
+    n_live: int,
+    progress: Callable[[int, State], None] | None,
+    prior: Callable[[Recording, int], SSFPrior],
+    data_sets: IntArray | None,
+    pixel_mm: float | None,
+    n_samples: int,
+) -> OrderFit:
+    """Fit one order; a function of the module, so that another process can run it."""
+    geometry = scan_geometry(recording)
+    n_usable = int(recording.usable.sum())
+    notes: tuple[str, ...] = ()
+    if n_usable < 6 * n_gaussians + 2:
+        notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the prior decides much",)
+        warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
+    belief = prior(recording, n_gaussians)
+    problem = problem_for(recording, belief, data_sets=data_sets)
+    # One Gaussian has one mode, so half the live points can go in one round: a batch costs the same whatever its
+    # size. Several have many, and there smaller rounds with fresher survivors found the evidence more reliably.
+    n_replaced = max(1, n_live // (2 if n_gaussians == 1 else 4))
+    told = None if progress is None else _told(progress, n_gaussians)
+    result = run(problem, rng=rng, n_live=n_live, n_replaced=n_replaced, progress=told)
+    sensor = _fitted(recording, problem, result, n_samples, pixel_mm, geometry.step_mm, notes, rng)
+    return OrderFit(n_gaussians, belief, result, sensor)
 
 
 def _told(progress: Callable[[int, State], None], n_gaussians: int) -> Callable[[State], None]:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, say, staged
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model
@@ -54,9 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
         two_workers() as pool,
         tqdm(total=4, desc="demo", unit=" part", disable=True if arguments.quiet else None) as bar,
     ):
-        calibrating = pool.submit(_calibrate, seed, arguments.full)
         diagnosing = pool.submit(_diagnose, seed)
-        calibration = calibrating.result()
+        calibration = _calibrate(seed, arguments.full, pool)
         bar.update()
         searching = [pool.submit(_search, calibration.sensor, model, truth, seed) for model in MODELS]
         diagnosis = diagnosing.result()
@@ -127,7 +128,7 @@ def hidden_circle(seed: int) -> tuple[float, ...]:
     return tuple(float(v) for v in drawn)
 
 
-def _calibrate(seed: int, full: bool) -> Calibration:
+def _calibrate(seed: int, full: bool, pool: Executor) -> Calibration:
     import numpy as np
 
     from probewise.calibration import calibrate
@@ -138,6 +139,7 @@ def _calibrate(seed: int, full: bool) -> Calibration:
         orders=(1, 2, 3, 4) if full else (1, 2),
         n_live=300 if full else N_LIVE,
         rng=np.random.default_rng([seed, 1]),
+        executor=pool,
     )
 
 

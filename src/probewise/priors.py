@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
@@ -32,8 +32,31 @@ class Prior(Protocol):
         """Map points of the unit cube, shape (n_samples, n_params), to parameters of the same shape."""
         ...
 
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Map parameters back to a point of the unit cube that leads to them, same shapes."""
+        ...
+
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, shape (n_samples,); -inf outside the support."""
+        ...
+
+
+class Coordinates(Protocol):
+    """Coordinates in which a problem is simpler than in its parameters or the unit cube.
+
+    A prior that has a property `coordinates` of this kind is sampled in them: what readings fix
+    sharply should be an axis there, not a bent surface through several.
+    """
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        """Map parameters with positive prior density to coordinates, (n_samples, n_params) both ways."""
+        ...
+
+    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates to parameters; also the prior's log density over coordinates, (n_samples,).
+
+        Any finite coordinates are allowed; the density is -inf where they lead nowhere.
+        """
         ...
 
 
@@ -42,6 +65,10 @@ class Marginal(Protocol):
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Quantile function, any shape."""
+        ...
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Distribution function, any shape: the inverse of `from_unit`."""
         ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
@@ -63,6 +90,10 @@ class Uniform:
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Quantile function, any shape: `u` in 0..1 -> low..high."""
         return self.low + (self.high - self.low) * u
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Distribution function, any shape: low..high -> 0..1."""
+        return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Natural log of the density, any shape; -inf outside the bounds."""
@@ -87,6 +118,11 @@ class LogUniform:
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Quantile function, any shape: equal steps of `u` are equal ratios."""
         return np.asarray(self.low * (self.high / self.low) ** u)
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Distribution function, any shape."""
+        within = np.clip(value, self.low, self.high)
+        return np.asarray(np.log(within / self.low) / math.log(self.high / self.low))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Natural log of the density, any shape; -inf outside the bounds."""
@@ -113,6 +149,10 @@ class Normal:
         """Quantile function, any shape; 0 and 1 map to the infinities."""
         return self.mean + self.sd * np.asarray(ndtri(u))
 
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Distribution function, any shape."""
+        return np.asarray(ndtr((value - self.mean) / self.sd))
+
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Natural log of the density, any shape."""
         z = (value - self.mean) / self.sd
@@ -137,6 +177,11 @@ class Product:
         """Map each coordinate by its own marginal, (n_samples, n_params) both ways."""
         _require_columns(u, self.names)
         return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Map each parameter by its own marginal, (n_samples, n_params) both ways."""
+        _require_columns(theta, self.names)
+        return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Sum of the marginals, (n_samples, n_params) -> (n_samples,)."""
@@ -163,6 +208,11 @@ class Joint:
         _require_columns(u, self.names)
         return np.concatenate([p.from_unit_cube(c) for p, c in self._split(u)], axis=-1)
 
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Map each part's parameters by that part, (n_samples, n_params) both ways."""
+        _require_columns(theta, self.names)
+        return np.concatenate([p.to_unit_cube(c) for p, c in self._split(theta)], axis=-1)
+
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Sum of the parts, (n_samples, n_params) -> (n_samples,)."""
         _require_columns(theta, self.names)
@@ -188,6 +238,10 @@ class Empty:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Return the points: they have no coordinates."""
         return u
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Return the points: they have no coordinates."""
+        return theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Zero for each sample: the one hypothesis is certain."""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
+from nested_sampling import problems
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested import diversify
-
-problems = sys.modules["nested_problems"]
 
 
 def test_replicated_samples_become_independent() -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from nested_sampling import problems
 
 from probewise.errors import FileError, ParameterError, ShapeError
-from probewise.nested import NestedResult, run
-
-problems = sys.modules["nested_problems"]
+from probewise.nested import Agreement, NestedResult, run
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +20,14 @@ def result() -> NestedResult:
 
 
 def test_a_saved_result_comes_back_whole(result: NestedResult, tmp_path: Path) -> None:
-    doubtful = dataclasses.replace(result, warnings=("a doubt",))
+    agreement = Agreement((1.0, 2.5), (0.5, 0.25), 7.2, 0.0073)
+    doubtful = dataclasses.replace(result, warnings=("a doubt",), agreement=agreement)
     doubtful.save(tmp_path / "run.npz")
     back = NestedResult.load(tmp_path / "run.npz")
     for field in dataclasses.fields(NestedResult):
-        assert np.array_equal(getattr(back, field.name), getattr(doubtful, field.name)), field.name
+        stored, kept = getattr(back, field.name), getattr(doubtful, field.name)
+        assert np.array_equal(stored, kept), field.name
+        assert type(stored) is type(kept), field.name
     assert [p.name for p in tmp_path.iterdir()] == ["run.npz"]
 
 
@@ -35,12 +37,25 @@ def test_a_damaged_file_is_refused(result: NestedResult, tmp_path: Path) -> None
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(FileError, match=r"run\.npz"):
         NestedResult.load(path)
-    np.savez(
-        path,
-        head=np.array('{"format": "nested-result/9"}'),
-        **dict.fromkeys(("theta", "log_likelihood", "log_weight", "log_birth", "insertion_rank"), np.zeros(1)),
-    )
-    with pytest.raises(FileError, match="nested-result/9"):
+    path.write_bytes(b"no archive")
+    with pytest.raises(FileError, match="unreadable"):
+        NestedResult.load(path)
+
+
+def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names(
+    result: NestedResult, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.npz"
+    np.savez(path, head=np.array('{"format": "nested-result/1"}'), theta=np.zeros(1))
+    with pytest.raises(FileError, match=r"nested-result/1.*make the file anew"):
+        NestedResult.load(path)
+    result.save(path)
+    with np.load(path) as file:
+        parts = {name: file[name] for name in file.files}
+    head = json.loads(str(parts.pop("head")))
+    del head["log_z"]
+    np.savez(path, head=np.array(json.dumps({**head, "mood": 1})), **parts)
+    with pytest.raises(FileError, match="log_z, mood missing or unknown"):
         NestedResult.load(path)
 
 
@@ -68,6 +83,62 @@ def test_quantiles_of_equal_weights_are_the_plain_ones(result: NestedResult) -> 
         plain.samples(0, rng=np.random.default_rng(0))
     with pytest.raises(ShapeError, match="rows"):
         plain.mean(lambda t: t[:3])
+    with pytest.raises(ShapeError, match=r"shape \(\)"):
+        plain.mean(lambda t: t.sum())
+    with pytest.raises(ParameterError, match="block is 0"):
+        plain.mean(lambda t: t, block=0)
+
+
+def test_a_mean_field_by_blocks_is_the_mean_field_and_holds_one_block_at_a_time(result: NestedResult) -> None:
+    """A bump on 20 x 30 pixels about each sample: the tensor of all of them is never made."""
+    y, x = np.mgrid[-3:3:20j, -3:3:30j]
+    handed = []
+
+    def field(theta: np.ndarray) -> np.ndarray:
+        handed.append(len(theta))
+        return np.exp(-((x - theta[:, 0, None, None]) ** 2) - (y - theta[:, 1, None, None]) ** 2)
+
+    whole = result.mean(field)
+    assert handed == [result.n_dead]
+    assert whole.shape == (20, 30)
+    assert result.mean(field, block=64) == pytest.approx(whole, rel=1e-12)
+    assert max(handed[1:]) == 64
+    assert sum(handed[1:]) == result.n_dead
+    by_hand = sum(w * field(t[None])[0] for w, t in zip(result.weight, result.theta, strict=True))
+    assert whole == pytest.approx(by_hand, rel=1e-9)
+
+
+def test_volumes_weights_and_likelihoods_give_the_evidence(result: NestedResult) -> None:
+    """ln Z from the stored volumes by the rectangle rule, to the accuracy of that rule."""
+    edges = np.concatenate([[1.0], np.exp(result.log_volume)])
+    z = np.sum((edges[:-1] - edges[1:]) * np.exp(result.log_likelihood))
+    assert np.log(z) == pytest.approx(result.log_z, abs=0.02)
+    assert (np.diff(result.log_volume) < 0).all()
+
+
+def test_the_cost_is_counted_for_each_live_point_and_nat(result: NestedResult) -> None:
+    each = result.calls_per_live_point_and_nat
+    assert each * result.n_live * result.information == pytest.approx(result.n_calls)
+    assert each > 1
+    assert f"{each:.3g} for each live point and nat" in result.summary()
+    nothing = dataclasses.replace(result, information=0.0)
+    assert nothing.calls_per_live_point_and_nat == np.inf
+    assert "for each" not in nothing.summary()
+
+
+def test_a_result_names_all_that_made_it(result: NestedResult) -> None:
+    assert set(result.versions) == {"probewise", "numpy", "scipy", "python"}
+    assert f"numpy {np.__version__}" in result.summary()
+    assert json.loads(result.seed_state)["bit_generator"] == "PCG64"
+    assert "of the prior" not in result.summary()
+
+
+def test_arrays_of_other_lengths_are_refused(result: NestedResult) -> None:
+    for name in ("label", "birth_label", "n_at_death", "log_weight"):
+        with pytest.raises(ShapeError, match=rf"{name} has shape \(1,\).*one a row of theta"):
+            dataclasses.replace(result, **{name: np.ones(1, dtype=int)})
+    with pytest.raises(ShapeError, match=r"insertion_n_ranked.*one an inserted point"):
+        dataclasses.replace(result, insertion_n_ranked=np.ones(1, dtype=int))
 
 
 def test_the_summary_names_what_matters(result: NestedResult) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
 
 import numpy as np
 import pytest
+from nested_sampling import problems
 from scipy.special import logsumexp
 from scipy.stats import kstest
 
@@ -28,8 +28,6 @@ from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
 from probewise.nested.sampler import Live, step
 from probewise.priors import Empty
-
-problems = sys.modules["nested_problems"]
 
 # A right sampler is further off than this many of its own errors less than once in 10 000 runs.
 N_ERRORS = 3.9
@@ -103,7 +101,7 @@ def test_one_step_by_hand_counts_the_shrinkage(rng: np.random.Generator) -> None
     problem = problems.box(1, 0, 1)
     evaluate = Evaluator(problems.Known(problem, lambda t: t[:, 0], 0.0))
     u = np.array([[0.1], [0.5], [0.3], [0.9], [0.7]])
-    live = Live(Points(u, u, u[:, 0], np.zeros(5)), np.full(5, -np.inf), 0.0)
+    live = Live(Points(u, u, np.zeros(5), u[:, 0], np.zeros(5)), np.full(5, -np.inf), np.ones(5), 0.0)
     after, dead, _ = step(live, PriorRejection(1.0), evaluate, n_replaced=2, rng=rng)
     assert dead.points.theta[:, 0].tolist() == [0.1, 0.3]
     assert dead.n_at_death.tolist() == [5, 4]

@@ -226,11 +226,8 @@ def _fit_order(
         warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
     belief = prior(recording, n_gaussians)
     problem = problem_for(recording, belief, data_sets=data_sets)
-    # One Gaussian has one mode, so half the live points can go in one round: a batch costs the same whatever its
-    # size. Several have many, and there smaller rounds with fresher survivors found the evidence more reliably.
-    n_replaced = max(1, n_live // (2 if n_gaussians == 1 else 4))
     told = None if progress is None else _told(progress, n_gaussians)
-    result = run(problem, rng=rng, n_live=n_live, n_replaced=n_replaced, progress=told)
+    result = run(problem, rng=rng, n_live=n_live, progress=told, return_interrupted=False)
     sensor = _fitted(recording, problem, result, n_samples, pixel_mm, geometry.step_mm, notes, rng)
     return OrderFit(n_gaussians, belief, result, sensor)
 

@@ -78,6 +78,14 @@ class HeavyTailed:
             x = np.clip(x - (-np.log(2 * upper) - goal) / slope, 0.0, size[-1])
         return np.asarray(sign * x)
 
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Distribution function, any shape."""
+        value = np.asarray(value, dtype=np.float64)
+        tail = self._upper(np.abs(value))
+        if self.positive:
+            return np.where(value > 0, 1.0 - 2.0 * tail, 0.0)
+        return np.where(value < 0, tail, 1.0 - tail)
+
     def __str__(self) -> str:
         kind = "positive heavy-tailed" if self.positive else "heavy-tailed about 0"
         return f"{kind}, typical {self.typical:g}"
@@ -96,6 +104,10 @@ class LogHeavyTailed:
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Quantile function, any shape."""
         return np.exp(self._log.from_unit(u))
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Distribution function, any shape."""
+        return self._log.to_unit(np.log(value))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Natural log of the density, any shape; -inf at and below zero."""

@@ -102,9 +102,9 @@ def step(
             problem,
             rng=rng,
             n_live=experiment.n_live,
-            n_replaced=experiment.n_live // 2,
             move=KernelMove(),
             stop=RemainingEvidence(DLOGZ),
+            return_interrupted=False,
         )
     drawn = posterior.samples(experiment.n_samples, rng=rng)
     cloud = posterior.samples(N_KERNELS, rng=rng)

@@ -7,13 +7,16 @@ the stop rule on consecutive values of log Z).
 
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
+from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult
+from probewise.nested.result import Agreement, NestedResult
 from probewise.nested.sampler import run, step
 from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, StopRule
 
 __all__ = [
+    "Agreement",
     "Bound",
     "DiversifyTally",
     "Evaluator",
@@ -28,8 +31,15 @@ __all__ = [
     "State",
     "StopRule",
     "Tally",
+    "Weighted",
+    "agreement_of",
+    "alive_at_death",
     "diversify",
     "diversify_by_kernels",
+    "merge",
+    "pareto_k",
+    "refine",
     "run",
     "step",
+    "update",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import NotConvergedError
+from probewise.nested.space import Space, space_of
 
 if TYPE_CHECKING:
     from probewise.priors import Prior
@@ -33,12 +35,14 @@ class Samplable(Protocol):
 class Points:
     """Hold evaluated points.
 
-    `u` in the unit cube and `theta` in parameters, both (n, n_params); `log_likelihood` (n,);
-    `label` (n,): a uniform number each, which orders points of equal likelihood.
+    `u` in the coordinates that chains step in (see `nested.space`) and `theta` in parameters, both
+    (n, n_params); `log_density` of the prior over `u` (n,); `log_likelihood` (n,); `label` (n,): a
+    uniform number each, which orders points of equal likelihood.
     """
 
     u: FloatArray
     theta: FloatArray
+    log_density: FloatArray
     log_likelihood: FloatArray
     label: FloatArray
 
@@ -47,7 +51,24 @@ class Points:
 
     def take(self, rows: IntArray | BoolArray | slice) -> Points:
         """Keep these rows."""
-        return Points(self.u[rows], self.theta[rows], self.log_likelihood[rows], self.label[rows])
+        return Points(
+            self.u[rows], self.theta[rows], self.log_density[rows], self.log_likelihood[rows], self.label[rows]
+        )
+
+    def copy(self) -> Points:
+        """Copy every array."""
+        return Points(
+            self.u.copy(),
+            self.theta.copy(),
+            self.log_density.copy(),
+            self.log_likelihood.copy(),
+            self.label.copy(),
+        )
+
+    def put(self, rows: IntArray | BoolArray, points: Points) -> None:
+        """Overwrite these rows."""
+        self.u[rows], self.theta[rows], self.log_density[rows] = points.u, points.theta, points.log_density
+        self.log_likelihood[rows], self.label[rows] = points.log_likelihood, points.label
 
     def order(self) -> IntArray:
         """Row numbers from worst to best, ties by label."""
@@ -59,6 +80,7 @@ class Points:
         return Points(
             np.concatenate([p.u for p in parts]),
             np.concatenate([p.theta for p in parts]),
+            np.concatenate([p.log_density for p in parts]),
             np.concatenate([p.log_likelihood for p in parts]),
             np.concatenate([p.label for p in parts]),
         )
@@ -83,30 +105,47 @@ class Bound:
 
 @dataclass
 class Evaluator:
-    """Evaluate points of the unit cube, count them, and name the parameters of a useless answer."""
+    """Evaluate points, count them, and name the parameters of a useless answer.
+
+    With an `executor` (any `concurrent.futures.Executor`) a batch is dealt out in `n_parts` parts; the
+    problem must then be one that the executor's workers can be sent. Answers come back in order, so
+    the run does not depend on it.
+    """
 
     problem: Samplable
     n_calls: int = 0
+    executor: Executor | None = None
+    n_parts: int = 1
     names: tuple[str, ...] = field(init=False)
+    space: Space = field(init=False)
 
     def __post_init__(self) -> None:
         self.names = self.problem.prior.names
+        self.space = space_of(self.problem.prior)
+
+    def from_prior(self, n: int, rng: np.random.Generator) -> Points:
+        """Draw from the prior and evaluate."""
+        return self(self.space.draw(n, rng=rng), rng)
 
     def __call__(self, u: FloatArray, rng: np.random.Generator) -> Points:
-        """Evaluate `u`, (n, n_params), and give every point a fresh label.
+        """Evaluate `u`, (n, n_params), which lies inside the space, and give every point a fresh label.
 
         Raises
         ------
         NotConvergedError
             If the likelihood raises, or returns the wrong shape, NaN or +inf; -inf (impossible) is allowed.
         """
-        theta = self.problem.prior.from_unit_cube(u)
-        return Points(u, theta, self.log_likelihood(theta), rng.random(len(u)))
+        theta, log_density = self.space.leave(u)
+        return self.weigh(u, theta, log_density, rng)
+
+    def weigh(self, u: FloatArray, theta: FloatArray, log_density: FloatArray, rng: np.random.Generator) -> Points:
+        """Evaluate what `space.leave` made of `u`, and give every point a fresh label."""
+        return Points(u, theta, log_density, self.log_likelihood(theta), rng.random(len(u)))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate hypotheses, (n, n_params) -> (n,), with the checks described above."""
         try:
-            raw = self.problem.log_likelihood(theta)
+            raw = self._asked(theta)
         except Exception as error:
             raise NotConvergedError(
                 f"the likelihood raised {type(error).__name__}: {error}; "
@@ -126,6 +165,12 @@ class Evaluator:
             )
         self.n_calls += len(theta)
         return values
+
+    def _asked(self, theta: FloatArray) -> FloatArray:
+        if self.executor is None or len(theta) < 2:
+            return self.problem.log_likelihood(theta)
+        parts = np.array_split(theta, min(self.n_parts, len(theta)))
+        return np.concatenate(list(self.executor.map(self.problem.log_likelihood, parts)))
 
     def _show(self, row: FloatArray) -> str:
         return ", ".join(f"{name} = {value:.10g}" for name, value in zip(self.names, row, strict=True))

@@ -12,6 +12,8 @@ from probewise._arrays import FloatArray, IntArray
 
 __all__ = ["Evidence", "insertion_p_value", "integrate", "log_volumes"]
 
+_SIMULATED_AT_A_TIME = 1_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -59,10 +61,16 @@ def integrate(
     log_weight = log_mass - log_z
     weight = np.exp(log_weight)
     information = float(weight @ np.where(weight > 0, log_likelihood - log_z, 0.0))
-    shrink = -rng.standard_exponential((n_simulations, len(n_at_death))) / n_at_death
-    starts = np.full((n_simulations, 1), log_start)
-    simulated = _log_shells(np.concatenate([starts, log_start + np.cumsum(shrink, axis=1)], axis=1))
-    spread = float(np.std(logsumexp(simulated + log_likelihood, axis=1), ddof=1))
+    n_dead = len(n_at_death)
+    simulated = np.empty(n_simulations)
+    # A few simulations at a time: a long run's all together would fill the memory.
+    size = max(1, _SIMULATED_AT_A_TIME // n_dead)
+    for first in range(0, n_simulations, size):
+        n = min(size, n_simulations - first)
+        shrink = -rng.standard_exponential((n, n_dead)) / n_at_death
+        edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
+        simulated[first : first + n] = logsumexp(_log_shells(edges) + log_likelihood, axis=1)
+    spread = float(np.std(simulated, ddof=1))
     return Evidence(
         log_z, float(np.hypot(spread, log_start_error)), information, log_weight, float(1.0 / (weight @ weight))
     )

@@ -120,24 +120,24 @@ class KernelMove:
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start; see `Move`."""
         n_chains = len(start)
+        space = evaluate.space
         kernels = Kernels.about(live, rng=rng)
         n_tries = n_chains * self.n_proposals
         u = kernels.draw(n_tries, rng=rng)
-        height = kernels.log_density(u)
-        inside = np.flatnonzero(((u >= 0.0) & (u <= 1.0)).all(axis=1))
+        log_target = -kernels.log_density(u)
+        inside = np.flatnonzero(((u >= space.low) & (u <= space.high)).all(axis=1))
         admitted = np.zeros(n_tries, dtype=bool)
         parts = [evaluate(u[rows], rng) for rows in np.array_split(inside, max(1, -(-inside.size // _BLOCK)))]
         tried = Points.join(*parts)
+        log_target[inside] += tried.log_density
         admitted[inside] = bound.admits(tried.log_likelihood, tried.label)
         log_odds = np.log(rng.random((self.n_proposals, n_chains)))
-        last = _decide(admitted, -height, -kernels.log_density(start.u), log_odds)
+        last = _decide(admitted, log_target, start.log_density - kernels.log_density(start.u), log_odds)
         where = np.empty(n_tries, dtype=np.int64)
         where[inside] = np.arange(inside.size)
         moved = last.index >= 0
-        ends = Points(start.u.copy(), start.theta.copy(), start.log_likelihood.copy(), start.label.copy())
-        rows = where[last.index[moved]]
-        ends.u[moved], ends.theta[moved] = tried.u[rows], tried.theta[rows]
-        ends.log_likelihood[moved], ends.label[moved] = tried.log_likelihood[rows], tried.label[rows]
+        ends = start.copy()
+        ends.put(moved, tried.take(where[last.index[moved]]))
         tally = Tally(inside.size, last.n_accepted)
         if last.n_accepted * self.patience < n_tries:
             ends, more = self.otherwise.draw(ends, bound, live, evaluate, rng)

@@ -8,14 +8,14 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 
 __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
-_FRAME, _DIFFERENCE, _HOP = 0, 1, 2
+_FRAME, _AXIS, _DIFFERENCE, _HOP = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Move(Protocol):
         bound
             The level and label that new points must exceed.
         live
-            All points known to satisfy the bound, in the unit cube, those of `start` included, (n, n_params).
+            All points known to satisfy the bound, in the evaluator's space, those of `start` included, (n, n_params).
         evaluate
             The problem.
         rng
@@ -76,7 +76,7 @@ class PriorRejection:
         wanted, found, parts, n_evaluated = len(start), 0, [], 0
         while found < wanted:
             batch = int(1.1 * (wanted - found) / self.volume) + 1
-            tried = evaluate(rng.random((batch, live.shape[1])), rng)
+            tried = evaluate.from_prior(batch, rng)
             kept = tried.take(bound.admits(tried.log_likelihood, tried.label))
             parts.append(kept)
             found += len(kept)
@@ -98,8 +98,14 @@ class SliceMove:
     reversible without it (Neal's limit m = 1), and evaluations are saved. Each chain goes to its
     next step when its own bracket has delivered, so the batches stay full.
 
-    Three kinds of steps, every one reversible by itself:
+    Where the prior is not even over the space that chains step in, a step first draws a level
+    below its density at the point, and candidates must lie above that too (Neal's auxiliary
+    height): refusing one for that reason costs no likelihood.
 
+    Four kinds of steps, every one reversible by itself:
+
+    - along the axes of the space, each on a scale drawn between the conditional and the marginal
+      sd of the live points: a parameter that the others do not confine goes far at once;
     - along random orthogonal frames in the metric of the live points, so that n_params successive
       steps cover every direction. Where the live points fall into clusters, each has its own
       metric and such a step stays within its cluster's part of space;
@@ -114,6 +120,8 @@ class SliceMove:
         Steps of a chain along frames and differences for each parameter.
     width
         Bracket width in units of the live points' sd along the line.
+    axes
+        Share of the steps that follow axes.
     differences
         Share of the steps that follow differences of live points.
     hops
@@ -122,8 +130,9 @@ class SliceMove:
         Candidates a step should need on average; the width is tuned to it.
     """
 
-    steps_per_param: float = 2.0
+    steps_per_param: float = 1.0
     width: float = 5.0
+    axes: float = 0.7
     differences: float = 0.1
     hops: int = 3
     target: float = 2.5
@@ -131,8 +140,8 @@ class SliceMove:
     def __post_init__(self) -> None:
         if not self.steps_per_param > 0:
             raise ParameterError("steps_per_param", self.steps_per_param, "greater than 0")
-        if not 0 <= self.differences <= 1:
-            raise ParameterError("differences", self.differences, "0 to 1")
+        if not (self.axes >= 0 and self.differences >= 0 and self.axes + self.differences <= 1):
+            raise ParameterError("(axes, differences)", (self.axes, self.differences), "0 or more, together at most 1")
         if self.hops < 0:
             raise ParameterError("hops", self.hops, "0 or more")
 
@@ -141,44 +150,56 @@ class SliceMove:
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start; see `Move`."""
         n_chains, n_params = start.u.shape
+        space = evaluate.space
         clusters = find_clusters(live)
         n_lines = max(2, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
+        kind = self._kinds(n_chains, n_steps, n_hops, rng)
         frames = _frames(n_chains, n_steps, n_params, rng)
-        kind = np.where(rng.random((n_chains, n_steps)) < self.differences, _DIFFERENCE, _FRAME)
-        kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
-        now = Points(start.u.copy(), start.theta.copy(), start.log_likelihood.copy(), start.label.copy())
+        axis = _axes(n_chains, n_steps, n_params, rng)
+        now = start.copy()
         home = clusters.assign(now.u)
         view = _View.of(clusters, start.u, home, live)
         line = np.empty((n_chains, n_params))
-        low, high = np.empty(n_chains), np.empty(n_chains)
+        low, high, level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
         moved = np.zeros(n_chains, dtype=bool)
         n_evaluated = n_tried = n_taken = 0
 
         def begin(rows: IntArray) -> None:
-            """Lay the next step's line and bracket."""
-            root = view.measures(rows, home[rows])[1]
-            line[rows] = self.width * np.einsum("nij,nj->ni", root, frames[rows, step[rows]])
-            follow = rows[kind[rows, step[rows]] == _DIFFERENCE]
+            """Lay the next step's line, bracket and level."""
+            root, inverse = view.measures(rows, home[rows])[1:3]
+            kinds, at = kind[rows, step[rows]], np.arange(rows.size)
+            toward = np.einsum("nij,nj->ni", root, frames[rows, step[rows]])
+            along = np.flatnonzero(kinds == _AXIS)
+            if along.size:
+                which = axis[rows[along], step[rows[along]]]
+                marginal = np.sqrt((root[along, which] ** 2).sum(axis=1))
+                conditional = 1.0 / np.sqrt((inverse[along, :, which] ** 2).sum(axis=1))
+                toward[along] = 0.0
+                toward[along, which] = conditional * (marginal / conditional) ** rng.random(along.size)
+            line[rows] = self.width * toward
+            follow = at[kinds == _DIFFERENCE]
             if follow.size:
                 n = len(live)
                 first = rng.integers(n - 1, size=follow.size)
                 second = (first + rng.integers(1, n - 1, size=follow.size)) % (n - 1)
                 # Counted from behind the chain's own start, so that neither is it.
-                behind = view.own_row[follow] + 1
-                line[follow] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
-            low[rows], high[rows] = _bracket(now.u[rows], line[rows], rng)
+                behind = view.own_row[rows[follow]] + 1
+                line[rows[follow]] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
+            low[rows], high[rows] = _bracket(now.u[rows], line[rows], space.low, space.high, rng)
+            level[rows] = now.log_density[rows] - rng.standard_exponential(rows.size)
 
         active = np.arange(n_chains)
         begin(active)
         while active.size:
             a, b = low[active], high[active]
             t = a + (b - a) * rng.random(active.size)
-            candidate = np.clip(now.u[active] + t[:, None] * line[active], 0.0, 1.0)
+            candidate = np.clip(now.u[active] + t[:, None] * line[active], space.low, space.high)
             hop = np.zeros(active.size, dtype=bool)
             place = home[active]
+            least = level[active]
             ok = np.ones(active.size, dtype=bool)
             if len(clusters) > 1:
                 kinds = kind[active, step[active]]
@@ -187,17 +208,23 @@ class SliceMove:
                 if hop.any():
                     rows = active[hop]
                     goal[hop] = (home[rows] + rng.integers(1, len(clusters), size=rows.size)) % len(clusters)
-                    candidate[hop], ok[hop] = view.hop(rows, now.u[rows], home[rows], goal[hop], rng)
+                    candidate[hop], log_growth = view.hop(rows, now.u[rows], home[rows], goal[hop])
+                    least[hop] -= log_growth
+                    ok[hop] = ((candidate[hop] >= space.low) & (candidate[hop] <= space.high)).all(axis=1)
                 place = clusters.assign(candidate)
                 ok &= (kinds == _DIFFERENCE) | (place == goal)
             asked = np.flatnonzero(ok)
             if asked.size:
-                tried = evaluate(candidate[asked], rng)
+                theta, log_density = space.leave(candidate[asked])
+                above = log_density >= least[asked]
+                ok[asked] = above
+                asked = asked[above]
+            if asked.size:
+                tried = evaluate.weigh(candidate[asked], theta[above], log_density[above], rng)
                 inside = bound.admits(tried.log_likelihood, tried.label)
                 ok[asked] = inside
-                taken, rows = active[asked[inside]], inside
-                now.u[taken], now.theta[taken] = tried.u[rows], tried.theta[rows]
-                now.log_likelihood[taken], now.label[taken] = tried.log_likelihood[rows], tried.label[rows]
+                taken = active[asked[inside]]
+                now.put(taken, tried.take(inside))
                 home[taken] = place[asked[inside]]
                 moved[taken] = True
                 n_evaluated += asked.size
@@ -215,6 +242,13 @@ class SliceMove:
                 begin(more)
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
+    def _kinds(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
+        """Say of every step of every chain which kind it is, (n_chains, n_steps)."""
+        lot = rng.random((n_chains, n_steps))
+        kind = np.where(lot < self.axes, _AXIS, np.where(lot < self.axes + self.differences, _DIFFERENCE, _FRAME))
+        kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
+        return kind
+
     def adapted(self, tally: Tally) -> SliceMove:
         """Widen or narrow the bracket towards `target` candidates a step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
@@ -226,6 +260,12 @@ def _frames(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator
     n_frames = -(-n_steps // n_params)
     frames = np.linalg.qr(rng.standard_normal((n_chains * n_frames, n_params, n_params)))[0]
     return np.asarray(frames.reshape(n_chains, n_frames * n_params, n_params)[:, :n_steps])
+
+
+def _axes(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
+    """Draw axes, (n_chains, n_steps), every one once before any comes again."""
+    n_turns = -(-n_steps // n_params)
+    return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,23 +298,21 @@ class _View:
             np.where(mine, own.log_det[rows], common.log_det[home]),
         )
 
-    def hop(
-        self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray, rng: np.random.Generator
-    ) -> tuple[FloatArray, BoolArray]:
-        """Map points to their counterparts in other clusters; say which the map's Jacobian and the cube let pass."""
+    def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Map points to their counterparts in other clusters; also the log of the volume they grow by."""
         mean, _, inverse, log_det = self.measures(rows, home)
         goal_mean, goal_root, _, goal_log_det = self.measures(rows, goal)
         z = np.einsum("nij,nj->ni", inverse, u - mean)
-        out = goal_mean + np.einsum("nij,nj->ni", goal_root, z)
-        passes = np.log(rng.random(len(u))) < goal_log_det - log_det
-        return out, passes & ((out >= 0) & (out <= 1)).all(axis=1)
+        return goal_mean + np.einsum("nij,nj->ni", goal_root, z), goal_log_det - log_det
 
 
-def _bracket(u: FloatArray, line: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Place a bracket of length one at random about each point, cut where the line leaves the unit cube."""
+def _bracket(
+    u: FloatArray, line: FloatArray, lowest: FloatArray, highest: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Place a bracket of length one at random about each point, cut where the line leaves the space."""
     low = -rng.random(len(u))
     with np.errstate(divide="ignore", invalid="ignore"):
-        to_zero, to_one = -u / line, (1.0 - u) / line
-    entry = np.where(line == 0, -np.inf, np.minimum(to_zero, to_one)).max(axis=1)
-    leave = np.where(line == 0, np.inf, np.maximum(to_zero, to_one)).min(axis=1)
+        to_low, to_high = (lowest - u) / line, (highest - u) / line
+    entry = np.where(line == 0, -np.inf, np.minimum(to_low, to_high)).max(axis=1)
+    leave = np.where(line == 0, np.inf, np.maximum(to_low, to_high)).min(axis=1)
     return np.maximum(low, entry), np.minimum(low + 1.0, leave)

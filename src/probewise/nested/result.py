@@ -4,22 +4,71 @@ from __future__ import annotations
 
 import io
 import json
+import math
+import platform
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import scipy
 
 from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
 from probewise._display import ShowsItself
+from probewise._version import __version__
 from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.nested import conversions
+from probewise.nested.evidence import log_volumes
 from probewise.recordings.atomic import write_bytes_atomically
 
-__all__ = ["NestedResult"]
+__all__ = ["Agreement", "NestedResult", "versions"]
 
-_FORMAT = "nested-result/1"
-_ARRAYS = ("theta", "log_likelihood", "log_weight", "log_birth", "insertion_rank")
+_FORMAT = "nested-result/2"
+_PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
+_COUNTS = ("n_at_death", "insertion_rank", "insertion_n_ranked")
+_ARRAYS = ("theta", *_PER_POINT, *_COUNTS)
+
+
+def versions() -> dict[str, str]:
+    """Give the versions of all that decides a run's numbers."""
+    return {
+        "probewise": __version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Say whether independent runs of one problem agree within the errors they claim.
+
+    Attributes
+    ----------
+    log_z, log_z_error
+        Of each run.
+    chi_square
+        Sum of the squared distances from the weighted mean, in units of each run's error.
+    p_value
+        Probability that runs whose errors are right lie as far apart (n_runs - 1 degrees of freedom).
+    """
+
+    log_z: tuple[float, ...]
+    log_z_error: tuple[float, ...]
+    chi_square: float
+    p_value: float
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs."""
+        return len(self.log_z)
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of ln Z between the runs."""
+        return float(np.std(self.log_z, ddof=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +81,16 @@ class NestedResult(ShowsItself):
         Parameters, one a column of theta.
     theta
         Dead points in order of death, the last live ones behind them, (n_dead, n_params).
-    log_likelihood, log_weight, log_birth
-        Of each: log likelihood, log posterior weight (the weights sum to one), and the log
-        likelihood level above which it was drawn, all (n_dead,).
+    log_likelihood, label, log_weight
+        Of each: log likelihood, the number from 0 to 1 that orders points of equal likelihood,
+        and log posterior weight (the weights sum to one), all (n_dead,).
+    log_birth, birth_label
+        Log likelihood and label of the dead point above which each was drawn, (n_dead,);
+        minus infinity and 1 where it was drawn from the whole prior.
+    n_at_death
+        Points alive when each died, itself included, (n_dead,).
+    log_start, log_start_error
+        Natural log of the share of the prior with a likelihood above zero, and its standard error.
     log_z, log_z_error
         Natural log of the evidence, and its standard error from simulated shrinkages.
     information
@@ -45,22 +101,30 @@ class NestedResult(ShowsItself):
         Likelihood evaluations and live points.
     stop_reason
         Why the run ended.
-    insertion_rank, insertion_p_value
-        Rank of each new point among those alive, and the probability that ranks of a right
-        sampler look as uneven as these.
+    insertion_rank, insertion_n_ranked
+        Rank of each new point among those alive, 0 to m, and m, both (n_inserted,).
+    insertion_p_value
+        Probability that ranks of a right sampler look as uneven as these.
     seed_state
-        State of the random generator at the start, as JSON.
-    version
-        The package's.
+        State of the random generator at the start, as JSON; a list of states for merged runs.
+    versions
+        Of probewise, numpy, scipy and python.
     warnings
         Why the result should not be trusted blindly; empty for a sound run.
+    agreement
+        How far the runs agree of which this result was merged; None for a single run.
     """
 
     names: tuple[str, ...]
     theta: FloatArray
     log_likelihood: FloatArray
+    label: FloatArray
     log_weight: FloatArray
     log_birth: FloatArray
+    birth_label: FloatArray
+    n_at_death: IntArray
+    log_start: float
+    log_start_error: float
     log_z: float
     log_z_error: float
     information: float
@@ -69,22 +133,29 @@ class NestedResult(ShowsItself):
     n_live: int
     stop_reason: str
     insertion_rank: IntArray
+    insertion_n_ranked: IntArray
     insertion_p_value: float
     seed_state: str
-    version: str
+    versions: Mapping[str, str]
     warnings: tuple[str, ...]
+    agreement: Agreement | None = None
 
     def __post_init__(self) -> None:
         theta = frozen(self.theta)
         if theta.ndim != 2 or theta.shape[1] != len(self.names):
             raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_dead, {len(self.names)}) for {self.names}")
         object.__setattr__(self, "theta", theta)
-        for name in ("log_likelihood", "log_weight", "log_birth"):
-            values = frozen(getattr(self, name))
-            if values.shape != (len(theta),):
-                raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(theta)},), one a row of theta")
-            object.__setattr__(self, name, values)
-        object.__setattr__(self, "insertion_rank", frozen_int(self.insertion_rank))
+        for name in _PER_POINT:
+            self._freeze(name, frozen(getattr(self, name)), len(theta), "a row of theta")
+        self._freeze("n_at_death", frozen_int(self.n_at_death), len(theta), "a row of theta")
+        rank = frozen_int(self.insertion_rank)
+        self._freeze("insertion_rank", rank, rank.size, "an inserted point")
+        self._freeze("insertion_n_ranked", frozen_int(self.insertion_n_ranked), rank.size, "an inserted point")
+
+    def _freeze(self, name: str, values: FloatArray | IntArray, n: int, one: str) -> None:
+        if values.shape != (n,):
+            raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n},), one {one}")
+        object.__setattr__(self, name, values)
 
     @property
     def weight(self) -> FloatArray:
@@ -96,24 +167,68 @@ class NestedResult(ShowsItself):
         """Number of weighted samples."""
         return len(self.theta)
 
+    @property
+    def log_volume(self) -> FloatArray:
+        """Natural log of the share of the prior expected above each sample, ln X, (n_dead,)."""
+        return log_volumes(self.n_at_death, self.log_start)
+
+    @property
+    def calls_per_live_point_and_nat(self) -> float:
+        """Likelihood evaluations for each live point and nat of information.
+
+        A live point costs at least one evaluation a nat, since n_live deaths shrink the volume by
+        one nat and each must be replaced; what exceeds one is the price of drawing above a bound.
+        """
+        return self.n_calls / (self.n_live * self.information) if self.information > 0 else math.inf
+
+    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
+        """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
+        if n < 1:
+            raise ParameterError("n", n, "1 or more")
+        ladder = np.cumsum(self.weight)
+        rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
+        return np.asarray(rng.permutation(np.minimum(rows, len(ladder) - 1)))
+
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
 
         Systematic resampling: a point of weight w occurs n w times, rounded up or down, so
         replications occur only where a weight exceeds 1 / n; `diversify` breaks them.
         """
-        if n < 1:
-            raise ParameterError("n", n, "1 or more")
-        ladder = np.cumsum(self.weight)
-        rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-        return np.asarray(self.theta[rng.permutation(np.minimum(rows, len(ladder) - 1))])
+        return np.asarray(self.theta[self.rows(n, rng=rng)])
 
-    def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
-        """Posterior mean of the parameters, (n_params,), or of `f(theta)` (n_dead, ...), of the trailing shape."""
-        values = self.theta if f is None else np.asarray(f(self.theta))
-        if len(values) != self.n_dead:
-            raise ShapeError(f"f(theta) has {len(values)} rows; allowed: {self.n_dead}, one a row of theta")
-        return np.asarray(np.tensordot(self.weight, values, axes=(0, 0)))
+    def mean(self, f: Callable[[FloatArray], FloatArray] | None = None, *, block: int | None = None) -> FloatArray:
+        """Average the parameters, or any function of them, over the posterior.
+
+        Parameters
+        ----------
+        f
+            From rows of theta, (n, n_params), to their values, (n, ...): an SSF field on pixels,
+            (n, n_v, n_u), say. The parameters themselves where not given.
+        block
+            Most rows that `f` is handed at a time, so that memory is bounded by one block's
+            values; all at once where not given.
+
+        Returns
+        -------
+        The posterior mean, of the shape of one row's value; (n_params,) without `f`.
+        """
+        if block is not None and block < 1:
+            raise ParameterError("block", block, "1 or more")
+        if f is None:
+            return np.asarray(self.weight @ self.theta)
+        size = self.n_dead if block is None else block
+        total: FloatArray | None = None
+        for first in range(0, self.n_dead, size):
+            theta, weight = self.theta[first : first + size], self.weight[first : first + size]
+            values = np.asarray(f(theta))
+            if values.shape[:1] != (len(theta),):
+                raise ShapeError(
+                    f"f(theta) has shape {values.shape}; allowed: {len(theta)} rows, as many as it was handed"
+                )
+            part = np.asarray(np.tensordot(weight, values, axes=(0, 0)))
+            total = part if total is None else total + part
+        return np.zeros(0) if total is None else total
 
     def covariance(self) -> FloatArray:
         """Posterior covariance of the parameters, (n_params, n_params)."""
@@ -153,10 +268,17 @@ class NestedResult(ShowsItself):
             f"log Z        {self.log_z:.2f} ± {self.log_z_error:.2f}",
             f"information  {self.information:.2f} nats",
             f"samples      {self.n_dead}, worth {self.n_eff:.0f} independent ones",
-            f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points",
+            f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points{self._efficiency()}",
             f"stopped      {self.stop_reason}",
             f"insertion    p = {self.insertion_p_value:.2g}",
         ]
+        if self.agreement is not None:
+            p = self.agreement.p_value
+            lines.append(f"runs         {self.agreement.n_runs}, ln Z agree with p = {p:.2g}")
+        if self.log_start < 0:
+            share = math.exp(self.log_start)
+            lines.append(f"possible     {share:.3g} ± {share * self.log_start_error:.1g} of the prior")
+        lines.append("made with    " + ", ".join(f"{name} {number}" for name, number in self.versions.items()))
         if self.names:
             width = max(9, *(len(name) for name in self.names))
             low, high = self.interval(0.95)
@@ -167,9 +289,22 @@ class NestedResult(ShowsItself):
             ]
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
 
+    def _efficiency(self) -> str:
+        each = self.calls_per_live_point_and_nat
+        return f", {each:.3g} for each live point and nat" if math.isfinite(each) else ""
+
+    def to_anesthetic(self) -> Any:
+        """Convert to `anesthetic.NestedSamples`; see `probewise.nested.conversions.to_anesthetic`."""
+        return conversions.to_anesthetic(self)
+
+    def to_arviz(self, *, rng: np.random.Generator, n: int | None = None) -> Any:
+        """Convert to ArviZ's container of samples; see `probewise.nested.conversions.to_arviz`."""
+        return conversions.to_arviz(self, rng=rng, n=n)
+
     def save(self, path: str | Path) -> None:
         """Write everything to one .npz file, in one piece or not at all."""
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
+        head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         buffer = io.BytesIO()
         np.savez_compressed(
@@ -190,16 +325,23 @@ class NestedResult(ShowsItself):
             # Opened here, since np.load leaves a damaged file open.
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
                 head = json.loads(str(file["head"]))
-                arrays = {name: file[name] for name in _ARRAYS}
+                found = head.pop("format", None) if isinstance(head, dict) else None
+                # Before the arrays, which another version may store under other names.
+                arrays = {name: file[name] for name in _ARRAYS} if found == _FORMAT else {}
         except FileNotFoundError:
             raise
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise FileError(path, f"unreadable ({error})", "a file written by NestedResult.save") from error
-        found = head.pop("format", None) if isinstance(head, dict) else None
         if found != _FORMAT:
             raise FileError(path, f"format {found!r}", f"{_FORMAT!r}; make the file anew with this version")
-        missing = {f.name for f in fields(cls)} - set(head) - set(_ARRAYS)
-        if missing:
-            raise FileError(path, f"without {', '.join(sorted(missing))}", "every field that NestedResult.save writes")
+        wanted = {f.name for f in fields(cls)} - set(_ARRAYS)
+        if set(head) != wanted:
+            odd = ", ".join(sorted(set(head) ^ wanted))
+            raise FileError(path, f"fields {odd} missing or unknown", "the fields that NestedResult.save writes")
         head["names"], head["warnings"] = tuple(head["names"]), tuple(head["warnings"])
+        runs = head["agreement"]
+        if runs is not None:
+            head["agreement"] = Agreement(
+                tuple(runs["log_z"]), tuple(runs["log_z_error"]), runs["chi_square"], runs["p_value"]
+            )
         return cls(**head, **arrays)

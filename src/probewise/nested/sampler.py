@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, IntArray
-from probewise._version import __version__
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested.checkpoint import Dead, Keeper, Live, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import insertion_p_value, integrate, log_volumes
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult
+from probewise.nested.result import NestedResult, versions
 from probewise.nested.stop import RemainingEvidence, State, StopRule
 
 __all__ = ["Dead", "Live", "run", "step"]
@@ -28,30 +30,6 @@ _PRIOR_VOLUME = 0.05
 _DOUBTFUL_P_VALUE = 1e-4
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class Live:
-    """Hold the live points, the likelihood level each was born above (n_live,), and the log volume they fill."""
-
-    points: Points
-    log_birth: FloatArray
-    log_volume: float
-
-
-@dataclass(frozen=True, eq=False)
-class Dead:
-    """Hold the points that one round removed, worst first, and how their successors came in.
-
-    `n_at_death`: points alive when each died, itself included. `rank`, `n_ranked`: how many of
-    the `n_ranked` points alive at a successor's insertion were worse than it.
-    """
-
-    points: Points
-    log_birth: FloatArray
-    n_at_death: IntArray
-    rank: IntArray
-    n_ranked: IntArray
 
 
 def step(
@@ -77,10 +55,11 @@ def step(
     n_ranked = len(spared) + np.arange(n_replaced)
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    dead = Dead(live.points.take(doomed), live.log_birth[doomed], n_at_death, rank, n_ranked)
+    dead = Dead(live.points.take(doomed), live.log_birth[doomed], live.birth_label[doomed], n_at_death, rank, n_ranked)
     births = np.concatenate([live.log_birth[spared], np.full(n_replaced, bound.log_likelihood)])
+    labels = np.concatenate([live.birth_label[spared], np.full(n_replaced, bound.label)])
     log_volume = float(log_volumes(n_at_death, live.log_volume)[-1])
-    return Live(points, births, log_volume), dead, tally
+    return Live(points, births, labels, log_volume), dead, tally
 
 
 def run(
@@ -93,6 +72,11 @@ def run(
     n_replaced: int | None = None,
     progress: Callable[[State], None] | None = None,
     max_calls: int | None = None,
+    checkpoint: str | Path | None = None,
+    checkpoint_every_s: float = 10.0,
+    executor: Executor | None = None,
+    n_workers: int | None = None,
+    return_interrupted: bool = True,
 ) -> NestedResult:
     """Compute the evidence of a problem and draw from its posterior (paper, section on SSF estimation).
 
@@ -110,11 +94,25 @@ def run(
         How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior
         is alive, points are drawn from the prior itself.
     n_replaced
-        Points replaced in one round; default a quarter of `n_live`.
+        Points replaced in one round; default half of `n_live`. The volume lost is counted exactly
+        whatever it is; with half, batches are large, 28 % fewer points are drawn than one by one
+        and the variance of log Z is 44 % greater.
     progress
         Called with a `State` after every round.
     max_calls
         Likelihood evaluations after which the run ends early with what it has.
+    checkpoint
+        File that the run is saved to as it goes, whole or not at all. Where it exists already
+        the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill.
+    checkpoint_every_s
+        Seconds between savings, at least.
+    executor
+        Where the likelihood is evaluated, for one that is slow; by default here. Each batch is
+        dealt out in `n_workers` parts; the result does not depend on it.
+    n_workers
+        Parts of a batch; default the number of processors.
+    return_interrupted
+        Whether Ctrl-C returns the result so far, doubtful and saying so; else it raises `KeyboardInterrupt`.
 
     Returns
     -------
@@ -128,85 +126,109 @@ def run(
     NotConvergedError
         If the likelihood fails (`partial` holds the result so far, if there is one), or every
         hypothesis drawn from the prior is impossible.
+    FileError
+        If the checkpoint is damaged, or of a run with another problem, other settings or another seed.
     """
-    evaluate = Evaluator(problem)
+    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
     least = max(2 * n_params, 10)
     if n_live < least:
         raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
     if n_replaced is None:
-        n_replaced = max(1, n_live // 4)
+        n_replaced = n_live // 2
     elif not 1 <= n_replaced <= n_live // 2:
         raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
     if max_calls is not None and max_calls < n_live:
         raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
+    if n_workers is not None and n_workers < 1:
+        raise ParameterError("n_workers", n_workers, "1 or more")
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(_plain(rng.bit_generator.state))
     if n_params == 0:
         return _without_parameters(evaluate, n_live, seed_state)
     moving: Move = SliceMove() if move is None else move
-    live, log_start_error, notes = _first_points(evaluate, moving, n_live, max_calls, rng)
-    log_start = live.log_volume
-    dead: list[Dead] = []
-    log_z, n_stuck, last_cost = -math.inf, 0, 0
+    keeper = None
+    if checkpoint is not None:
+        settings = settings_of(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
+        keeper = Keeper(Path(checkpoint), checkpoint_every_s, settings)
+    resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
+    now = _first(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
 
-    def finish(reason: str, doubts: tuple[str, ...]) -> NestedResult:
-        return _result(
-            evaluate, live, dead, (log_start, log_start_error), n_live, reason, doubts, seed_state, rng.spawn(1)[0]
-        )
+    def finish(now: Run, reason: str, *more_notes: str) -> NestedResult:
+        if keeper is not None:
+            keeper.save(now)
+        noted = replace(now, notes=(*now.notes, *more_notes))
+        return _result(evaluate, noted, n_live, reason, seed_state, rng.spawn(1)[0])
 
     try:
         while True:
-            if max_calls is not None and evaluate.n_calls + last_cost > max_calls:
-                reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
-                notes = (*notes, f"{reason}; log Z lacks what a full run would have found")
+            if now.ended is not None:
+                result = finish(now, now.ended)
                 break
-            volume = math.exp(live.log_volume - log_start)
-            whole = math.exp(live.log_volume)
-            if whole > _PRIOR_VOLUME:
-                live, gone, tally = step(live, PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng)
-            else:
-                live, gone, tally = step(live, moving, evaluate, n_replaced=n_replaced, rng=rng)
-                moving = moving.adapted(tally)
-                n_stuck += tally.n_stuck
-            last_cost = tally.n_evaluated
-            edges = math.log(volume) + log_start + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
-            log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + gone.points.log_likelihood
-            before = float(logsumexp(np.concatenate([[log_z], log_mass[:-1]])))
-            log_z = float(np.logaddexp(before, log_mass[-1]))
-            dead.append(gone)
-            best = float(live.points.log_likelihood.max())
-            state = State(
-                n_dead=len(dead) * n_replaced,
-                n_calls=evaluate.n_calls,
-                log_z=log_z,
-                log_z_remaining=best + live.log_volume,
-                last_change=log_z - before,
-                log_volume=live.log_volume,
-                best_log_likelihood=best,
-            )
+            # A round can cost twice the one before: the volume halves while points come from the prior.
+            if max_calls is not None and evaluate.n_calls + 2 * now.last_cost > max_calls:
+                reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
+                result = finish(now, reason, f"{reason}; log Z lacks what a full run would have found")
+                break
+            now, state = _round(now, evaluate, n_replaced, rng)
             if progress is not None:
                 progress(state)
-            verdict = rule(state)
-            if verdict is not None:
-                reason = verdict
-                break
+            now = replace(now, ended=rule(state))
+            if keeper is not None:
+                keeper.save_if_due(now)
     except NotConvergedError as error:
-        if dead:
-            error.partial = finish("the likelihood failed", (*notes, f"the likelihood failed: {error}"))
+        if now.dead:
+            error.partial = finish(now, "the likelihood failed", f"the likelihood failed: {error}")
         raise
-    if n_stuck > _STUCK_SHARE * len(dead) * n_replaced:
-        notes = (*notes, f"{n_stuck} of {len(dead) * n_replaced} chains could not leave their start")
-    result = finish(reason, notes)
+    except KeyboardInterrupt:
+        if not now.dead or not return_interrupted:
+            if keeper is not None:
+                keeper.save(now)
+            raise
+        result = finish(now, "interrupted", "interrupted; log Z lacks what a full run would have found")
     for note in result.warnings:
         warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
     return result
 
 
-def _first_points(
-    evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator
-) -> tuple[Live, float, tuple[str, ...]]:
-    """Draw live points from the possible part of the prior; also the error of its log volume, and notes.
+def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, State]:
+    """Replace points once and add up what died; nothing is changed before it is complete."""
+    live, moving = now.live, now.moving
+    whole = math.exp(live.log_volume)
+    chains = whole <= _PRIOR_VOLUME
+    fresh, gone, tally = step(
+        live, moving if chains else PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng
+    )
+    edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
+    log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + gone.points.log_likelihood
+    before = float(logsumexp(np.concatenate([[now.log_z], log_mass[:-1]])))
+    log_z = float(np.logaddexp(before, log_mass[-1]))
+    best = float(fresh.points.log_likelihood.max())
+    state = State(
+        n_dead=(len(now.dead) + 1) * n_replaced,
+        n_calls=evaluate.n_calls,
+        log_z=log_z,
+        log_z_remaining=best + fresh.log_volume,
+        last_change=log_z - before,
+        log_volume=fresh.log_volume,
+        best_log_likelihood=best,
+    )
+    after = replace(
+        now,
+        live=fresh,
+        dead=(*now.dead, gone),
+        moving=moving.adapted(tally) if chains else moving,
+        log_z=log_z,
+        n_stuck=now.n_stuck + (tally.n_stuck if chains else 0),
+        last_cost=tally.n_evaluated,
+        n_calls=evaluate.n_calls,
+        rng_state=rng.bit_generator.state,
+    )
+    return after, state
+
+
+def _first(evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator) -> Run:
+    """Draw live points from the possible part of the prior.
 
     Impossible hypotheses (zero likelihood) are counted and thrown away: the share m / n of
     possible ones is where the volume starts. Where they are rare, chains fill up what is missing.
@@ -218,7 +240,7 @@ def _first_points(
     while found < n_live and drawn < most:
         share = max(found, 0.5) / drawn if drawn else 1.0
         batch = min(int(1.1 * (n_live - found) / share) + 1 if drawn else n_live, 4 * n_live, most - drawn)
-        tried = evaluate(rng.random((batch, n_params)), rng)
+        tried = evaluate.from_prior(batch, rng)
         possible = np.flatnonzero(np.isfinite(tried.log_likelihood))
         if found + possible.size > n_live:
             possible = possible[: n_live - found]
@@ -240,29 +262,26 @@ def _first_points(
         notes = (f"only {found} of {drawn} hypotheses drawn from the prior are possible",)
         bound = Bound(-math.inf, 1.0)
         start = points.take(rng.integers(found, size=n_live - found))
-        cloud = points.u if found > n_params else np.concatenate([points.u, rng.random((n_live, n_params))])
+        cloud = points.u if found > n_params else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
         more, _ = move.draw(start, bound, cloud, evaluate, rng)
         points = Points.join(points, more)
-    return Live(points, np.full(n_live, -np.inf), log_volume), error, notes
+    live = Live(points, np.full(n_live, -np.inf), np.ones(n_live), log_volume)
+    return Run(live, (), move, log_volume, error, notes, n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
 
 
 def _result(
-    evaluate: Evaluator,
-    live: Live,
-    dead: list[Dead],
-    log_start: tuple[float, float],
-    n_live: int,
-    reason: str,
-    notes: tuple[str, ...],
-    seed_state: str,
-    rng: np.random.Generator,
+    evaluate: Evaluator, now: Run, n_live: int, reason: str, seed_state: str, rng: np.random.Generator
 ) -> NestedResult:
     """Let the live points die where they are and sum up."""
+    live, dead, notes = now.live, now.dead, now.notes
+    n_dead = sum(len(d.points) for d in dead)
+    if now.n_stuck > _STUCK_SHARE * n_dead:
+        notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
     order = live.points.order()
     points = Points.join(*(d.points for d in dead), live.points.take(order))
     n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(n_live, 0, -1)])
     evidence = integrate(
-        points.log_likelihood, n_at_death, rng=rng, log_start=log_start[0], log_start_error=log_start[1]
+        points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
@@ -281,7 +300,12 @@ def _result(
         theta=points.theta,
         log_likelihood=points.log_likelihood,
         log_weight=evidence.log_weight,
+        label=points.label,
         log_birth=np.concatenate([*(d.log_birth for d in dead), live.log_birth[order]]),
+        birth_label=np.concatenate([*(d.birth_label for d in dead), live.birth_label[order]]),
+        n_at_death=n_at_death,
+        log_start=now.log_start,
+        log_start_error=now.log_start_error,
         log_z=evidence.log_z,
         log_z_error=evidence.log_z_error,
         information=evidence.information,
@@ -290,9 +314,10 @@ def _result(
         n_live=n_live,
         stop_reason=reason,
         insertion_rank=rank,
+        insertion_n_ranked=n_ranked,
         insertion_p_value=p_value,
         seed_state=seed_state,
-        version=__version__,
+        versions=versions(),
         warnings=notes,
     )
 
@@ -308,7 +333,12 @@ def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> Ne
         theta=theta,
         log_likelihood=log_likelihood,
         log_weight=np.zeros(1),
+        label=np.zeros(1),
         log_birth=np.full(1, -np.inf),
+        birth_label=np.ones(1),
+        n_at_death=np.ones(1, dtype=np.int64),
+        log_start=0.0,
+        log_start_error=0.0,
         log_z=float(log_likelihood[0]),
         log_z_error=0.0,
         information=0.0,
@@ -317,9 +347,10 @@ def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> Ne
         n_live=n_live,
         stop_reason="no free parameters: the likelihood is the evidence",
         insertion_rank=np.empty(0, dtype=np.int64),
+        insertion_n_ranked=np.empty(0, dtype=np.int64),
         insertion_p_value=1.0,
         seed_state=seed_state,
-        version=__version__,
+        versions=versions(),
         warnings=(),
     )
 

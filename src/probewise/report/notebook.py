@@ -17,9 +17,9 @@ from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Markup, element, figure, paragraph, table
 from probewise.report.plots import (
+    corner_plot,
     hypothesis_probabilities,
     png,
-    posterior_pairs,
     posterior_widths,
     readings_by_orientation,
     spatial_sensitivity,
@@ -31,6 +31,7 @@ from probewise.sensor import SSFField
 __all__: list[str] = []
 
 DPI = 70  # notebooks keep every picture: small files
+MOST_PARAMETERS = 6  # of a run's picture in a notebook: compact; `corner_plot` draws all of them
 
 
 def _card(*parts: Markup) -> str:
@@ -75,8 +76,10 @@ def _(value: NestedResult) -> str:
     text = Markup(f"<pre>{html.escape(value.summary())}</pre>")
     if not value.names:
         return _card(text)
-    drawn = posterior_pairs(value.names, value.theta, value.weight)
-    return _card(figure(png(drawn, dpi=DPI), "Posterior: each parameter, and each pair"), text)
+    drawn = corner_plot(value, parameters=value.names[:MOST_PARAMETERS])
+    left_out = len(value.names) - MOST_PARAMETERS
+    of = f" of the first {MOST_PARAMETERS} of {len(value.names)} parameters" if left_out > 0 else ""
+    return _card(figure(png(drawn, dpi=DPI), f"Posterior{of}: each by itself, and each pair"), text)
 
 
 @render_html.register

@@ -63,6 +63,12 @@ class Placed:
         low, high = self._room(own)
         return np.concatenate([low + (high - low) * u[:, :2], own], axis=1)
 
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Map parameters to the unit cube, both (n_samples, n_params)."""
+        low, high = self._room(theta[:, 2:])
+        centre = np.clip((theta[:, :2] - low) / np.maximum(high - low, 1e-300), 0.0, 1.0)
+        return np.concatenate([centre, self.own.to_unit_cube(theta[:, 2:])], axis=1)
+
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples,); -inf outside the support."""
         own = self.own.log_prob(theta[:, 2:])
@@ -138,6 +144,12 @@ class _EllipseOwn:
         low, high = self.bounds_mm
         major = low + (high - low) * u[:, 0]
         return np.stack([major, low + (major - low) * u[:, 1], np.pi * u[:, 2]], axis=1)
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        low, high = self.bounds_mm
+        major, minor, angle = theta.T
+        share = (minor - low) / np.maximum(major - low, 1e-300)
+        return np.asarray(np.clip(np.stack([(major - low) / (high - low), share, angle / np.pi], axis=1), 0.0, 1.0))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         low, high = self.bounds_mm
@@ -296,6 +308,19 @@ class _AnyOfPrior:
             taken = which == k
             theta[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
         return theta
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        ends = np.concatenate([[0.0], np.cumsum(self.weights)])
+        u = np.empty_like(theta)
+        u[:, 0] = np.interp(theta[:, 0], np.arange(len(ends)), ends)
+        which = self.which(theta)
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
+            values = shape.prior.to_unit_cube(theta[:, columns])
+            own = columns > len(self.shared)
+            u[:, columns[own]] = values[:, own]
+            taken = which == k
+            u[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
+        return u
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         which = self.which(theta)

@@ -2,11 +2,12 @@
 
 Data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
 predicted against recorded (figure 7), the entropy map with its hypotheses (figures 2 and 8);
-beside them progress towards the precision asked for, and what a diagnosis found.
+beside them progress towards the precision asked for, what a diagnosis found, and what judges a
+run of nested sampling.
 """
 
 from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
-from probewise.report.plots.posterior import posterior_pairs
+from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
 from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
@@ -18,18 +19,21 @@ from probewise.report.plots.witness import witness
 __all__ = [
     "AxesGrid",
     "calibration_check",
+    "corner_plot",
     "grid_of_axes",
     "hypothesis_probabilities",
     "information_gained",
+    "insertion_plot",
     "log_evidences",
     "playing_field",
     "png",
-    "posterior_pairs",
     "posterior_widths",
     "predicted_against_recorded",
     "readings_by_orientation",
     "residuals_against",
+    "run_plot",
     "spatial_sensitivity",
     "ssf_by_order",
+    "trace_plot",
     "witness",
 ]

@@ -1,0 +1,55 @@
+"""
+What nested sampling costs
+==========================
+
+Shows how evaluations, cpu time and memory of a run grow with the number of parameters, readings, live points and
+iterations. The numbers are measured by ``python -m nested_sampling.scaling`` in ``benchmarks/`` and stored; nothing
+random is drawn here.
+"""
+
+# %%
+import json
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+file = next(p for p in (Path("docs"), Path("../docs")) if p.is_dir()) / "results" / "nested_scaling.json"
+studies = json.loads(file.read_text(encoding="utf-8"))["studies"]
+for name, study in studies.items():
+    print(f"{name}: probewise {study['version']}, {study['date']}, {study['command']}")
+
+
+def draw(name, label, quantities):
+    """Plot quantities of one study against its size, logarithmic axes, a panel each."""
+    points = studies[name]["points"]
+    _, axes = plt.subplots(1, len(quantities), figsize=(3.4 * len(quantities), 3), layout="constrained")
+    for ax, (key, title) in zip(axes, quantities.items(), strict=True):
+        ax.loglog([p["size"] for p in points], [p[key] for p in points], "o-")
+        ax.set(xlabel=label, ylabel=title)
+        ax.grid(True, which="both", alpha=0.3)
+
+
+cost = {
+    "n_evaluations": "evaluations",
+    "cpu_s": "cpu time / s",
+    "per_live_point_and_nat": "evaluations per live point and nat",
+}
+
+# %%
+# A correlated Gaussian in more and more dimensions. Information grows in proportion to the dimension, and so does the
+# length of a chain. One evaluation per live point and nat would be the least possible.
+draw("dimension", "parameters", cost)
+
+# %%
+# One Gaussian of the sensor's sensitivity, from denser and denser scans. The posterior narrows as the readings
+# multiply, so the information grows by half a nat a parameter for each factor e; the rest is the likelihood's own cost.
+draw("readings", "readings", cost)
+
+# %%
+# The Gaussian in ten dimensions with more and more live points: the error falls with their root.
+draw("live points", "live points", {**cost, "log_z_error": "error of log Z / nats"})
+
+# %%
+# Memory, with 300 live points and twenty parameters: what the result stores grows with the iterations, as it must;
+# beside it is what the run itself holds at its peak.
+draw("iterations", "iterations", {"stored_mb": "stored / MB", "beside_mb": "peak beside it / MB"})

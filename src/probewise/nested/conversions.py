@@ -1,0 +1,126 @@
+"""Hand a result to the libraries that others analyse samples with: anesthetic and ArviZ, both optional."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+
+if TYPE_CHECKING:
+    from probewise.nested.result import NestedResult
+
+__all__ = ["to_anesthetic", "to_arviz"]
+
+
+def to_anesthetic(result: NestedResult) -> Any:
+    """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.
+
+    anesthetic counts the live points anew from births and deaths, and knows no labels. Where the
+    likelihood is exactly constant the levels are therefore spread by single units in the last
+    place, in the order of the labels. It also knows nothing of impossible hypotheses (zero
+    likelihood): where there are some, `log_start` is added to every level, which leaves the product
+    of prior and likelihood as it is, the prior being that of the possible ones alone. So its
+    evidence is ours.
+
+    Raises
+    ------
+    ImportError
+        If anesthetic is not installed.
+    """
+    anesthetic = _optional("anesthetic")
+    death, birth = _strict_levels(result)
+    return anesthetic.NestedSamples(
+        data=np.array(result.theta), columns=list(result.names), logL=death, logL_birth=birth, label="probewise"
+    )
+
+
+def to_arviz(result: NestedResult, *, rng: np.random.Generator, n: int | None = None) -> Any:
+    """Convert to ArviZ's container: `n` equally weighted samples as one chain, with evidence as attributes.
+
+    Parameters
+    ----------
+    result
+        What to convert.
+    rng
+        Draws the samples.
+    n
+        Number of samples; by default the effective number, so that few are replications.
+
+    Returns
+    -------
+    arviz.InferenceData, or xarray.DataTree from ArviZ 1.0 on
+        Group `posterior` has a variable for each parameter, group `sample_stats` each sample's
+        log likelihood `log_l`, the level `log_l_birth` it was drawn above and its `row` in the result, all of
+        dimensions (chain, draw).
+
+    Raises
+    ------
+    ImportError
+        If arviz is not installed.
+    """
+    arviz = _optional("arviz")
+    if not result.names:
+        raise ParameterError("names", result.names, "one parameter or more; without any there are no samples")
+    rows = result.rows(max(1, int(result.n_eff)) if n is None else n, rng=rng)
+    groups = {
+        "posterior": {name: result.theta[None, rows, i] for i, name in enumerate(result.names)},
+        "sample_stats": {
+            "log_l": result.log_likelihood[None, rows],
+            "log_l_birth": result.log_birth[None, rows],
+            "row": rows[None, :],
+        },
+    }
+    attributes = {
+        "inference_library": "probewise",
+        "inference_library_version": result.versions["probewise"],
+        "log_z": result.log_z,
+        "log_z_error": result.log_z_error,
+        "information_nats": result.information,
+        "n_eff": result.n_eff,
+        "n_calls": result.n_calls,
+        "n_live": result.n_live,
+        "stop_reason": result.stop_reason,
+        "warnings": json.dumps(result.warnings),
+    }
+    # ArviZ 1.0 takes all groups as one mapping, earlier versions one argument a group.
+    if "data" in inspect.signature(arviz.from_dict).parameters:
+        return arviz.from_dict(groups, attrs={"/": attributes})
+    return arviz.from_dict(**groups, attrs=attributes)
+
+
+def _strict_levels(result: NestedResult) -> tuple[FloatArray, FloatArray]:
+    """Log likelihoods at death and birth, (n_dead,), equal ones spread apart in the order of their labels."""
+    order = np.lexsort((result.label, result.log_likelihood))
+    strict = result.log_likelihood[order] + result.log_start
+    for i in range(1, len(strict)):
+        if strict[i] <= strict[i - 1]:
+            strict[i] = np.nextafter(strict[i - 1], np.inf)
+    death = np.empty_like(strict)
+    death[order] = strict
+    # A birth level is a dead point's level and label: how many dead points lie at or below it?
+    both_level = np.concatenate([result.log_likelihood, result.log_birth])
+    both_label = np.concatenate([result.label, result.birth_label])
+    kind = np.repeat([0, 1], result.n_dead)
+    ranked = np.lexsort((kind, both_label, both_level))
+    n_below = np.cumsum(ranked < result.n_dead)
+    born = ranked >= result.n_dead
+    at = np.empty(result.n_dead, dtype=np.int64)
+    at[ranked[born] - result.n_dead] = n_below[born]
+    return death, np.where(at > 0, strict[at - 1], -np.inf)
+
+
+def _optional(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"{name} cannot be imported ({error}); install it with: pip install {name}, "
+            "or pip install 'probewise[convert]'"
+        ) from error

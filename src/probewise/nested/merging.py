@@ -1,0 +1,198 @@
+"""Join independent runs of one problem into one result, and ask whether they agree (Higson et al. 2019)."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.nested.evidence import integrate
+from probewise.nested.result import Agreement, NestedResult, versions
+
+__all__ = ["agreement_of", "alive_at_death", "merge"]
+
+# Runs that differ more than this improbably disagree: one false alarm in 1000 merges.
+_DISAGREE = 1e-3
+_DOUBTFUL_P_VALUE = 1e-4
+
+
+def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
+    """Join independent runs of the same problem into one run with the live points of all.
+
+    A point is alive between the level it was drawn above and its own. Sorted together by level,
+    the points of all runs are a run whose number of live points is the sum of theirs at that
+    level (Higson, Handley, Hobson & Lasenby 2019, section 4), whatever the numbers of live points
+    and wherever each run stopped; the labels make the count exact on plateaus. Merged runs may be merged
+    again. The error of ln Z falls as one over the root of the number of runs.
+
+    Parameters
+    ----------
+    results
+        Two runs or more, of different seeds.
+    rng
+        For the error of ln Z; see `probewise.nested.evidence.integrate`.
+
+    Returns
+    -------
+    NestedResult
+        With `agreement`: where the runs' evidences lie further apart than their errors allow
+        (p < 0.001) a warning says so and the error is no less than their scatter.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two runs, or they have other parameters, share a seed, or hold no
+        complete record of births and deaths.
+    """
+    parts = tuple(results)
+    seeds = _check(parts)
+    log_likelihood = np.concatenate([r.log_likelihood for r in parts])
+    label = np.concatenate([r.label for r in parts])
+    order = np.lexsort((label, log_likelihood))
+    log_likelihood, label = log_likelihood[order], label[order]
+    log_birth = np.concatenate([r.log_birth for r in parts])[order]
+    birth_label = np.concatenate([r.birth_label for r in parts])[order]
+    n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
+    log_start, log_start_error = _possible_share(parts)
+    evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
+    agreement = agreement_of(parts)
+    p_value = _combined([r.insertion_p_value for r in parts])
+    doubts, error = [], evidence.log_z_error
+    if agreement.p_value < _DISAGREE:
+        doubts.append(
+            f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
+            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}), so that some missed a part of the posterior; "
+            "the error is widened to their scatter; use more n_live or longer chains"
+        )
+        error = max(error, agreement.scatter)
+    if p_value < _DOUBTFUL_P_VALUE:
+        doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
+    for doubt in doubts:
+        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
+    said = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
+    return NestedResult(
+        names=parts[0].names,
+        theta=np.concatenate([r.theta for r in parts])[order],
+        log_likelihood=log_likelihood,
+        label=label,
+        log_weight=evidence.log_weight,
+        log_birth=log_birth,
+        birth_label=birth_label,
+        n_at_death=n_at_death,
+        log_start=log_start,
+        log_start_error=log_start_error,
+        log_z=evidence.log_z,
+        log_z_error=error,
+        information=evidence.information,
+        n_eff=evidence.n_eff,
+        n_calls=sum(r.n_calls for r in parts),
+        n_live=sum(r.n_live for r in parts),
+        stop_reason=f"merged {len(parts)} runs: " + "; ".join(dict.fromkeys(r.stop_reason for r in parts)),
+        insertion_rank=np.concatenate([r.insertion_rank for r in parts]),
+        insertion_n_ranked=np.concatenate([r.insertion_n_ranked for r in parts]),
+        insertion_p_value=p_value,
+        seed_state=json.dumps(seeds),
+        versions=versions(),
+        warnings=(*doubts, *said),
+        agreement=agreement,
+    )
+
+
+def agreement_of(results: Iterable[NestedResult]) -> Agreement:
+    """Compare the evidences of independent runs by chi-square; merged ones count as the runs they were made of."""
+    log_z, log_z_error = list[float](), list[float]()
+    for result in results:
+        runs = result.agreement
+        log_z += [result.log_z] if runs is None else runs.log_z
+        log_z_error += [result.log_z_error] if runs is None else runs.log_z_error
+    if len(log_z) < 2:
+        raise ParameterError("results", f"{len(log_z)} runs", "two runs or more")
+    weight = 1.0 / np.square(log_z_error)
+    middle = float(weight @ log_z / weight.sum())
+    chi_square = float(weight @ np.square(np.asarray(log_z) - middle))
+    return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chi2.sf(chi_square, len(log_z) - 1)))
+
+
+def alive_at_death(
+    log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
+) -> IntArray:
+    """Count the points alive at each death from levels of birth and death alone.
+
+    Parameters
+    ----------
+    log_likelihood, label
+        Level of each point's death, (n_dead,); ties of likelihood are ordered by label.
+    log_birth, birth_label
+        Level above which each was drawn, (n_dead,).
+
+    Returns
+    -------
+    Points born strictly below each death and not yet dead, itself included, (n_dead,).
+    """
+    n = len(log_likelihood)
+    born = np.repeat([0, 1], n)  # a death comes before the births at its own level
+    levels, labels = np.concatenate([log_likelihood, log_birth]), np.concatenate([label, birth_label])
+    order = np.lexsort((born, labels, levels))
+    # Itself included: the count before its death is subtracted.
+    alive = np.cumsum(2 * born[order] - 1) + (1 - born[order])
+    out = np.empty(2 * n, dtype=np.int64)
+    out[order] = alive
+    return out[:n]
+
+
+def _check(parts: Sequence[NestedResult]) -> list[object]:
+    """Refuse what cannot be merged; give the seed states of all runs."""
+    if len(parts) < 2:
+        raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
+    names = parts[0].names
+    if not names:
+        raise ParameterError("results", "runs without parameters", "runs with some; the evidence is exact without")
+    seeds = list[object]()
+    for number, result in enumerate(parts, start=1):
+        if result.names != names:
+            raise ParameterError(f"names of run {number}", result.names, f"those of the first run, {names}")
+        record = (result.log_likelihood, result.label, result.log_birth, result.birth_label)
+        if not np.array_equal(alive_at_death(*record), result.n_at_death):
+            raise ParameterError(
+                f"n_at_death of run {number}",
+                "not what births and deaths give",
+                "complete runs of nested sampling, in the order of log likelihood and label",
+            )
+        state = json.loads(result.seed_state)
+        for one in state if isinstance(state, list) else [state]:
+            if one in seeds:
+                raise ParameterError(
+                    f"seed_state of run {number}",
+                    "that of a run before it",
+                    "independent runs: give each its own generator, `rng.spawn(n_runs)`",
+                )
+            seeds.append(one)
+    return seeds
+
+
+def _possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
+    """Pool the shares of the prior with a likelihood above zero: hypotheses found possible over those drawn.
+
+    A share s of m in n has the relative error sqrt((1 - s) / m), from which m follows; where all
+    were possible, as many as there are live points.
+    """
+    found = drawn = 0.0
+    for result in parts:
+        share = math.exp(result.log_start)
+        possible = (1.0 - share) / result.log_start_error**2 if result.log_start_error > 0 else float(result.n_live)
+        found += possible
+        drawn += possible / share
+    share = found / drawn
+    return math.log(share), math.sqrt(max(1.0 - share, 0.0) / found)
+
+
+def _combined(p_values: Sequence[float]) -> float:
+    """Combine independent p values (Fisher)."""
+    statistic = -2.0 * float(np.log(np.maximum(p_values, 1e-300)).sum())
+    return float(chi2.sf(statistic, 2 * len(p_values)))

@@ -1,0 +1,122 @@
+"""Fit a density to posterior samples, to draw from and to weigh by: kernels in each cluster's own metric."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaln, logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.nested.clusters import Clusters, find_clusters
+
+__all__ = ["Proposal", "fit_proposals", "joined"]
+
+# Tails heavier than a Gaussian's, so that weights stay bounded where the fit is too narrow.
+_DEGREES_OF_FREEDOM = 8.0
+_MOST_KERNELS = 400
+_FEW = 40
+_SCALES = (1.0, 0.5, 0.2, 0.05, 0.01)
+_BLOCK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """Mix Student-t kernels of one shape for each cluster.
+
+    `centres` in each cluster's own metric, one array (n_kernels, n_params) a cluster; `width` of a
+    kernel there; `share` of the draws that each cluster gets, (n_clusters,).
+    """
+
+    clusters: Clusters
+    centres: tuple[FloatArray, ...]
+    width: tuple[float, ...]
+    share: FloatArray
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, n_params)."""
+        n_params = self.clusters.mean.shape[1]
+        which = rng.choice(len(self.share), size=n, p=self.share)
+        white = rng.standard_normal((n, n_params))
+        white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
+        out = np.empty((n, n_params))
+        for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
+            rows = np.flatnonzero(which == k)
+            place = centres[rng.integers(len(centres), size=rows.size)] + width * white[rows]
+            out[rows] = self.clusters.mean[k] + place @ self.clusters.root[k].T
+        return out
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """Natural log of the density, (n, n_params) -> (n,)."""
+        blocks = np.array_split(x, max(1, -(-len(x) // _BLOCK)))
+        return np.concatenate([self._log_density(block) for block in blocks])
+
+    def _log_density(self, x: FloatArray) -> FloatArray:
+        n_params, nu = x.shape[1], _DEGREES_OF_FREEDOM
+        constant = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
+        parts = []
+        for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
+            white = (x - self.clusters.mean[k]) @ self.clusters.inverse_root[k].T
+            square = (white**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2.0 * white @ centres.T
+            kernel = -0.5 * (nu + n_params) * np.log1p(np.maximum(square, 0.0) / (nu * width**2))
+            norm = constant - self.clusters.log_det[k] - n_params * math.log(width) - math.log(len(centres))
+            parts.append(logsumexp(kernel, axis=1) + norm + math.log(self.share[k]))
+        return np.asarray(logsumexp(parts, axis=0))
+
+
+def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
+    """Mix proposals, each with its share of the draws."""
+    clusters = [p.clusters for p in proposals]
+    return Proposal(
+        Clusters(
+            np.concatenate([c.mean for c in clusters]),
+            np.concatenate([c.root for c in clusters]),
+            np.concatenate([c.inverse_root for c in clusters]),
+            np.concatenate([c.log_det for c in clusters]),
+            np.concatenate([c.size for c in clusters]),
+        ),
+        tuple(centres for p in proposals for centres in p.centres),
+        tuple(width for p in proposals for width in p.width),
+        np.concatenate([s * p.share for p, s in zip(proposals, share, strict=True)]),
+    )
+
+
+def fit_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:
+    """Fit to samples, (n_samples, n_params), in the two forms that promise most.
+
+    Forms: one kernel a cluster as wide as the cluster, or kernels about the samples, Silverman's
+    width or narrower; with clusters or without. Of either kind the one whose fit to half of the
+    samples gives the other half the greatest likelihood is fitted to all. Which of the two serves
+    better is for a few weighed draws to say: likelihood rewards a close fit, weights a wide one.
+    """
+    x = x[rng.permutation(len(x))]
+    half = len(x) // 2
+    if half < _FEW:
+        return (_fit(x, False, None),)
+
+    def score(form: tuple[bool, float | None]) -> float:
+        return float(_fit(x[:half], *form).log_density(x[half:]).mean())
+
+    wide: list[tuple[bool, float | None]] = [(False, None), (True, None)]
+    narrow: list[tuple[bool, float | None]] = [(split, scale) for split in (False, True) for scale in _SCALES]
+    return tuple(_fit(x, *max(forms, key=score)) for forms in (wide, narrow))
+
+
+def _fit(x: FloatArray, split: bool, scale: float | None) -> Proposal:
+    clusters = find_clusters(x) if split else Clusters.of([x])
+    home = clusters.assign(x)
+    n_params = x.shape[1]
+    centres, width = [], []
+    for k in range(len(clusters)):
+        own = x[home == k]
+        if scale is None or len(own) < 2:
+            centres.append(np.zeros((1, n_params)))
+            width.append(1.0)
+        else:
+            kept = own[:_MOST_KERNELS]
+            centres.append((kept - clusters.mean[k]) @ clusters.inverse_root[k].T)
+            width.append(scale * (4 / (n_params + 2) / len(kept)) ** (1 / (n_params + 4)))
+    size = np.maximum(np.bincount(home, minlength=len(clusters)), 1)
+    return Proposal(clusters, tuple(centres), tuple(width), size / size.sum())

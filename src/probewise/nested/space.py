@@ -1,0 +1,132 @@
+"""Say in which coordinates chains step: the unit cube, or those that the prior says are better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from probewise._arrays import FloatArray
+from probewise.priors import Coordinates, Prior
+
+__all__ = ["Space", "space_of", "unbounded"]
+
+_EDGE = 1e-15
+
+
+class Space(Protocol):
+    """Where chains step; the prior has a density there."""
+
+    @property
+    def low(self) -> FloatArray:
+        """Least value of each coordinate, (n_params,); -inf where there is none."""
+        ...
+
+    @property
+    def high(self) -> FloatArray:
+        """Greatest value of each coordinate, (n_params,); inf where there is none."""
+        ...
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        """Map parameters to coordinates, (n, n_params) both ways."""
+        ...
+
+    def leave(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates to parameters, (n, n_params); also the prior's log density over them, (n,)."""
+        ...
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates from the prior, (n, n_params)."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Cube:
+    """The unit cube, where every prior is even."""
+
+    prior: Prior
+
+    @property
+    def low(self) -> FloatArray:
+        return np.zeros(len(self.prior.names))
+
+    @property
+    def high(self) -> FloatArray:
+        return np.ones(len(self.prior.names))
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        return self.prior.to_unit_cube(theta)
+
+    def leave(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.prior.from_unit_cube(u), np.zeros(len(u))
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        return rng.random((n, len(self.prior.names)))
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """The unit cube drawn out: every coordinate has a standard normal prior, and no walls."""
+
+    prior: Prior
+
+    @property
+    def low(self) -> FloatArray:
+        return np.full(len(self.prior.names), -np.inf)
+
+    @property
+    def high(self) -> FloatArray:
+        return np.full(len(self.prior.names), np.inf)
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        return np.asarray(ndtri(np.clip(self.prior.to_unit_cube(theta), _EDGE, 1.0 - _EDGE)))
+
+    def leave(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        cube = np.clip(ndtr(u), _EDGE, 1.0 - _EDGE)
+        return self.prior.from_unit_cube(cube), -0.5 * (u * u + np.log(2 * np.pi)).sum(axis=1)
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        return rng.standard_normal((n, len(self.prior.names)))
+
+
+@dataclass(frozen=True)
+class _Own:
+    """The prior's own coordinates."""
+
+    prior: Prior
+    coordinates: Coordinates
+
+    @property
+    def low(self) -> FloatArray:
+        return np.full(len(self.prior.names), -np.inf)
+
+    @property
+    def high(self) -> FloatArray:
+        return np.full(len(self.prior.names), np.inf)
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        return self.coordinates.enter(theta)
+
+    def leave(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.coordinates.leave(u)
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        return self.enter(self.prior.from_unit_cube(rng.random((n, len(self.prior.names)))))
+
+
+@runtime_checkable
+class _HasCoordinates(Protocol):
+    @property
+    def coordinates(self) -> Coordinates: ...
+
+
+def space_of(prior: Prior) -> Space:
+    """Choose where chains step: the prior's own coordinates if it has any, else the unit cube."""
+    return _Own(prior, prior.coordinates) if isinstance(prior, _HasCoordinates) else _Cube(prior)
+
+
+def unbounded(prior: Prior) -> Space:
+    """Choose coordinates without walls, for densities that know none: the prior's own, else normal scores."""
+    return _Own(prior, prior.coordinates) if isinstance(prior, _HasCoordinates) else _Normal(prior)

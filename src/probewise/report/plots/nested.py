@@ -1,0 +1,383 @@
+"""What judges a run of nested sampling, and its posterior: trace, corner, insertion ranks, course of the run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.stats import binom
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.nested import NestedResult
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, VERMILLION, AxesGrid, axes_or_new, grid_of_axes, tidy
+
+__all__ = ["corner_plot", "insertion_plot", "run_plot", "trace_plot"]
+
+# Darker is heavier: on white, the points that count are seen; lightness falls evenly, so that it reads in grey.
+_WEIGHT: Colormap = LinearSegmentedColormap.from_list("probewise_weight", ["#dcdcdc", "#8fbbdb", BLUE, "#00233b"])
+_UNITS = {"mm": "mm", "rad": "rad", "s": "s", "counts": "counts"}
+_MASSES = (0.68, 0.95)
+_SHADES = ("#aecfe6", "#4d9bcb")  # of the larger mass, of the smaller
+_MOST_POINTS = 4000
+_DEPTH = "−ln X (X: share of the prior)"
+_FEW = 8  # parameters up to which a corner plot has room for numbers
+
+
+def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None) -> AxesGrid:
+    """Draw each parameter of the dead points against the log volume left, darker where the posterior is.
+
+    On top, the posterior mass for each nat of volume; to the right of each trace, the posterior
+    of the parameter on a scale of its own.
+
+    Parameters
+    ----------
+    result
+        The run.
+    parameters
+        Names of those to draw, in this order; all of them where not given.
+
+    Returns
+    -------
+    Axes, (1 + number of parameters drawn, 2).
+    """
+    columns = _columns(result, parameters)
+    n = len(columns)
+    height = 1.5 if n <= _FEW else 1.05
+    axes = grid_of_axes(
+        n + 1,
+        2,
+        size_in=(8.6, 1.9 + height * n),
+        gridspec_kw={"width_ratios": (4.0, 1.0), "height_ratios": (1.2 if n <= _FEW else 1.6, *[1.0] * n)},
+    )
+    depth, mass = -result.log_volume, _mass_per_nat(result)
+    shown = _thinned(result.n_dead)
+    shown = shown[np.argsort(mass[shown], kind="stable")]
+    top, key = axes[0]
+    top.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
+    top.plot(depth, mass, color=BLUE, linewidth=1.2)
+    top.set_ylim(bottom=0)
+    tidy(top, x="", y="posterior\nper nat", title=_evidence(result))
+    key.axis("off")
+    scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
+    place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
+    bar = key.figure.colorbar(scale, cax=place, orientation="horizontal", ticks=[0, 1])
+    bar.set_label("posterior per nat,\nshare of its peak", fontsize="small")
+    bar.ax.tick_params(labelsize="small")
+    for row, i in enumerate(columns, start=1):
+        trace, side = axes[row]
+        values = result.theta[:, i]
+        trace.scatter(
+            depth[shown],
+            values[shown],
+            c=mass[shown] / mass.max(),
+            cmap=_WEIGHT,
+            vmin=0,
+            vmax=1,
+            s=5,
+            linewidths=0,
+            rasterized=True,
+        )
+        last = row == n
+        tidy(trace, x=_DEPTH if last else "", y=_label(result.names[i]))
+        span = _span(result, i)
+        centres, density = _marginal(values, result.weight, span, result.n_eff)
+        side.fill_betweenx(centres, density, color=BLUE, alpha=0.25, lw=0)
+        side.plot(density, centres, color=BLUE, linewidth=1.2)
+        side.set_xlim(left=0)
+        side.set_ylim(span)
+        tidy(side, x="posterior" if last else "", y="")
+        side.set_xticks([])
+        side.yaxis.tick_right()
+        side.tick_params(labelsize="small")
+        for ax in (trace, side):
+            ax.yaxis.set_major_locator(MaxNLocator(3))
+        if n > _FEW:
+            trace.yaxis.label.set_size("small")
+            trace.tick_params(labelsize="small")
+    for ax in axes[:, 0]:
+        ax.set_xlim(0, depth[-1])
+        if ax is not axes[-1, 0]:
+            ax.set_xticklabels([])
+    top.figure.align_ylabels(list(axes[:, 0]))
+    return axes
+
+
+def corner_plot(result: NestedResult, *, parameters: Sequence[str] | None = None) -> AxesGrid:
+    """Draw the posterior of each parameter, and of each pair the regions that hold 68 % and 95 % of it.
+
+    Intervals of single parameters are central ones. Regions of pairs are those of highest density, from
+    a histogram of the weighted samples smoothed by a kernel that narrows as the effective number
+    of samples grows.
+
+    Parameters
+    ----------
+    result
+        The run.
+    parameters
+        Names of those to draw, in this order; all of them where not given.
+
+    Returns
+    -------
+    Axes, (n, n), of the n parameters drawn; None above the diagonal.
+    """
+    columns = _columns(result, parameters)
+    n = len(columns)
+    few = n <= _FEW
+    side = min(1.9, max(11.0 / n, 0.62)) if n > 1 else 3.2
+    left, bottom, top, right = (0.85, 0.85, 0.65, 0.2) if few else (0.7, 0.7, 0.3, 0.15)
+    gap = 0.06
+    width, height = left + n * side + right, bottom + n * side + top
+    sheet = Figure(figsize=(width, height))
+    FigureCanvasAgg(sheet)
+    axes = np.full((n, n), None, dtype=np.object_)
+    spans = [_span(result, i) for i in columns]
+    text = "small" if few else "x-small"
+    for row in range(n):
+        for column in range(row + 1):
+            corner = (left + column * side, bottom + (n - 1 - row) * side)
+            box = (corner[0] / width, corner[1] / height, (side - gap) / width, (side - gap) / height)
+            ax = axes[row, column] = sheet.add_axes(box)
+            if row == column:
+                _draw_one(ax, result, columns[row], spans[row], titled=few)
+            else:
+                _draw_pair(ax, result, (columns[column], columns[row]), (spans[column], spans[row]))
+            ax.set_xlim(spans[column])
+            ax.tick_params(labelsize=text if few else 6, length=3 if few else 2)
+            ax.xaxis.set_major_locator(MaxNLocator(3 if few else 2, prune="both"))
+            ax.tick_params(axis="x", labelrotation=45 if few else 90)
+            if row == n - 1:
+                ax.set_xlabel(_label(result.names[columns[column]]), fontsize=text)
+                ax.xaxis.set_label_coords(0.5, -0.55 / (side - gap) if few else -0.52 / (side - gap))
+            else:
+                ax.set_xticklabels([])
+            if row != column:
+                ax.yaxis.set_major_locator(MaxNLocator(3 if few else 2, prune="both"))
+            if column == 0 and row > 0:
+                ax.set_ylabel(_label(result.names[columns[row]]), fontsize=text)
+                ax.yaxis.set_label_coords(-0.6 / (side - gap) if few else -0.52 / (side - gap), 0.5)
+            elif row != column:
+                ax.set_yticklabels([])
+    if n > 1:
+        patches = [
+            Patch(facecolor=colour, label=f"{mass:.0%}".replace("%", " %"))
+            for mass, colour in zip(_MASSES, reversed(_SHADES), strict=True)
+        ]
+        sheet.legend(
+            handles=patches,
+            title=f"{_evidence(result)}\nposterior within",
+            loc="upper right",
+            frameon=False,
+            fontsize="small" if few else "medium",
+            title_fontsize="small" if few else "medium",
+            alignment="left",
+        )
+    return axes
+
+
+def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
+    """Draw where new points were inserted among the live ones, with the band that a right sampler fills.
+
+    Every new point is equally likely to take any rank (Fowlie, Handley & Su 2020). Too many low
+    ranks mean chains too short to leave the bound; too many high ones that a region was lost. The band
+    holds all bars at once in 99 of 100 right runs (binomial, Šidák's correction for the number of bars).
+
+    Parameters
+    ----------
+    result
+        The run.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(6.4, 3.6))
+    n = result.insertion_rank.size
+    if n == 0:
+        ax.text(0.5, 0.5, "no point was inserted", transform=ax.transAxes, ha="center", va="center")
+        return tidy(ax, x="rank among the live points (0: worst, 1: best)", y="new points")
+    edges = np.linspace(0.0, 1.0, int(np.clip(n / 60, 4, 25)) + 1)
+    counts = _spread_ranks(result.insertion_rank, result.insertion_n_ranked, edges)
+    n_bars = len(counts)
+    tail = (1.0 - 0.99 ** (1.0 / n_bars)) / 2.0
+    low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
+    outside = (counts < low) | (counts > high)
+    ax.bar(
+        edges[:-1],
+        counts,
+        width=1.0 / n_bars,
+        align="edge",
+        color=np.where(outside, VERMILLION, "#aecfe6"),
+        edgecolor="white",
+        linewidth=0.6,
+    )
+    ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="99 % of right samplers")
+    ax.axhline(n / n_bars, color=BLACK, linewidth=0.9, label="uniform")
+    ax.set_xlim(0, 1)
+    ax.set_ylim(0, 1.3 * max(high, counts.max()))
+    ax.legend(frameon=False, fontsize="small", loc="upper right", ncols=2)
+    title = f"{n} new points, p = {result.insertion_p_value:.2g}"
+    return tidy(ax, x="rank among the live points (0: worst, 1: best)", y="new points", title=title)
+
+
+def run_plot(result: NestedResult) -> AxesGrid:
+    """Draw the course of a run: likelihood, posterior mass, live points and evidence so far against the log volume.
+
+    Parameters
+    ----------
+    result
+        The run.
+
+    Returns
+    -------
+    Axes, (4, 1). The likelihood's lower end is cut off where nothing of the posterior lies.
+    """
+    axes = grid_of_axes(4, 1, size_in=(7.0, 7.6), sharex=True)
+    depth, mass = -result.log_volume, _mass_per_nat(result)
+    likelihood, posterior, alive, evidence = axes[:, 0]
+    peak = float(result.log_likelihood.max())
+    below = max(20.0 * (peak - float(result.log_likelihood[int(np.argmax(mass))])), 30.0)
+    floor = max(float(result.log_likelihood.min()), peak - below)
+    likelihood.plot(depth, result.log_likelihood, color=BLUE, linewidth=1.4)
+    likelihood.set_ylim(floor - 0.03 * (peak - floor), peak + 0.05 * (peak - floor))
+    tidy(likelihood, x="", y="ln likelihood", title=_evidence(result))
+    posterior.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
+    posterior.plot(depth, mass, color=BLUE, linewidth=1.4)
+    posterior.set_ylim(bottom=0)
+    tidy(posterior, x="", y="posterior per nat")
+    alive.plot(depth, result.n_at_death, color=BLUE, linewidth=0.8)
+    alive.set_ylim(0, 1.1 * float(result.n_at_death.max()))
+    tidy(alive, x="", y="live points")
+    error = result.log_z_error
+    evidence.axhspan(result.log_z - error, result.log_z + error, color=GREY, alpha=0.35, lw=0, label="ln Z ± its error")
+    so_far = np.logaddexp.accumulate(result.log_weight) + result.log_z
+    evidence.plot(depth, so_far, color=BLUE, linewidth=1.4, label="from the points so far")
+    evidence.set_ylim(result.log_z - max(6.0, 4 * error), result.log_z + max(1.0, 2 * error))
+    evidence.legend(frameon=False, fontsize="small", loc="lower right")
+    evidence.set_xlim(0, depth[-1])
+    tidy(evidence, x=_DEPTH, y="ln Z")
+    evidence.figure.align_ylabels(list(axes[:, 0]))
+    return axes
+
+
+def _evidence(result: NestedResult) -> str:
+    return f"ln Z = {result.log_z:.2f} ± {result.log_z_error:.2f}".replace("-", "−")
+
+
+def _columns(result: NestedResult, parameters: Sequence[str] | None) -> list[int]:
+    if not result.names:
+        raise ParameterError("names", result.names, "one parameter or more; without any there is nothing to draw")
+    if parameters is None:
+        return list(range(len(result.names)))
+    unknown = [name for name in parameters if name not in result.names]
+    if unknown or not parameters:
+        raise ParameterError("parameters", tuple(parameters), f"one or more of {result.names}")
+    return [result.names.index(name) for name in parameters]
+
+
+def _label(name: str) -> str:
+    """Write a parameter's name as a label: its unit in brackets, a symbol's index lowered."""
+    stem, _, unit = name.rpartition("_")
+    if stem and unit in _UNITS:
+        return f"{stem.replace('_', ' ').replace('.', ' ')} ({_UNITS[unit]})"
+    symbol = re.fullmatch(r"([A-Za-z])_(\w+)", name)
+    if symbol:
+        letter, index = symbol.groups()
+        return rf"${letter}_{{{index}}}$" if index.isdigit() else rf"${letter}_\mathrm{{{index}}}$"
+    return name.replace("_", " ").replace(".", " ")
+
+
+def _mass_per_nat(result: NestedResult) -> FloatArray:
+    """Posterior mass for each nat of log volume, (n_dead,): a death shrinks the volume by 1 / n nats."""
+    return result.weight * result.n_at_death
+
+
+def _thinned(n: int) -> IntArray:
+    return np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).astype(np.int64))
+
+
+def _span(result: NestedResult, column: int) -> tuple[float, float]:
+    """Limits that hold 99 % of the posterior with a margin, within the dead points, which fill the prior."""
+    values = result.theta[:, column]
+    order = np.argsort(values)
+    ladder = np.cumsum(result.weight[order])
+    low, high = values[order][np.minimum(np.searchsorted(ladder, [0.005, 0.995]), len(values) - 1)]
+    margin = 0.15 * (high - low)
+    low, high = max(low - margin, values.min()), min(high + margin, values.max())
+    if not high > low:
+        margin = max(abs(low), 1.0) * 1e-3
+        low, high = low - margin, high + margin
+    return float(low), float(high)
+
+
+def _marginal(
+    values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
+) -> tuple[FloatArray, FloatArray]:
+    """Smooth density on the middles of 80 bins, reflected at the ends, where the prior's edge may be.
+
+    The kernel is three quarters of Silverman's, since posteriors may have several modes.
+    """
+    density, edges = np.histogram(values, bins=80, range=span, weights=weight)
+    centres = (edges[:-1] + edges[1:]) / 2
+    total = max(float(density.sum()), 1e-300)
+    middle = float(density @ centres) / total
+    sd = np.sqrt(float(density @ (centres - middle) ** 2) / total) / (edges[1] - edges[0])
+    width = max(0.8 * sd * max(n_eff, 1.0) ** -0.2, 0.5)
+    return centres, np.asarray(gaussian_filter1d(density, width, mode="reflect"))
+
+
+def _draw_one(ax: Axes, result: NestedResult, column: int, span: tuple[float, float], *, titled: bool) -> None:
+    centres, density = _marginal(result.theta[:, column], result.weight, span, result.n_eff)
+    cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
+    ax.plot(centres, density, color=BLUE, linewidth=1.2)
+    for (low, high), colour in zip(cuts, _SHADES, strict=True):
+        ax.fill_between(centres, density, where=list((centres >= low) & (centres <= high)), color=colour, lw=0)
+    ax.set_ylim(0, 1.1 * max(float(density.max()), 1e-300))
+    ax.set_yticks([])
+    ax.spines[["top", "right", "left"]].set_visible(False)
+    if titled:
+        mean, sd = float(result.mean()[column]), float(result.sd()[column])
+        ax.set_title(_with_error(mean, sd), fontsize="small")
+
+
+def _with_error(mean: float, sd: float) -> str:
+    """Write mean and sd to the second figure of the sd."""
+    digits = 1 - int(np.floor(np.log10(sd))) if sd > 0 else 3
+    if -2 < digits < 6:
+        return f"{mean:.{max(digits, 0)}f} ± {sd:.{max(digits, 0)}f}".replace("-", "−")
+    return f"{mean:.3g} ± {sd:.1g}".replace("-", "−")
+
+
+def _draw_pair(
+    ax: Axes, result: NestedResult, columns: tuple[int, int], spans: tuple[tuple[float, float], tuple[float, float]]
+) -> None:
+    x, y = (result.theta[:, i] for i in columns)
+    density, x_edges, y_edges = np.histogram2d(x, y, bins=48, range=spans, weights=result.weight)
+    # A span is about six sds of 48 bins; three quarters of Silverman's width in the plane.
+    width = float(np.clip(6.0 * max(result.n_eff, 1.0) ** (-1 / 6), 0.8, 3.0))
+    smooth = gaussian_filter(density, width, mode="reflect")
+    ordered = np.sort(smooth.ravel())[::-1]
+    ladder = np.cumsum(ordered) / max(float(ordered.sum()), 1e-300)
+    levels = [float(ordered[min(int(np.searchsorted(ladder, m)), ordered.size - 1)]) for m in reversed(_MASSES)]
+    top = float(ordered[0])
+    ax.set_ylim(spans[1])
+    if not 0 < levels[0] < levels[1] < top:
+        ax.plot(x, y, linestyle="none", marker=".", markersize=2, color=BLUE)
+        return
+    middles = [(edges[:-1] + edges[1:]) / 2 for edges in (x_edges, y_edges)]
+    ax.contourf(*middles, smooth.T, levels=[*levels, top * 1.001], colors=_SHADES)
+    ax.contour(*middles, smooth.T, levels=levels, colors=BLUE, linewidths=0.6)
+
+
+def _spread_ranks(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:
+    """Count new points a bar, (n_bars,), a rank of m + 1 being spread evenly over its share of the axis."""
+    low, high = rank / (n_ranked + 1.0), (rank + 1.0) / (n_ranked + 1.0)
+    below = np.array([np.clip((edge - low) / (high - low), 0.0, 1.0).sum() for edge in edges])
+    return np.asarray(np.diff(below))

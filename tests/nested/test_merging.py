@@ -1,0 +1,203 @@
+"""Merged runs: counts by births and deaths against counts kept by the sampler, evidences against known ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nested_sampling import problems
+from scipy.stats import chi2, combine_pvalues
+
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.nested import Agreement, NestedResult, agreement_of, alive_at_death, merge, run
+from probewise.priors import Product, Uniform
+
+N_ERRORS = 3.9
+
+
+def several(problem: object, n_runs: int, *, n_live: int = 50, seed: int = 5) -> list[NestedResult]:
+    return [run(problem, rng=rng, n_live=n_live) for rng in np.random.default_rng(seed).spawn(n_runs)]
+
+
+@pytest.fixture(scope="module")
+def terraces() -> list[NestedResult]:
+    return several(problems.plateau(), 8)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(11)
+
+
+def alive(result: NestedResult) -> np.ndarray:
+    return alive_at_death(result.log_likelihood, result.label, result.log_birth, result.birth_label)
+
+
+@pytest.mark.parametrize("name", ["plateau", "naive steps", "Rosenbrock 2-D"])
+@pytest.mark.parametrize("n_replaced", [1, 7])
+def test_births_and_deaths_alone_give_the_count_that_the_sampler_kept(name: str, n_replaced: int) -> None:
+    result = run(problems.PROBLEMS[name](), rng=np.random.default_rng(1), n_live=20, n_replaced=n_replaced)
+    assert np.array_equal(alive(result), result.n_at_death)
+
+
+def test_the_count_of_two_runs_by_hand() -> None:
+    """Runs of two points each: births and deaths interleave on a plateau at 1, ordered by labels."""
+    level = np.array([1.0, 1.0, 2.0, 1.0, 3.0, 4.0])
+    label = np.array([0.2, 0.7, 0.5, 0.4, 0.1, 0.3])
+    birth = np.array([-np.inf, -np.inf, 1.0, -np.inf, -np.inf, 1.0])
+    birth_label = np.array([1.0, 1.0, 0.2, 1.0, 1.0, 0.4])
+    assert alive_at_death(level, label, birth, birth_label).tolist() == [4, 4, 3, 4, 2, 1]
+
+
+def test_the_order_of_the_points_does_not_matter(terraces: list[NestedResult], rng: np.random.Generator) -> None:
+    one = terraces[0]
+    rows = rng.permutation(one.n_dead)
+    shuffled = alive_at_death(one.log_likelihood[rows], one.label[rows], one.log_birth[rows], one.birth_label[rows])
+    assert np.array_equal(shuffled, one.n_at_death[rows])
+
+
+def test_merged_runs_are_one_run_with_the_live_points_of_all(
+    terraces: list[NestedResult], rng: np.random.Generator
+) -> None:
+    merged = merge(terraces, rng=rng)
+    assert merged.n_live == 400 == merged.n_at_death[0]
+    assert merged.n_dead == sum(r.n_dead for r in terraces)
+    assert merged.n_calls == sum(r.n_calls for r in terraces)
+    order = np.lexsort((merged.label, merged.log_likelihood))
+    assert np.array_equal(order, np.arange(merged.n_dead))
+    assert np.exp(merged.log_weight).sum() == pytest.approx(1.0)
+    assert np.array_equal(alive(merged), merged.n_at_death)
+    assert merged.agreement is not None
+    assert merged.agreement.log_z == tuple(r.log_z for r in terraces)
+    assert "8, ln Z agree" in merged.summary()
+
+
+@pytest.mark.parametrize("name", ["plateau", "naive steps", "shells 2-D"])
+def test_merged_evidence_is_right_and_its_error_falls_as_the_root_of_the_number_of_runs(
+    name: str, rng: np.random.Generator
+) -> None:
+    problem = problems.PROBLEMS[name]()
+    runs = several(problem, 8, n_live=40)
+    merged = merge(runs, rng=rng)
+    single = math.sqrt(np.mean(np.square([r.log_z_error for r in runs])))
+    # 200 simulations give a standard deviation to 5 %; runs differ in information too.
+    assert merged.log_z_error == pytest.approx(single / math.sqrt(8), rel=0.25)
+    assert abs(merged.log_z - problem.log_z) < N_ERRORS * merged.log_z_error
+
+
+@pytest.mark.slow
+def test_the_error_of_merged_runs_is_their_scatter() -> None:
+    """Mean square of 40 standardised residuals: chi-square's 1e-4 and 1 - 1e-4 quantiles over 40."""
+    problem = problems.plateau()
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 40) / 40
+    z = []
+    for k in range(40):
+        merged = merge(several(problem, 4, n_live=40, seed=100 + k), rng=np.random.default_rng(k))
+        z.append((merged.log_z - problem.log_z) / merged.log_z_error)
+    assert low < np.mean(np.square(z)) < high
+
+
+def test_runs_of_different_live_points_and_ends_are_merged(rng: np.random.Generator) -> None:
+    problem = problems.gaussian(2, 0.5)
+    one, two = (run(problem, rng=np.random.default_rng(n), n_live=n) for n in (40, 120))
+    with pytest.warns(DoubtfulResultWarning, match="max_calls"):
+        short = run(problem, rng=np.random.default_rng(3), n_live=80, max_calls=600)
+    merged = merge([one, two], rng=rng)
+    assert abs(merged.log_z - problem.log_z) < N_ERRORS * merged.log_z_error
+    assert merged.log_z_error < one.log_z_error
+    early = np.minimum.reduce([r.log_likelihood[-r.n_live] for r in (one, two, short)])
+    all_three = [one, two, dataclasses.replace(short, log_z=two.log_z)]  # what it lacks is not the matter here
+    joined = merge(all_three, rng=rng)
+    assert (joined.n_at_death[joined.log_likelihood < early] > 120).all()  # half of 240, at the end of rounds that coincide
+    assert joined.warnings == (f"run 3 of 3: {short.warnings[0]}", *(f"run 3 of 3: {w}" for w in short.warnings[1:]))
+    assert abs(joined.log_z - problem.log_z) < N_ERRORS * joined.log_z_error
+
+
+def test_merging_in_two_stages_is_merging_at_once(terraces: list[NestedResult]) -> None:
+    halves = [merge(part, rng=np.random.default_rng(0)) for part in (terraces[:3], terraces[3:])]
+    staged, at_once = (merge(parts, rng=np.random.default_rng(0)) for parts in (halves, terraces))
+    assert staged.log_z == at_once.log_z
+    assert np.array_equal(staged.theta, at_once.theta)
+    assert staged.agreement == at_once.agreement
+    assert staged.seed_state == at_once.seed_state
+    with pytest.raises(ParameterError, match="seed_state of run 2"):
+        merge([halves[0], terraces[1]], rng=np.random.default_rng(0))
+
+
+def test_the_possible_share_of_the_prior_is_pooled(rng: np.random.Generator) -> None:
+    """A ball in a box: a pooled share of found over drawn, and the evidence is the share."""
+    prior = Product({"x": Uniform(-1, 1), "y": Uniform(-1, 1)})
+    disc = problems.Known(prior, lambda t: np.where((t**2).sum(axis=1) < 0.5, 0.0, -np.inf), math.log(math.pi / 8))
+    runs = [run(disc, rng=np.random.default_rng(n), n_live=n) for n in (100, 300)]
+    merged = merge(runs, rng=rng)
+    drawn = [r.n_live / math.exp(r.log_start) for r in runs]
+    share = 400 / sum(drawn)
+    assert math.exp(merged.log_start) == pytest.approx(share)
+    assert merged.log_start_error == pytest.approx(math.sqrt((1 - share) / 400))
+    assert abs(merged.log_z - disc.log_z) < N_ERRORS * merged.log_z_error
+    assert "of the prior" in merged.summary()
+
+
+def test_runs_that_disagree_say_so_and_widen_the_error(terraces: list[NestedResult], rng: np.random.Generator) -> None:
+    far = [terraces[0], terraces[1], dataclasses.replace(terraces[2], log_z=terraces[2].log_z + 3)]
+    with pytest.warns(DoubtfulResultWarning, match="3 runs disagree more than their errors"):
+        merged = merge(far, rng=rng)
+    assert merged.log_z_error == pytest.approx(np.std([r.log_z for r in far], ddof=1))
+    assert "disagree" in merged.warnings[0]
+    assert "doubtful: the 3 runs disagree" in merged.summary()
+
+
+def test_agreement_by_hand(terraces: list[NestedResult]) -> None:
+    """Two runs: chi-square is the squared difference over the sum of the squared errors."""
+    one = dataclasses.replace(terraces[0], log_z=1.0, log_z_error=0.3)
+    two = dataclasses.replace(terraces[1], log_z=2.0, log_z_error=0.4)
+    found = agreement_of([one, two])
+    assert found.chi_square == pytest.approx(1.0 / 0.25)
+    assert found.p_value == pytest.approx(math.erfc(2.0 / math.sqrt(2)))
+    assert found.scatter == pytest.approx(math.sqrt(0.5))
+    assert found.n_runs == 2
+
+
+def test_insertion_tests_are_combined(terraces: list[NestedResult], rng: np.random.Generator) -> None:
+    known = [dataclasses.replace(r, insertion_p_value=p) for r, p in zip(terraces, (0.03, 0.2, 0.9), strict=False)]
+    merged = merge(known, rng=rng)
+    assert merged.insertion_p_value == pytest.approx(combine_pvalues([0.03, 0.2, 0.9]).pvalue)
+    assert merged.insertion_rank.size == sum(r.insertion_rank.size for r in known)
+    bad = [dataclasses.replace(r, insertion_p_value=1e-3) for r in terraces[:4]]
+    with pytest.warns(DoubtfulResultWarning, match="insertion ranks of the runs together"):
+        merge(bad, rng=rng)
+
+
+def test_what_is_no_independent_run_of_the_same_problem_is_refused(
+    terraces: list[NestedResult], rng: np.random.Generator
+) -> None:
+    one, two = terraces[:2]
+    with pytest.raises(ParameterError, match="1 runs"):
+        merge([one], rng=rng)
+    with pytest.raises(ParameterError, match="1 runs"):
+        agreement_of([one])
+    with pytest.raises(ParameterError, match="seed_state of run 2"):
+        merge([one, one], rng=rng)
+    with pytest.raises(ParameterError, match="names of run 2"):
+        merge([one, dataclasses.replace(two, names=("a", "b"))], rng=rng)
+    with pytest.raises(ParameterError, match="n_at_death of run 2"):
+        merge([one, dataclasses.replace(two, n_at_death=two.n_at_death + 1)], rng=rng)
+    bare = [dataclasses.replace(r, names=(), theta=np.empty((r.n_dead, 0))) for r in (one, two)]
+    with pytest.raises(ParameterError, match="without parameters"):
+        merge(bare, rng=rng)
+
+
+def test_a_merged_result_comes_back_from_its_file(
+    terraces: list[NestedResult], rng: np.random.Generator, tmp_path: Path
+) -> None:
+    merged = merge(terraces[:3], rng=rng)
+    merged.save(tmp_path / "merged.npz")
+    back = NestedResult.load(tmp_path / "merged.npz")
+    assert isinstance(back.agreement, Agreement)
+    assert back.agreement == merged.agreement
+    assert len(json.loads(back.seed_state)) == 3
+    assert back.summary() == merged.summary()

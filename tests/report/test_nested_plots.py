@@ -1,0 +1,201 @@
+"""Pictures of a run of nested sampling show its numbers."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from matplotlib.collections import PathCollection, PolyCollection
+from scipy.integrate import trapezoid
+from scipy.stats import binom
+
+from probewise.errors import ParameterError
+from probewise.nested import NestedResult, merge, run
+from probewise.priors import Empty, Product, Uniform
+from probewise.report import plots
+from probewise.report.plots.nested import _label, _marginal, _spread_ranks
+
+
+class Bell:
+    def __init__(self, *names):
+        self.prior = Product({name: Uniform(-5.0, 5.0) for name in names})
+
+    def log_likelihood(self, theta):
+        return -0.5 * ((theta - 1.0) ** 2).sum(axis=1)
+
+
+class Fixed:
+    prior = Empty()
+
+    def log_likelihood(self, theta):
+        return np.zeros(len(theta))
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run(Bell("x_mm", "angle_rad", "I_min"), rng=np.random.default_rng(0), n_live=100)
+
+
+def synthetic(n_params, n=600, n_live=50):
+    """As a run would leave it, without running one: a bell in many dimensions."""
+    rng = np.random.default_rng(1)
+    theta = rng.normal(size=(n, n_params))
+    ln_l = np.sort(-0.5 * (theta**2).sum(axis=1))
+    return NestedResult(
+        names=tuple(f"p{i}" for i in range(n_params)),
+        theta=theta,
+        log_likelihood=ln_l,
+        label=np.zeros(n),
+        log_weight=np.full(n, -np.log(n)),
+        log_birth=np.full(n, -np.inf),
+        birth_label=np.ones(n),
+        n_at_death=np.full(n, n_live),
+        log_start=0.0,
+        log_start_error=0.0,
+        log_z=-3.0,
+        log_z_error=0.1,
+        information=2.0,
+        n_eff=float(n),
+        n_calls=n,
+        n_live=n_live,
+        stop_reason="made up",
+        insertion_rank=np.arange(n) % n_live,
+        insertion_n_ranked=np.full(n, n_live - 1),
+        insertion_p_value=0.5,
+        seed_state="{}",
+        versions={},
+        warnings=(),
+    )
+
+
+def test_a_trace_shows_every_dead_point_against_the_volume_left(result):
+    axes = plots.trace_plot(result)
+    assert axes.shape == (4, 2)
+    assert "ln X" in axes[-1, 0].get_xlabel()
+    assert "−" in axes[0, 0].get_title(loc="left")
+    (dots,) = (c for c in axes[1, 0].collections if isinstance(c, PathCollection))
+    shown = np.asarray(dots.get_offsets())
+    assert len(shown) == result.n_dead
+    order = np.argsort(shown[:, 0])
+    assert shown[order, 0] == pytest.approx(-result.log_volume)
+    assert shown[order, 1] == pytest.approx(result.theta[:, 0])
+    line = axes[0, 0].lines[0]
+    assert trapezoid(line.get_ydata(), line.get_xdata()) == pytest.approx(1.0, abs=0.05)
+    assert plots.png(axes, dpi=30).startswith(b"\x89PNG")
+
+
+def test_a_long_trace_is_thinned():
+    axes = plots.trace_plot(synthetic(1, n=9000))
+    (dots,) = (c for c in axes[1, 0].collections if isinstance(c, PathCollection))
+    assert len(dots.get_offsets()) <= 4000
+
+
+@pytest.mark.parametrize("n_params", [1, 2, 10])
+def test_a_corner_has_each_parameter_and_each_pair(n_params):
+    axes = plots.corner_plot(synthetic(n_params))
+    assert axes.shape == (n_params, n_params)
+    drawn = [[ax is not None for ax in row] for row in axes]
+    assert np.array_equal(drawn, np.tril(np.ones((n_params, n_params), dtype=bool)))
+    assert [ax.get_xlabel() for ax in axes[-1]] == [f"p{i}" for i in range(n_params)]
+    assert [ax.get_ylabel() for ax in axes[1:, 0]] == [f"p{i}" for i in range(1, n_params)]
+    assert all(ax.get_xlim() == axes[-1, k].get_xlim() for k in range(n_params) for ax in axes[k:, k])
+    if n_params < 10:
+        assert plots.png(axes, dpi=30).startswith(b"\x89PNG")
+
+
+def test_a_corners_regions_hold_what_they_say():
+    """Of samples of a plane bell, 95 % and 68 % lie within the two contours, smoothing widening them a little."""
+    result = synthetic(2, n=20_000)
+    ax = plots.corner_plot(result)[1, 0]
+    lines = ax.collections[-1]
+    for path, mass in zip(lines.get_paths(), (0.95, 0.68), strict=True):
+        inside = path.contains_points(result.theta).mean()
+        assert mass - 0.01 < inside < mass + 0.03
+
+
+def test_chosen_parameters_are_drawn_in_their_order(result):
+    axes = plots.corner_plot(result, parameters=["I_min", "x_mm"])
+    assert [ax.get_xlabel() for ax in axes[-1]] == [r"$I_\mathrm{min}$", "x (mm)"]
+    assert plots.trace_plot(result, parameters=["angle_rad"])[1, 0].get_ylabel() == "angle (rad)"
+    for wrong in (["y_mm"], []):
+        with pytest.raises(ParameterError, match="parameters is"):
+            plots.corner_plot(result, parameters=wrong)
+    with pytest.raises(ParameterError, match="nothing to draw"):
+        plots.trace_plot(run(Fixed(), rng=np.random.default_rng(0)))
+
+
+def test_a_parameter_that_does_not_vary_is_drawn_too(result):
+    theta = np.array(result.theta)
+    theta[:, 0] = 3.0
+    still = dataclasses.replace(result, theta=theta)
+    assert plots.png(plots.corner_plot(still), dpi=30).startswith(b"\x89PNG")
+    assert plots.png(plots.trace_plot(still), dpi=30).startswith(b"\x89PNG")
+
+
+def test_names_become_labels_with_units():
+    assert _label("x_mm") == "x (mm)"
+    assert _label("semi_major_mm") == "semi major (mm)"
+    assert _label("gain_drift.tau_s") == "gain drift tau (s)"
+    assert _label("a_1") == "$a_{1}$"
+    assert _label("I_max") == r"$I_\mathrm{max}$"
+    assert _label("saturation.level") == "saturation level"
+
+
+def test_a_flat_posterior_stays_flat_up_to_the_priors_edge():
+    values = (np.arange(8000) + 0.5) / 8000
+    _, density = _marginal(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
+    assert density == pytest.approx(np.full(80, 1 / 80))
+
+
+def test_insertion_ranks_are_counted_against_a_band_of_all_bars(result):
+    ax = plots.insertion_plot(result)
+    bars = [p for p in ax.patches if p.get_width() < 0.5]
+    heights = np.array([p.get_height() for p in bars])
+    n, n_bars = result.insertion_rank.size, len(bars)
+    assert heights.sum() == pytest.approx(n)
+    band = next(p for p in ax.patches if p not in bars)
+    low, high = band.get_y(), band.get_y() + band.get_height()
+    # Of uniform ranks about 1 % of the histograms leave the band: 20 of 2000, twice that never.
+    counts = np.random.default_rng(3).multinomial(n, np.full(n_bars, 1 / n_bars), size=2000)
+    left = ((counts < low) | (counts > high)).any(axis=1).sum()
+    assert left < 40
+    assert binom.cdf(low - 1, n, 1 / n_bars) < 0.01 / n_bars
+    assert "p = " in ax.get_title(loc="left")
+
+
+def test_ranks_are_spread_over_their_share_of_the_axis():
+    """One of three ranks in two bars: the first rank in the first bar, the middle one half in each."""
+    edges = np.array([0.0, 0.5, 1.0])
+    assert _spread_ranks(np.array([0]), np.array([2]), edges) == pytest.approx([1.0, 0.0])
+    assert _spread_ranks(np.array([1]), np.array([2]), edges) == pytest.approx([0.5, 0.5])
+
+
+def test_ranks_outside_the_band_are_marked_and_none_are_said(result):
+    lowest_missing = dataclasses.replace(result, insertion_rank=np.maximum(result.insertion_rank, 15))
+    bars = [p for p in plots.insertion_plot(lowest_missing).patches if p.get_width() < 0.5]
+    colours = [p.get_facecolor() for p in bars]
+    assert len(set(colours)) == 2
+    assert colours[0] != colours[-1]
+    empty = np.empty(0, dtype=np.int64)
+    none = dataclasses.replace(result, insertion_rank=empty, insertion_n_ranked=empty)
+    assert plots.insertion_plot(none).texts[0].get_text() == "no point was inserted"
+
+
+def test_the_course_of_a_run_ends_at_its_evidence(result):
+    axes = plots.run_plot(result)
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["ln likelihood", "posterior per nat", "live points", "ln Z"]
+    assert axes[3, 0].lines[0].get_ydata()[-1] == pytest.approx(result.log_z)
+    assert axes[2, 0].lines[0].get_ydata().max() == 100
+    assert any(isinstance(c, PolyCollection) for c in axes[1, 0].collections)
+
+
+def test_merged_runs_are_drawn_as_one():
+    rngs = np.random.default_rng(5).spawn(3)
+    merged = merge([run(Bell("x_mm"), rng=rng, n_live=40) for rng in rngs[1:]], rng=rngs[0])
+    assert plots.run_plot(merged)[2, 0].lines[0].get_ydata().max() == 80
+    assert plots.insertion_plot(merged).get_title(loc="left").startswith(f"{merged.insertion_rank.size} new points")
+
+
+def test_a_notebook_shows_no_more_than_six_parameters():
+    shown = synthetic(9)._repr_html_()
+    assert "of the first 6 of 9 parameters" in shown
+    assert "worth 600 independent ones" in shown

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from nested_sampling.problems import FloatArray, Known
 from probewise.errors import DoubtfulResultWarning
-from probewise.nested import NestedResult, diversify, run
+from probewise.nested import KernelMove, Move, NestedResult, refine, run
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +99,15 @@ class Sampler:
     needs_traceable: bool = False
 
 
-def ours_result(problem: Counted | Known, seed: int, n_live: int | None = None) -> NestedResult:
+def ours_result(
+    problem: Counted | Known, seed: int, n_live: int | None = None, move: Move | None = None
+) -> NestedResult:
     """Run this project's sampler as its users do: every call of it in these benchmarks is here."""
     n_live = n_live or 300
     # A doubtful run is counted, not shouted about.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        return run(problem, rng=np.random.default_rng(seed), n_live=n_live)
+        return run(problem, rng=np.random.default_rng(seed), n_live=n_live, move=move)
 
 
 def ours(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
@@ -113,21 +115,26 @@ def ours(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
     return outcome_of(ours_result(problem, seed, n_live), problem.n_evaluations)
 
 
-def ours_diversified(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
-    """Run it and walk 50 equally weighted samples apart, as the paper's robot does; the posterior is those 50."""
-    result = ours_result(problem, seed, n_live)
-    rng = np.random.default_rng([seed, 1])
-    theta, _ = diversify(result.samples(50, rng=rng), problem, rng=rng)
+def ours_refined(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
+    """Run it with a third of the live points and sharpen the result by importance sampling."""
+    return _refined(problem, seed, (n_live or 300) // 3, 4000)
+
+
+def ours_quick(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
+    """Run it as for a robot that waits: few live points, proposals in one batch a round, 50 independent draws."""
+    least = max(50, 2 * problem.n_params + 10)
+    found = _refined(problem, seed, least, 1000, KernelMove(moves=5.0))
+    return replace(found, theta=found.samples(50, seed), log_weight=np.zeros(50))
+
+
+def _refined(problem: Counted, seed: int, n_live: int, n_draws: int, move: Move | None = None) -> Outcome:
+    result = ours_result(problem, seed, max(n_live, 2 * problem.n_params + 10), move)
+    sharp = refine(result, problem, rng=np.random.default_rng([seed, 1]), n_draws=n_draws)
     found = outcome_of(result, problem.n_evaluations)
-    return Outcome(
-        found.log_z,
-        found.log_z_error,
-        found.n_evaluations,
-        theta,
-        np.zeros(len(theta)),
-        found.n_live,
-        found.insertion_p_value,
-        found.doubts,
+    if not sharp.sound:
+        return replace(found, doubts=(*found.doubts, f"not refined: Pareto k = {sharp.pareto_k:.2f}"))
+    return replace(
+        found, log_z=sharp.log_z, log_z_error=sharp.log_z_error, theta=sharp.theta, log_weight=sharp.log_weight
     )
 
 
@@ -147,7 +154,8 @@ def outcome_of(result: NestedResult, n_evaluations: int) -> Outcome:
 
 OURS: dict[str, Sampler] = {
     "ours": Sampler((), ours),
-    "ours-diversified": Sampler((), ours_diversified),
+    "ours-refined": Sampler((), ours_refined),
+    "ours-quick": Sampler((), ours_quick),
 }
 PEERS = (
     "dynesty",

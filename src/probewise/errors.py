@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 __all__ = [
     "DoubtfulResultWarning",
     "FileError",
     "LinkError",
     "NotConvergedError",
+    "NotSavedWarning",
     "ParameterError",
     "ProbewiseError",
     "ReachError",
@@ -24,6 +27,10 @@ class ParameterError(ProbewiseError, ValueError):
     def __init__(self, name: str, value: object, allowed: str) -> None:
         self.name, self.value, self.allowed = name, value, allowed
         super().__init__(f"{name} is {value!r}; allowed: {allowed}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Exceptions are pickled as type(*args), which would hand the message back as the name.
+        return type(self), (self.name, self.value, self.allowed)
 
 
 class ShapeError(ProbewiseError, ValueError):
@@ -44,6 +51,10 @@ class FileError(ProbewiseError, ValueError):
             where += f", column {column}"
         super().__init__(f"{where}: {found}; allowed: {allowed}")
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # As for ParameterError; `partial` carries what is keyword-only.
+        return partial(type(self), row=self.row, column=self.column), (self.path, self.found, self.allowed)
+
 
 class ReachError(ParameterError):
     """Report a pose that the arm cannot take."""
@@ -63,3 +74,7 @@ class NotConvergedError(ProbewiseError, RuntimeError):
 
 class DoubtfulResultWarning(UserWarning):
     """Warn of a result that can be used but not trusted blindly; the result holds the reason too."""
+
+
+class NotSavedWarning(UserWarning):
+    """Warn of a computation that goes on but could not be saved on the way."""

@@ -112,7 +112,8 @@ def test_runs_of_different_live_points_and_ends_are_merged(rng: np.random.Genera
     early = np.minimum.reduce([r.log_likelihood[-r.n_live] for r in (one, two, short)])
     all_three = [one, two, dataclasses.replace(short, log_z=two.log_z)]  # what it lacks is not the matter here
     joined = merge(all_three, rng=rng)
-    assert (joined.n_at_death[joined.log_likelihood < early] > 120).all()  # half of 240, at the end of rounds that coincide
+    # Half of 240 remain at the end of rounds that coincide.
+    assert (joined.n_at_death[joined.log_likelihood < early] > 120).all()
     assert joined.warnings == (f"run 3 of 3: {short.warnings[0]}", *(f"run 3 of 3: {w}" for w in short.warnings[1:]))
     assert abs(joined.log_z - problem.log_z) < N_ERRORS * joined.log_z_error
 

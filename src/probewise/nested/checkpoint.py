@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import io
 import json
+import re
+import tempfile
 import time
+import warnings
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, NotSavedWarning, ParameterError
 from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.moves import Move
 from probewise.nested.stop import StopRule
@@ -21,6 +26,7 @@ from probewise.recordings.atomic import write_bytes_atomically
 __all__ = ["Dead", "Keeper", "Live", "Run", "settings_of"]
 
 _FORMAT = "nested-checkpoint/1"
+_ROUNDING = 1e-6
 _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 
 
@@ -69,13 +75,20 @@ class Run:
     last_cost: int = 0
     n_calls: int = 0
     ended: str | None = None
-    rng_state: object = field(default=None)
+    rng_state: Mapping[str, Any] = field(default_factory=dict)
 
 
 def settings_of(
     names: tuple[str, ...], n_live: int, n_replaced: int, move: Move, stop: StopRule, seed_state: str
 ) -> dict[str, object]:
-    """Describe what a resumed run must share with the one that was interrupted."""
+    """Describe what a resumed run must share with the one that was interrupted.
+
+    Raises
+    ------
+    ParameterError
+        If the move is none that a checkpoint can hold.
+    """
+    _numbers(move)
     return {
         "names": list(names),
         "n_live": n_live,
@@ -87,7 +100,10 @@ def settings_of(
 
 
 def _told(value: object) -> str:
-    return repr(value) if is_dataclass(value) else str(getattr(value, "__qualname__", type(value).__qualname__))
+    if not is_dataclass(value):
+        return str(getattr(value, "__qualname__", type(value).__qualname__))
+    # Where a function stands in memory differs from one process to the next.
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
 
 
 @dataclass
@@ -99,19 +115,41 @@ class Keeper:
     settings: dict[str, object]
     _last: float = field(default_factory=time.monotonic)
     _took: float = 0.0
+    _held: Run | None = None
 
     def __post_init__(self) -> None:
         if not self.every_s >= 0:
             raise ParameterError("checkpoint_every_s", self.every_s, "0 or more")
+        if self.path.is_dir():
+            raise FileError(self.path, "a folder", "a file in an existing, writable folder")
+        try:
+            # Found out now rather than when there is something to lose.
+            tempfile.TemporaryFile(dir=self.path.parent).close()
+        except OSError as error:
+            raise FileError(
+                self.path, f"cannot be written ({error.strerror})", "a file in an existing, writable folder"
+            ) from error
 
     def save_if_due(self, now: Run) -> None:
-        """Save if the last time is long ago, and long compared with what saving takes."""
-        if time.monotonic() - self._last >= max(self.every_s, 10.0 * self._took):
+        """Save if the last time is long ago, and long compared with what saving takes; always if `every_s` is 0."""
+        if self.every_s == 0 or time.monotonic() - self._last >= max(self.every_s, 10.0 * self._took):
             self.save(now)
 
     def save(self, now: Run) -> None:
-        """Write the file."""
+        """Write the file, unless it holds this run already; warn where that fails: the run itself is sound."""
+        if now is self._held:
+            return
         begun = time.monotonic()
+        try:
+            write_bytes_atomically(self.path, self._bytes(now))
+            self._held = now
+        except FileError as error:
+            warnings.warn(f"{error}; the run goes on unsaved", NotSavedWarning, stacklevel=2)
+        finally:
+            self._last = time.monotonic()
+            self._took = self._last - begun
+
+    def _bytes(self, now: Run) -> bytes:
         head = {
             "format": _FORMAT,
             "settings": self.settings,
@@ -129,9 +167,7 @@ class Keeper:
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_plain)), **arrays)
-        write_bytes_atomically(self.path, buffer.getvalue())
-        self._last = time.monotonic()
-        self._took = self._last - begun
+        return buffer.getvalue()
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> Run | None:
         """Read the file and put the generator where it was; None where there is no file.
@@ -145,33 +181,65 @@ class Keeper:
             return None
         try:
             with open(self.path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+                # An array read short of its end would go unchecked.
+                damaged = file.zip.testzip()
+                if damaged is not None:
+                    raise zipfile.BadZipFile(f"{damaged} is damaged")
                 head = json.loads(str(file["head"]))
-                if head.get("format") != _FORMAT:
-                    raise ValueError(f"format {head.get('format')!r}, not {_FORMAT!r}")
-                arrays = {name: file[name] for name in file.files if name != "head"}
-            now = _run_from(head, arrays, move)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+                found, settings = head["format"], head["settings"]
+                # Only then, since another version or move may have stored other things.
+                same = found == _FORMAT and settings == self.settings
+                now = (
+                    _run_from(head, {name: file[name] for name in file.files if name != "head"}, move) if same else None
+                )
+        except Exception as error:  # a damaged archive can raise whatever its parts do
             raise FileError(
                 self.path, f"unreadable ({error})", "a checkpoint of this run; delete it to start anew"
             ) from error
-        for name, mine in self.settings.items():
-            if head["settings"].get(name) != mine:
-                raise FileError(
-                    self.path,
-                    f"of a run with {name} = {str(head['settings'].get(name))[:80]}, not {str(mine)[:80]}",
-                    "the same problem, settings and seed; give another file, or delete this one to start anew",
-                )
-        first = now.live.points.take(slice(0, 1))
-        if evaluate.log_likelihood(first.theta)[0] != first.log_likelihood[0]:
+        if found != _FORMAT:
+            raise FileError(self.path, f"format {found!r}", f"{_FORMAT!r}; delete the file to start anew")
+        if now is None:
+            raise self._of_another(settings)
+        self._require_same_problem(now, evaluate)
+        evaluate.n_calls = now.n_calls
+        rng.bit_generator.state = now.rng_state
+        self._last, self._held = time.monotonic(), now
+        return now
+
+    def _of_another(self, settings: dict[str, object]) -> FileError:
+        """Say in what the file's settings differ from this run's."""
+        name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
+        if name == "seed_state":
+            return FileError(
+                self.path,
+                "of a run with another seed: its generator began in another state",
+                "rng as it was when that run began, made anew from its seed; "
+                "give another file, or delete this one to start anew",
+            )
+        return FileError(
+            self.path,
+            f"of a run with {name} = {_short(settings.get(name))}, not {_short(self.settings.get(name))}",
+            "the same problem, settings and seed; give another file, or delete this one to start anew",
+        )
+
+    def _require_same_problem(self, now: Run, evaluate: Evaluator) -> None:
+        points, way_out = now.live.points, "give another file, or delete this one to start anew"
+        theta, log_density = evaluate.space.leave(points.u)
+        scale = np.abs(points.theta).max(axis=0)
+        if not (_near(theta, points.theta, scale) and _near(log_density, points.log_density, 1.0)):
             raise FileError(
                 self.path,
-                "of a run with another likelihood: its first live point now has another value",
-                "the same problem and readings; give another file, or delete this one to start anew",
+                "of a run with another prior: it leads from its live points' coordinates to other parameters",
+                f"the same problem; {way_out}",
             )
-        evaluate.n_calls = now.n_calls
-        rng.bit_generator.state = _state(now.rng_state)
-        self._last = time.monotonic()
-        return now
+        then = points.log_likelihood[:1]
+        again = evaluate.log_likelihood(points.theta[:1])
+        if not _near(again, then, 1.0 + np.abs(then)):
+            raise FileError(
+                self.path,
+                f"of a run with another likelihood: its first live point had {then[0]:.10g}, now {again[0]:.10g}",
+                f"the same problem and readings; {way_out}",
+            )
 
 
 _PLAIN = ("log_start", "log_start_error", "notes", "log_z", "n_stuck", "last_cost", "n_calls", "ended")
@@ -194,7 +262,18 @@ def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move
     plain = {name: head[name] for name in _PLAIN}
     plain["notes"] = tuple(plain["notes"])  # type: ignore[arg-type]
     moving = _with_numbers(move, head["moving"])
-    return Run(live, tuple(dead), moving, rng_state=head["rng_state"], **plain)  # type: ignore[arg-type]
+    return Run(live, tuple(dead), moving, rng_state=_state(head["rng_state"]), **plain)  # type: ignore[arg-type]
+
+
+def _near(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
+    """Compare but for rounding: the last digits of a row depend on how many rows are computed with it."""
+    with np.errstate(invalid="ignore"):  # inf - inf
+        return a.shape == b.shape and bool(((a == b) | (np.abs(a - b) <= _ROUNDING * scale)).all())
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _numbers(move: Move) -> dict[str, float]:
@@ -215,7 +294,7 @@ def _plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
-def _state(value: object) -> dict[str, object]:
+def _state(value: object) -> dict[str, Any]:
     """Turn lists of a generator's state back into arrays."""
     if not isinstance(value, dict):
         raise ValueError("no state of a random generator")

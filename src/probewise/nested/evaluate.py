@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -109,7 +110,7 @@ class Evaluator:
 
     With an `executor` (any `concurrent.futures.Executor`) a batch is dealt out in `n_parts` parts; the
     problem must then be one that the executor's workers can be sent. Answers come back in order, so
-    the run does not depend on it.
+    the run does not depend on it where a hypothesis has the same likelihood, to the last bit, in any company.
     """
 
     problem: Samplable
@@ -144,18 +145,16 @@ class Evaluator:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate hypotheses, (n, n_params) -> (n,), with the checks described above."""
+        shared = self.executor is not None and len(theta) > 1
+        parts = np.array_split(theta, min(self.n_parts, len(theta))) if shared else [theta]
+        answers: list[object] = []
         try:
-            raw = self._asked(theta)
+            for answer in self._answers(parts):
+                answers.append(answer)  # one by one: how many there are tells which part failed
         except Exception as error:
-            raise NotConvergedError(
-                f"the likelihood raised {type(error).__name__}: {error}; "
-                f"first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
-            ) from error
-        values = np.asarray(raw, dtype=np.float64)
-        if values.shape != (len(theta),):
-            raise NotConvergedError(
-                f"the likelihood returned shape {values.shape}; allowed: ({len(theta)},), one number a hypothesis"
-            )
+            raise NotConvergedError(self._why(error, parts[len(answers)])) from error
+        # A copy, since a likelihood may hand out the same array every time.
+        values = np.concatenate([self._numbers(a, part) for a, part in zip(answers, parts, strict=True)])
         bad = np.isnan(values) | (values == np.inf)
         if bad.any():
             at = int(np.flatnonzero(bad)[0])
@@ -166,11 +165,57 @@ class Evaluator:
         self.n_calls += len(theta)
         return values
 
-    def _asked(self, theta: FloatArray) -> FloatArray:
-        if self.executor is None or len(theta) < 2:
-            return self.problem.log_likelihood(theta)
-        parts = np.array_split(theta, min(self.n_parts, len(theta)))
-        return np.concatenate(list(self.executor.map(self.problem.log_likelihood, parts)))
+    def _answers(self, parts: list[FloatArray]) -> Iterator[object]:
+        """Ask for every part, all at once where there is more than one; give the answers in order."""
+        if self.executor is not None and len(parts) > 1:
+            yield from self.executor.map(self.problem.log_likelihood, parts)
+        else:
+            for part in parts:
+                yield self.problem.log_likelihood(part)
+
+    def _numbers(self, answer: object, theta: FloatArray) -> FloatArray:
+        first = f"first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
+        try:
+            values = np.asarray(answer, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise NotConvergedError(f"the likelihood returned what are no numbers ({error}); {first}") from error
+        if values.shape != (len(theta),):
+            raise NotConvergedError(
+                f"the likelihood returned shape {values.shape}; "
+                f"allowed: ({len(theta)},), one number a hypothesis; {first}"
+            )
+        return values
+
+    def _why(self, error: Exception, theta: FloatArray) -> str:
+        """Say what went wrong with a batch, (n, n_params), and with which hypothesis of it."""
+        said = f"{type(error).__name__}: {error}"
+        if self.executor is not None and "pickle" in said.lower():
+            return (
+                f"the problem cannot be sent to the executor's workers ({said}); allowed: one that pickles, so made of "
+                "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
+            )
+        # A hypothesis that kills its worker would kill this process if it were asked for here.
+        culprit = None if isinstance(error, BrokenExecutor) else self._culprit(theta)
+        if culprit is not None:
+            return f"the likelihood raised {said}; at {self._show(culprit)}"
+        return f"the likelihood raised {said}; first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
+
+    def _culprit(self, theta: FloatArray) -> FloatArray | None:
+        """Ask again, half by half, for a hypothesis that fails by itself; None where it is the batch that fails."""
+        while len(theta) > 1:
+            half = len(theta) // 2
+            theta = theta[:half] if self._fails(theta[:half]) else theta[half:]
+        return theta[0] if self._fails(theta) else None
+
+    def _fails(self, theta: FloatArray) -> bool:
+        try:
+            if self.executor is None:
+                self.problem.log_likelihood(theta)
+            else:
+                self.executor.submit(self.problem.log_likelihood, theta).result()
+        except Exception:
+            return True
+        return False
 
     def _show(self, row: FloatArray) -> str:
         return ", ".join(f"{name} = {value:.10g}" for name, value in zip(self.names, row, strict=True))

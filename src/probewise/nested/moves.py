@@ -8,13 +8,15 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 
 __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
+# Candidates drawn ahead of refusals, where few chains are left.
+_MOST_AHEAD = 4
 _FRAME, _AXIS, _DIFFERENCE, _HOP = 0, 1, 2, 3
 
 
@@ -194,23 +196,29 @@ class SliceMove:
         active = np.arange(n_chains)
         begin(active)
         while active.size:
-            a, b = low[active], high[active]
-            t = a + (b - a) * rng.random(active.size)
-            candidate = np.clip(now.u[active] + t[:, None] * line[active], space.low, space.high)
-            hop = np.zeros(active.size, dtype=bool)
-            place = home[active]
-            least = level[active]
-            ok = np.ones(active.size, dtype=bool)
+            rows, n_ahead = active, min(_MOST_AHEAD, max(1, n_chains // (2 * active.size)))
+            t, low[rows], high[rows] = _candidates(low[rows], high[rows], n_ahead, rng)
+            of = np.repeat(np.arange(rows.size), n_ahead)
+            chain = rows[of]
+            candidate = np.clip(now.u[chain] + t.reshape(-1, 1) * line[chain], space.low, space.high)
+            least = level[chain]
+            ok = np.ones(chain.size, dtype=bool)
+            place = home[chain]
+            hop = np.zeros(rows.size, dtype=bool)
             if len(clusters) > 1:
-                kinds = kind[active, step[active]]
-                hop = kinds == _HOP
+                kinds = kind[chain, step[chain]]
+                hopping = kinds == _HOP
+                hop = hopping[::n_ahead]
                 goal = place.copy()
                 if hop.any():
-                    rows = active[hop]
-                    goal[hop] = (home[rows] + rng.integers(1, len(clusters), size=rows.size)) % len(clusters)
-                    candidate[hop], log_growth = view.hop(rows, now.u[rows], home[rows], goal[hop])
-                    least[hop] -= log_growth
-                    ok[hop] = ((candidate[hop] >= space.low) & (candidate[hop] <= space.high)).all(axis=1)
+                    # A hop has one place to go to: the first candidate takes it, the others are void.
+                    ok[hopping] = np.arange(chain.size)[hopping] % n_ahead == 0
+                    first = np.flatnonzero(hopping & ok)
+                    who = chain[first]
+                    goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
+                    candidate[first], log_growth = view.hop(who, now.u[who], home[who], goal[first])
+                    least[first] -= log_growth
+                    ok[first] = ((candidate[first] >= space.low) & (candidate[first] <= space.high)).all(axis=1)
                 place = clusters.assign(candidate)
                 ok &= (kinds == _DIFFERENCE) | (place == goal)
             asked = np.flatnonzero(ok)
@@ -223,17 +231,21 @@ class SliceMove:
                 tried = evaluate.weigh(candidate[asked], theta[above], log_density[above], rng)
                 inside = bound.admits(tried.log_likelihood, tried.label)
                 ok[asked] = inside
-                taken = active[asked[inside]]
-                now.put(taken, tried.take(inside))
-                home[taken] = place[asked[inside]]
+                # Of a chain's candidates the first that is admitted counts: written backwards, it comes last.
+                good = np.flatnonzero(inside)[::-1]
+                first_of = np.full(rows.size, -1)
+                first_of[of[asked[good]]] = good
+                won = np.flatnonzero(first_of >= 0)
+                taken, which = rows[won], first_of[won]
+                now.put(taken, tried.take(which))
+                home[taken] = place[asked[which]]
                 moved[taken] = True
                 n_evaluated += asked.size
-            n_tried += int((~hop).sum())
-            n_taken += int((ok & ~hop).sum())
-            high[active] = np.where(t > 0, t, b)
-            low[active] = np.where(t > 0, a, t)
+            n_needed, delivered = _needed(ok.reshape(-1, n_ahead))
+            n_tried += int(n_needed[~hop].sum())
+            n_taken += int((delivered & ~hop).sum())
             # A bracket that has shrunk to nothing (a point alone on its line) ends the step where it began.
-            done = active[ok | hop | (high[active] - low[active] < 1e-13)]
+            done = rows[delivered | hop | (high[rows] - low[rows] < 1e-13)]
             step[done] += 1
             more = done[step[done] < n_steps]
             if more.size < done.size:
@@ -253,6 +265,27 @@ class SliceMove:
         """Widen or narrow the bracket towards `target` candidates a step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
+
+
+def _candidates(
+    low: FloatArray, high: FloatArray, n_ahead: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Draw the next candidates on each line as if all before were refused, (n, n_ahead); also the bracket if all are.
+
+    A refusal shrinks the bracket whatever the likelihood was, so candidates can be drawn ahead and
+    evaluated together: the chain is the same, a few evaluations are spent for batches that stay full.
+    """
+    t = np.empty((len(low), n_ahead))
+    for k in range(n_ahead):
+        t[:, k] = low + (high - low) * rng.random(len(low))
+        low, high = np.where(t[:, k] > 0, low, t[:, k]), np.where(t[:, k] > 0, t[:, k], high)
+    return t, low, high
+
+
+def _needed(ok: BoolArray) -> tuple[IntArray, BoolArray]:
+    """Say how many of the candidates, (n, n_ahead), a step needed, and whether it delivered, both (n,)."""
+    delivered = np.asarray(ok.any(axis=1))
+    return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
 
 def _frames(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> FloatArray:

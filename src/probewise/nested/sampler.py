@@ -103,12 +103,14 @@ def run(
         Likelihood evaluations after which the run ends early with what it has.
     checkpoint
         File that the run is saved to as it goes, whole or not at all. Where it exists already
-        the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill.
+        the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill;
+        `rng` must be as it was at the run's start, made anew from its seed. `max_calls` may be another.
     checkpoint_every_s
-        Seconds between savings, at least.
+        Seconds between savings, at least; ten times as long as a saving takes if that is more. 0: after every round.
     executor
         Where the likelihood is evaluated, for one that is slow; by default here. Each batch is
-        dealt out in `n_workers` parts; the result does not depend on it.
+        dealt out in `n_workers` parts. The result is the same to the last bit if the likelihood of
+        a hypothesis is, whatever others are in the batch (matrix products in NumPy need not be).
     n_workers
         Parts of a batch; default the number of processors.
     return_interrupted
@@ -127,7 +129,8 @@ def run(
         If the likelihood fails (`partial` holds the result so far, if there is one), or every
         hypothesis drawn from the prior is impossible.
     FileError
-        If the checkpoint is damaged, or of a run with another problem, other settings or another seed.
+        If the checkpoint is damaged, or of a run with another problem, other settings or another seed, or
+        cannot be written: before anything is evaluated. Where a later saving fails, the run goes on and warns.
     """
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
@@ -153,39 +156,57 @@ def run(
         keeper = Keeper(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
     now = _first(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
+    if keeper is not None and resumed is None:
+        keeper.save_if_due(now)
 
-    def finish(now: Run, reason: str, *more_notes: str) -> NestedResult:
+    def save() -> None:
         if keeper is not None:
             keeper.save(now)
+
+    def finish(reason: str, *more_notes: str) -> NestedResult:
+        save()
         noted = replace(now, notes=(*now.notes, *more_notes))
-        return _result(evaluate, noted, n_live, reason, seed_state, rng.spawn(1)[0])
+        # From the state after the last round alone, so that the sums depend neither on where in a round an
+        # interruption came nor on what the generator was spawned from, which its state does not tell.
+        rng.bit_generator.state = now.rng_state
+        summing = np.random.default_rng(rng.integers(2**63, size=4))
+        return _result(evaluate, noted, n_live, reason, seed_state, summing)
 
     try:
         while True:
             if now.ended is not None:
-                result = finish(now, now.ended)
+                result = finish(now.ended)
                 break
             # A round can cost twice the one before: the volume halves while points come from the prior.
             if max_calls is not None and evaluate.n_calls + 2 * now.last_cost > max_calls:
                 reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
-                result = finish(now, reason, f"{reason}; log Z lacks what a full run would have found")
+                result = finish(reason, f"{reason}; log Z lacks what a full run would have found")
                 break
-            now, state = _round(now, evaluate, n_replaced, rng)
+            after, state = _round(now, evaluate, n_replaced, rng)
+            # At once, so that a round is done and judged, or not done at all, wherever an interruption comes.
+            now = replace(after, ended=rule(state))
             if progress is not None:
                 progress(state)
-            now = replace(now, ended=rule(state))
             if keeper is not None:
                 keeper.save_if_due(now)
     except NotConvergedError as error:
         if now.dead:
-            error.partial = finish(now, "the likelihood failed", f"the likelihood failed: {error}")
+            error.partial = finish("the likelihood failed", f"the likelihood failed: {error}")
+        else:
+            save()
         raise
     except KeyboardInterrupt:
         if not now.dead or not return_interrupted:
-            if keeper is not None:
-                keeper.save(now)
+            save()
             raise
-        result = finish(now, "interrupted", "interrupted; log Z lacks what a full run would have found")
+        if now.ended is not None:
+            result = finish(now.ended)
+        else:
+            result = finish("interrupted", "interrupted; log Z lacks what a full run would have found")
+    except BaseException:
+        # `progress` or `stop` raised, or somebody's signal handler did.
+        save()
+        raise
     for note in result.warnings:
         warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
     return result

@@ -1,0 +1,334 @@
+"""Likelihoods evaluated elsewhere: by threads and processes, in order, whole, and stopped with the run."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from nested_sampling import problems
+
+from probewise.errors import FileError, NotConvergedError, ParameterError, ReachError
+from probewise.nested import Evaluator, KernelMove, NestedResult, SliceMove, State, run
+from probewise.priors import Product, Uniform
+
+# A module of its own, since a process is sent the names of functions and not the functions.
+MODULE = '''
+"""Problems that workers can be sent."""
+
+import os
+import signal
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.errors import ParameterError
+from probewise.priors import Product, Uniform
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Steep along x; from `edge` on something else happens."""
+
+    edge: float = 2.0
+    what: str = "nothing"
+
+    @property
+    def prior(self):
+        return Product({"x": Uniform(0, 1), "y": Uniform(0, 1)})
+
+    def log_likelihood(self, theta):
+        over = theta[:, 0] > self.edge
+        if over.any():
+            if self.what == "raise":
+                raise ArithmeticError("too steep")
+            if self.what == "own error":
+                raise ParameterError("x", float(theta[over][0, 0]), "less")
+            if self.what == "die":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.what == "shape":
+                return np.zeros(3)
+            if self.what == "nan":
+                return np.where(over, np.nan, 0.0)
+        return 30 * theta[:, 0] - 5 * theta[:, 1]
+'''
+
+
+@pytest.fixture(scope="module")
+def slopes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "slopes_for_workers.py").write_text(MODULE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield importlib.import_module("slopes_for_workers")
+    del sys.modules["slopes_for_workers"]
+
+
+@pytest.fixture(scope="module")
+def processes(slopes: ModuleType) -> Iterator[Executor]:
+    """Two processes, begun anew, so that they know what they are sent and no more."""
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="module")
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(3) as pool:
+        yield pool
+
+
+@pytest.fixture(params=["threads", "processes"])
+def executor(request: pytest.FixtureRequest) -> Executor:
+    pool: Executor = request.getfixturevalue(request.param)
+    return pool
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20240229)
+
+
+def assert_same(one: NestedResult, other: NestedResult) -> None:
+    """Compare every field, bit for bit."""
+    for field in dataclasses.fields(NestedResult):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        same = a.tobytes() == b.tobytes() if isinstance(a, np.ndarray) else a == b
+        assert same, field.name
+
+
+class AtOnce(Executor):
+    """The least that an executor is: it does at once what it is given."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+
+    def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]
+        future: Future[object] = Future()
+        self.sizes.append(len(args[0]))
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.mark.parametrize("move", [SliceMove(), KernelMove()])
+def test_the_result_does_not_depend_on_the_executor(
+    move: SliceMove | KernelMove, executor: Executor, slopes: ModuleType
+) -> None:
+    alone = run(slopes.Slope(), rng=rng(), n_live=50, move=move)
+    for n_workers in (None, 5):
+        together = run(slopes.Slope(), rng=rng(), n_live=50, move=move, executor=executor, n_workers=n_workers)
+        assert_same(together, alone)
+
+
+def test_any_executor_will_do_and_gets_even_parts() -> None:
+    pool = AtOnce()
+    together = run(problems.plateau(), rng=rng(), n_live=50, executor=pool, n_workers=4)
+    assert_same(together, run(problems.plateau(), rng=rng(), n_live=50))
+    assert pool.sizes[:4] == [13, 13, 12, 12]
+    # A single hypothesis is not worth sending.
+    assert sum(pool.sizes) <= together.n_calls
+
+
+def test_parts_of_a_batch_are_evaluated_at_the_same_time() -> None:
+    """The first three parts wait for one another: were they evaluated in turn, none would ever go on."""
+    meeting, lock = threading.Barrier(3, timeout=60), threading.Lock()
+    n_met, here, most = 0, 0, 0
+
+    def function(theta: np.ndarray) -> np.ndarray:
+        nonlocal n_met, here, most
+        with lock:
+            n_met, here = n_met + 1, here + 1
+            most, meets = max(most, here), n_met <= 3
+        if meets:
+            meeting.wait()
+        with lock:
+            here -= 1
+        return 30 * theta[:, 0]
+
+    problem = problems.Known(problems.box(2, 0, 1), function, 0.0)
+    with ThreadPoolExecutor(3) as pool:
+        run(problem, rng=rng(), n_live=30, executor=pool, n_workers=3)
+    assert most == 3
+
+
+def test_a_run_with_an_executor_is_taken_up_again_without_and_the_other_way_round(
+    executor: Executor, slopes: ModuleType, tmp_path: Path
+) -> None:
+    class Stop(Exception):
+        pass
+
+    def stop(state: State) -> None:
+        raise Stop
+
+    whole = run(slopes.Slope(), rng=rng(), n_live=50)
+    path = tmp_path / "run.npz"
+    for pool in (executor, None, executor, None, executor):
+        with pytest.raises(Stop):
+            run(slopes.Slope(), rng=rng(), n_live=50, executor=pool, checkpoint=path, progress=stop)
+    assert_same(run(slopes.Slope(), rng=rng(), n_live=50, executor=executor, checkpoint=path), whole)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("raise", r"raised ArithmeticError: too steep; at x = 0\.9\d+, y = 0\.\d+"),
+        ("own error", r"raised ParameterError: x is 0\.9\d+; allowed: less; at x = 0\.9\d+, y = 0\.\d+"),
+        ("nan", r"log likelihood is nan at x = 0\.9\d+, y = 0\.\d+"),
+        ("shape", r"returned shape \(3,\); allowed: \(\d+,\).*first of the \d+ hypotheses asked for: x = 0\.\d+"),
+    ],
+)
+def test_a_failure_in_a_worker_is_told_with_its_parameters_and_mended(
+    what: str, message: str, executor: Executor, slopes: ModuleType, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.npz"
+    options = {"n_live": 50, "executor": executor, "n_workers": 3, "checkpoint": path}
+    with pytest.raises(NotConvergedError, match=message) as caught:
+        run(slopes.Slope(0.9995, what), rng=rng(), **options)
+    assert isinstance(caught.value.partial, NestedResult)
+    assert caught.value.partial.stop_reason == "the likelihood failed"
+    assert path.exists()
+    assert_same(run(slopes.Slope(), rng=rng(), **options), run(slopes.Slope(), rng=rng(), n_live=50))
+
+
+def test_the_part_that_failed_is_the_one_that_is_told() -> None:
+    def function(theta: np.ndarray) -> np.ndarray:
+        if (theta[:, 0] == 7.0).any():
+            raise ArithmeticError
+        return theta[:, 0]
+
+    problem = problems.Known(Product({"x": Uniform(0, 10)}), function, 0.0)
+    for n_parts in (1, 3, 10):
+        evaluate = Evaluator(problem, executor=AtOnce(), n_parts=n_parts)
+        with pytest.raises(NotConvergedError, match=r"at x = 7$"):
+            evaluate.log_likelihood(np.arange(10.0)[:, None])
+        assert evaluate.n_calls == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no kill -9")
+def test_a_worker_that_dies_does_not_take_the_run_along(slopes: ModuleType, tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    with (
+        ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool,
+        pytest.raises(NotConvergedError, match=r"raised BrokenProcessPool: .*first of the \d+ .*: x = 0\.") as caught,
+    ):
+        run(slopes.Slope(0.9995, "die"), rng=rng(), n_live=50, executor=pool, n_workers=2, checkpoint=path)
+    assert isinstance(caught.value.__cause__, BrokenProcessPool)
+    assert isinstance(caught.value.partial, NestedResult)
+    assert_same(run(slopes.Slope(), rng=rng(), n_live=50, checkpoint=path), run(slopes.Slope(), rng=rng(), n_live=50))
+
+
+def test_a_problem_that_cannot_be_sent_is_told_how_to(processes: Executor) -> None:
+    problem = problems.Known(problems.box(2, 0, 1), lambda t: t[:, 0], 0.0)
+    with pytest.raises(NotConvergedError, match=r"cannot be sent to the executor's workers .*without lambdas; or take"):
+        run(problem, rng=rng(), n_live=50, executor=processes, n_workers=2)
+
+
+def test_n_workers_is_checked() -> None:
+    with pytest.raises(ParameterError, match="n_workers is 0; allowed: 1 or more"):
+        run(problems.plateau(), rng=rng(), n_live=50, executor=AtOnce(), n_workers=0)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ParameterError("x", 3.0, "less"),
+        ReachError("x_mm", 3.0, "less"),
+        FileError("a.csv", "nothing", "a number", row=3, column="reading"),
+        NotConvergedError("too slow", partial=3.0),
+    ],
+)
+def test_errors_come_back_from_another_process_as_they_were(error: Exception) -> None:
+    """An error that cannot be unpickled breaks a pool of processes instead of telling what happened."""
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)
+
+
+INTERRUPTED = """
+import multiprocessing, sys, time
+from concurrent.futures import {pool}
+import numpy as np
+import slopes_for_workers
+
+class Slow(slopes_for_workers.Slope):
+    def log_likelihood(self, theta):
+        time.sleep(0.005)
+        return super().log_likelihood(theta)
+
+def tell(state):
+    print("round", flush=True)
+
+def main():
+    from probewise.nested import run  # workers do without
+
+    context = dict(mp_context=multiprocessing.get_context("{start}")) if "{start}" else {{}}
+    with {pool}(2, **context) as pool:
+        result = run(Slow(), rng=np.random.default_rng(1), n_live=50, executor=pool, n_workers=4, progress=tell,
+                     checkpoint=sys.argv[1])
+    print(result.stop_reason, flush=True)
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends Ctrl-C otherwise")
+@pytest.mark.parametrize(
+    ("pool", "start", "everybody"),
+    [
+        ("ProcessPoolExecutor", "fork", True),
+        pytest.param("ProcessPoolExecutor", "spawn", False, marks=pytest.mark.slow),
+        pytest.param("ProcessPoolExecutor", "spawn", True, marks=pytest.mark.slow),
+        pytest.param("ProcessPoolExecutor", "forkserver", True, marks=pytest.mark.slow),
+        pytest.param("ThreadPoolExecutor", "", True, marks=pytest.mark.slow),
+    ],
+)
+def test_ctrl_c_ends_the_run_and_every_worker(
+    pool: str, start: str, everybody: bool, slopes: ModuleType, tmp_path: Path
+) -> None:
+    """A terminal sends it to every process; whoever starts the program, `kill -INT`, to the first alone.
+
+    The output ends when the last process that could write to it has ended.
+    """
+    script, path = tmp_path / "interrupted.py", tmp_path / "run.npz"
+    script.write_text(textwrap.dedent(INTERRUPTED).format(pool=pool, start=start))
+    folder = str(Path(str(slopes.__file__)).parent)
+    begun = subprocess.Popen(
+        [sys.executable, "-W", "ignore", str(script), str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([folder, *sys.path])},
+        start_new_session=True,
+        text=True,
+    )
+    try:
+        assert begun.stdout is not None
+        assert [begun.stdout.readline() for _ in range(2)] == ["round\n"] * 2
+        if everybody:
+            os.killpg(begun.pid, signal.SIGINT)
+        else:
+            begun.send_signal(signal.SIGINT)
+        out, err = begun.communicate(timeout=60)
+    except BaseException:
+        os.killpg(begun.pid, signal.SIGKILL)
+        begun.communicate()
+        raise
+    assert (begun.returncode, out.splitlines()[-1:]) == (0, ["interrupted"]), err
+    assert path.exists()

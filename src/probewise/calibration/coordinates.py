@@ -59,7 +59,7 @@ class MomentCoordinates:
         n = self.prior.n_gaussians
         g = x[:, : 6 * n].reshape(len(x), n, 6)
         # A sampler asks far outside too; nothing there may overflow.
-        log_mass, log_x, log_y = (np.clip(g[..., k], -500.0, 500.0) for k in (0, 3, 4))
+        log_mass, log_x, log_y = (np.clip(g[..., k], -100.0, 100.0) for k in (0, 3, 4))
         r = np.tanh(g[..., 5])
         rest = np.maximum(1.0 - r * r, 1e-12)
         out = np.empty_like(g)
@@ -79,11 +79,11 @@ class MomentCoordinates:
         jacobian = np.log(out[..., 0]) - 3.0 * np.log(2.0) - 1.5 * (log_x + log_y) - 2.0 * np.log(rest)
         log_density = self.prior.log_prob(theta) + jacobian.sum(axis=1) - 2.0 * np.log(share[:, 0]) + math.lgamma(n + 1)
         falling = np.diff(np.concatenate([np.zeros((len(x), 1)), g[:, 1:, 0]], axis=1), axis=1) <= 0.0
-        usable = falling.all(axis=1) & (np.abs(g[..., 3:5]) < 500.0).all(axis=(1, 2)) & np.isfinite(theta).all(axis=1)
+        usable = falling.all(axis=1) & (np.abs(g[..., 3:5]) < 100.0).all(axis=(1, 2)) & np.isfinite(theta).all(axis=1)
         return theta, np.where(usable, log_density, -np.inf)
 
 
 def _shares(g: FloatArray) -> FloatArray:
     """Share of the light that each Gaussian holds, from coordinates (n_samples, N, 6) -> (n_samples, N)."""
-    ratio = np.concatenate([np.ones((len(g), 1)), np.exp(np.clip(g[:, 1:, 0], -500.0, 0.0))], axis=1)
+    ratio = np.concatenate([np.ones((len(g), 1)), np.exp(np.clip(g[:, 1:, 0], -100.0, 0.0))], axis=1)
     return np.asarray(ratio / ratio.sum(axis=1, keepdims=True))

@@ -1,0 +1,167 @@
+"""Coordinates that chains step in and densities are fitted in: there and back, Jacobians, total probability."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_t
+
+from probewise.calibration import SSFPrior, default_prior
+from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
+from probewise.nested.space import space_of, unbounded
+from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
+from probewise.recordings import Recording, paper_plan
+from probewise.scene import AnyOf, Circle, Ellipse, Rectangle, RegularPolygon
+
+
+def paper_prior(n_gaussians):
+    return SSFPrior(n_gaussians, Uniform(-10, 10), Uniform(0.003, 0.5), Uniform(0, 20), Uniform(40, 80))
+
+
+def derived_prior(n_gaussians):
+    plan = paper_plan()
+    return default_prior(Recording(plan, 10 + 50 / (1 + np.exp(-plan.x_mm / 4))), n_gaussians)
+
+
+PRIORS = {
+    "uniform": Product({"a": Uniform(-2.0, 5.0)}),
+    "log-uniform": Product({"a": LogUniform(1e-3, 40.0)}),
+    "normal": Product({"a": Normal(3.0, 0.5)}),
+    "heavy-tailed": Product({"a": HeavyTailed(2.0)}),
+    "positive heavy-tailed": Product({"a": HeavyTailed(0.1, positive=True)}),
+    "log heavy-tailed": Product({"a": LogHeavyTailed(0.2)}),
+    "joint": Joint((Product({"a": Uniform(0, 1)}), Empty(), Product({"b": Normal(0, 1), "c": LogUniform(1, 2)}))),
+    "circle": Circle().prior,
+    "circle inside": Circle(inside=True).prior,
+    "ellipse": Ellipse().prior,
+    "ellipse inside": Ellipse(inside=True).prior,
+    "rectangle": Rectangle().prior,
+    "rectangle inside": Rectangle(inside=True).prior,
+    "triangle": RegularPolygon(3).prior,
+    "hexagon inside": RegularPolygon(6, inside=True).prior,
+    "any of two": AnyOf({"circle": Circle(), "rectangle": Rectangle()}, (0.7, 0.3)).prior,
+    "any of two inside": AnyOf({"circle": Circle(inside=True), "ellipse": Ellipse(inside=True)}).prior,
+    "SSF of one Gaussian": paper_prior(1),
+    "SSF of three Gaussians": paper_prior(3),
+    "SSF by mass": derived_prior(2),
+}
+MOMENTS = {"one": paper_prior(1), "two": paper_prior(2), "three by mass": derived_prior(3)}
+
+
+def cube(prior, n=200, seed=0):
+    return np.random.default_rng(seed).random((n, len(prior.names)))
+
+
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
+def test_a_point_of_the_unit_cube_is_found_again_from_its_parameters(prior):
+    u = cube(prior)
+    np.testing.assert_allclose(prior.to_unit_cube(prior.from_unit_cube(u)), u, atol=1e-7)
+
+
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
+def test_what_lies_outside_a_prior_goes_to_the_wall_of_its_cube_and_never_beyond(prior):
+    """Rounding may push a sample over its prior's edge; chains must still find it in the cube."""
+    theta = prior.from_unit_cube(cube(prior))
+    for moved in (theta * (1 + 1e-12), theta * (1 - 1e-12)):
+        u = prior.to_unit_cube(moved)
+        assert ((u >= 0) & (u <= 1)).all()
+
+
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
+def test_parameters_are_found_again_from_coordinates_without_walls(prior):
+    space = unbounded(prior)
+    theta = prior.from_unit_cube(cube(prior))
+    x = space.enter(theta)
+    back, log_density = space.leave(x)
+    assert np.isfinite(log_density).all()
+    # Labels of exchangeable Gaussians may have been swapped; the density knows none.
+    np.testing.assert_allclose(prior.log_prob(back), prior.log_prob(theta), atol=1e-6)
+    np.testing.assert_allclose(space.enter(back), x, atol=1e-6)
+    assert np.isinf(space.low).all()
+    assert np.isinf(space.high).all()
+
+
+@pytest.mark.parametrize("prior", [p for p in PRIORS.values() if not hasattr(p, "coordinates")])
+def test_chains_step_in_the_unit_cube_where_a_prior_has_no_better(prior):
+    assert isinstance(prior, Prior)
+    space = space_of(prior)
+    u = cube(prior)
+    theta, log_density = space.leave(u)
+    np.testing.assert_array_equal(theta, prior.from_unit_cube(u))
+    assert (log_density == 0).all()
+    np.testing.assert_allclose(space.enter(theta), u, atol=1e-7)
+
+
+@pytest.mark.parametrize("prior", MOMENTS.values(), ids=MOMENTS)
+def test_moments_give_back_the_gaussians_sorted_by_mass(prior):
+    theta = prior.from_unit_cube(cube(prior))
+    n = prior.n_gaussians
+    back, _ = prior.coordinates.leave(prior.coordinates.enter(theta))
+    g = theta[:, : 6 * n].reshape(-1, n, 6)
+    mass = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
+    sorted_g = np.take_along_axis(g, np.argsort(-mass, axis=1)[..., None], axis=1)
+    np.testing.assert_allclose(back[:, : 6 * n].reshape(-1, n, 6), sorted_g, rtol=1e-7, atol=1e-9)
+    np.testing.assert_array_equal(back[:, 6 * n :], theta[:, 6 * n :])
+
+
+@pytest.mark.parametrize("prior", MOMENTS.values(), ids=MOMENTS)
+def test_the_density_over_moments_has_the_jacobian_of_finite_differences(prior):
+    """Log density over x = log N! + log density over theta + log |d theta / d x|, by central differences."""
+    n_params, step = len(prior.names), 1e-6
+    # Away from the walls, where a difference would reach over them.
+    x = prior.coordinates.enter(prior.from_unit_cube(0.1 + 0.8 * cube(prior, 20)))
+    theta, log_density = prior.coordinates.leave(x)
+    slopes = np.empty((len(x), n_params, n_params))
+    for k in range(n_params):
+        ahead, behind = x.copy(), x.copy()
+        ahead[:, k] += step
+        behind[:, k] -= step
+        slopes[:, :, k] = (prior.coordinates.leave(ahead)[0] - prior.coordinates.leave(behind)[0]) / (2 * step)
+    jacobian = np.linalg.slogdet(slopes)[1]
+    wanted = prior.log_prob(theta) + jacobian + math.lgamma(prior.n_gaussians + 1)
+    np.testing.assert_allclose(log_density, wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("prior", [paper_prior(1), paper_prior(2), derived_prior(2)], ids=["one", "two", "two by mass"])
+def test_the_folded_density_over_moments_integrates_to_one(prior):
+    """Importance sampling from a Student-t about the prior's own draws; within five standard errors."""
+    rng = np.random.default_rng(6)
+    drawn = unbounded(prior).draw(20_000, rng=rng)
+    around = multivariate_t(drawn.mean(axis=0), np.cov(drawn, rowvar=False), df=6, seed=rng)
+    x = around.rvs(150_000)
+    ratio = np.exp(prior.coordinates.leave(x)[1] - around.logpdf(x))
+    error = ratio.std() / math.sqrt(len(x))
+    assert error < 0.05
+    assert ratio.mean() == pytest.approx(1.0, abs=5 * error)
+
+
+def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():
+    prior = paper_prior(2)
+    inside = prior.coordinates.enter(prior.from_unit_cube(0.3 + 0.4 * cube(prior, 1)))[0]
+    n_params = len(prior.names)
+    far = np.concatenate([np.full((1, n_params), v) for v in (1e4, -1e4, 800.0, -800.0)])
+    mixed = np.random.default_rng(5).choice([-1e4, -300.0, 300.0, 1e4], size=(500, n_params))
+    changes = {
+        "amplitude above its bound": (0, 60.0),
+        "centre off its bound": (1, 500.0),
+        "variance beyond any": (3, 300.0),
+        "variance below any": (4, -300.0),
+        "correlation of one": (5, 40.0),
+        "the second heavier than the first": (6, 0.5),
+        "level off its bound": (n_params - 1, 90.0),
+    }
+    moved = np.repeat(inside[None, :], len(changes), axis=0)
+    for row, (column, value) in enumerate(changes.values()):
+        moved[row, column] = value
+    assert np.isfinite(prior.coordinates.leave(inside[None, :])[1]).all()
+    for x in (far, mixed, moved):
+        theta, log_density = prior.coordinates.leave(x)
+        assert (log_density == -np.inf).all()
+        assert not np.isnan(theta).any()
+
+
+def test_normal_scores_have_the_density_of_a_standard_normal_prior():
+    space = unbounded(Circle().prior)
+    x = space.draw(1000, rng=np.random.default_rng(3))
+    _, log_density = space.leave(x)
+    np.testing.assert_allclose(log_density, (-0.5 * x**2 - 0.5 * math.log(2 * math.pi)).sum(axis=1))

@@ -14,9 +14,8 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
-from probewise.sensor._normal import normal_cdf
 from probewise.sensor.discrete import seen_discrete
-from probewise.sensor.gaussian import ACCURATE_NODES, Spot, mass_in_quadrant, seen_by_one
+from probewise.sensor.gaussian import ACCURATE_NODES, Spot, seen_by_one, turned
 from probewise.sensor.ssf import FieldSSF, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
@@ -27,6 +26,7 @@ from probewise.sensor.stages import (
     Stage,
     require_columns,
 )
+from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 
 __all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "response"]
 
@@ -166,16 +166,32 @@ class Chain:
         """Seen white fraction R before any effect on it, shape (n_samples or 1, n_points)."""
         require_columns(theta, self.names)
         apply = self._applier(theta, plan)
-        n_ssf = len(self.ssf.names)
-        n_before = n_ssf + len(self.levels.names)
-        poses = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
-        poses = apply(Stage.POSE, poses)
-        regions = self.scene.regions(theta[:, n_before : n_before + len(self.scene.names)])
-        view = apply(Stage.SCENE, SceneView(regions))
+        layout = self._layout_of(theta, plan)
         if isinstance(self.ssf, FieldSSF):
-            return _discrete_response(view.regions, self.ssf, poses, plan)
-        footprint = apply(Stage.FOOTPRINT, self.ssf.footprint(theta[:, :n_ssf]))
-        return response(view.regions, footprint, poses, plan, n_nodes=self.n_nodes)
+            return _discrete_response(layout, self.ssf)
+        footprint = apply(Stage.FOOTPRINT, self.ssf.footprint(theta[:, : len(self.ssf.names)]))
+        return response(layout, footprint, n_nodes=self.n_nodes)
+
+    def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
+        """Lay out the scene under the poses; where no hypothesis changes either, once for a plan."""
+        fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
+        known = self._last_layout.get(plan) if fixed else None
+        if known is not None:
+            return known
+        apply = self._applier(theta, plan)
+        start = len(self.ssf.names) + len(self.levels.names)
+        regions = self.scene.regions(theta[:, start : start + len(self.scene.names)])
+        poses = apply(Stage.POSE, Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]))
+        layout = Layout(apply(Stage.SCENE, SceneView(regions)).regions, poses, plan)
+        if fixed:
+            self._last_layout.clear()
+            self._last_layout[plan] = layout
+        return layout
+
+    @cached_property
+    def _last_layout(self) -> dict[Plan, Layout]:
+        """Layout by plan, of the last plan alone."""
+        return {}
 
     def noise_level(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseLevel:
         """Noise of each reading: `sd` broadcasting to (n_samples, n_points), then the effects on it."""
@@ -206,198 +222,103 @@ class Chain:
         return pairs
 
 
-def response(
-    regions: Mapping[str, Region],
-    footprint: Footprint,
-    poses: Poses,
-    plan: Plan,
-    *,
-    n_nodes: int = ACCURATE_NODES,
-) -> FloatArray:
-    """Integrate the footprint over each reading's pattern (paper, eq. R), by the closed forms.
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Which region lies under which reading: what the response needs that no footprint changes.
 
     Parameters
     ----------
     regions
         Region by pattern name.
-    footprint
-        SSF in the sensor frame, arrays broadcasting to (n_samples, n_points, n_gaussians).
     poses
         Where the sensor stands, arrays broadcasting to (n_samples, n_points).
     plan
         Which pattern lies under each reading.
-    n_nodes
-        Nodes of the quadrature over curved edges.
-
-    Returns
-    -------
-    R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
 
     Raises
     ------
     ParameterError
         If the plan has a pattern that the regions lack.
     """
-    parts = [(rows, _region_named(regions, name)) for name, rows in plan.rows_by_pattern()]
-    place = (poses.x_mm, poses.y_mm, poses.orientation_rad)
-    arrays = (footprint.weight, footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
-    n_samples = max(1, *(a.shape[0] for a in (*arrays, *place)), *(region.n_regions for _, region in parts))
-    n_gaussians = max(a.shape[2] for a in arrays)
-    gaussians = [_Gaussian(*(a[:, :, g if a.shape[2] > 1 else 0] for a in arrays)) for g in range(n_gaussians)]
-    out = np.zeros((n_samples, len(plan)))
-    half_planes: list[tuple[IntArray, HalfPlaneRegion]] = []
-    quadrants: list[tuple[IntArray, QuadrantRegion]] = []
-    for rows, region in parts:
-        if region.n_regions == 1 and poses.orientation_rad.shape[0] == 1:
-            # Known straight edges of all patterns are taken together: calibration lives on them.
-            if isinstance(region, HalfPlaneRegion):
-                half_planes.append((rows, region))
-                continue
-            if isinstance(region, QuadrantRegion):
-                quadrants.append((rows, region))
-                continue
-        for group in _by_orientation(rows, poses.orientation_rad):
-            for gaussian in gaussians:
-                spot = gaussian.spot(poses, group)
-                out[:, group] += _columns_of(gaussian.weight, group) * seen_by_one(region, spot, n_nodes)
-    if half_planes:
-        _add_half_planes(out, half_planes, gaussians, poses)
-    if quadrants:
-        _add_quadrants(out, quadrants, gaussians, poses)
+
+    regions: Mapping[str, Region]
+    poses: Poses
+    plan: Plan
+
+    @cached_property
+    def n_samples(self) -> int:
+        """Hypotheses that the poses and regions tell apart, or 1."""
+        place = (self.poses.x_mm, self.poses.y_mm, self.poses.orientation_rad)
+        return max([1, *(len(a) for a in place), *(region.n_regions for _, region in self.parts)])
+
+    @cached_property
+    def parts(self) -> list[tuple[IntArray, Region]]:
+        """Readings and the region under them."""
+        return [(rows, _region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
+
+    @cached_property
+    def straight(self) -> tuple[StraightEdges | StraightCorners, ...]:
+        """Known straight edges and corners of all patterns, taken together: calibration lives on them."""
+        if self.poses.orientation_rad.shape[0] > 1:
+            return ()
+        known = [(rows, region) for rows, region in self.parts if region.n_regions == 1]
+        edges = [(rows, region) for rows, region in known if isinstance(region, HalfPlaneRegion)]
+        corners = [(rows, region) for rows, region in known if isinstance(region, QuadrantRegion)]
+        return (
+            *((StraightEdges.of(edges, self.poses),) if edges else ()),
+            *((StraightCorners.of(corners, self.poses),) if corners else ()),
+        )
+
+    @cached_property
+    def others(self) -> list[tuple[IntArray, Region]]:
+        """Readings over anything else, in groups that share an orientation."""
+        taken = np.concatenate([part.rows for part in self.straight]) if self.straight else np.empty(0, dtype=np.int64)
+        return [
+            (group, region)
+            for rows, region in self.parts
+            if not np.isin(rows, taken).any()
+            for group in _by_orientation(rows, self.poses.orientation_rad)
+        ]
+
+
+def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
+    """Integrate the footprint over each reading's pattern (paper, eq. R), by the closed forms.
+
+    Parameters
+    ----------
+    layout
+        What lies under the sensor at each reading.
+    footprint
+        SSF in the sensor frame, arrays broadcasting to (n_samples, n_points, n_gaussians).
+    n_nodes
+        Nodes of the quadrature over curved edges.
+
+    Returns
+    -------
+    R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
+    """
+    arrays = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
+    out = np.zeros((max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *arrays))), len(layout.plan)))
+    poses = layout.poses
+    for part in layout.straight:
+        part.see(footprint, out)
+    for rows, region in layout.others:
+        x, y, turn = (columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
+        if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
+            turn = turn[:, :1]
+        for g in range(footprint.weight.shape[2]):
+            one = (columns_of(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in arrays)
+            seen = seen_by_one(region, Spot(x, y, *turned(turn, *one)), n_nodes)
+            out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * seen
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Gaussian:
-    """One Gaussian of the footprint in the sensor frame, arrays broadcasting to (n_samples, n_points)."""
-
-    weight: FloatArray
-    u_mm: FloatArray
-    v_mm: FloatArray
-    var_u: FloatArray
-    var_v: FloatArray
-    cov_uv: FloatArray
-
-    @property
-    def varies(self) -> bool:
-        """Whether it depends on the reading."""
-        return any(a.shape[1] > 1 for a in (self.u_mm, self.v_mm, self.var_u, self.var_v, self.cov_uv))
-
-    def spot(self, poses: Poses, rows: IntArray) -> Spot:
-        """Turn it with the sensor into the lab frame, at the readings `rows`."""
-        turn = _columns_of(poses.orientation_rad, rows)
-        if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
-            turn = turn[:, :1]
-        c, s = np.cos(turn), np.sin(turn)
-        u, v, var_u, var_v, cov = (
-            _columns_of(a, rows) for a in (self.u_mm, self.v_mm, self.var_u, self.var_v, self.cov_uv)
-        )
-        cross = 2 * c * s * cov
-        return Spot(
-            _columns_of(poses.x_mm, rows),
-            _columns_of(poses.y_mm, rows),
-            c * u - s * v,
-            s * u + c * v,
-            c * c * var_u + s * s * var_v - cross,
-            s * s * var_u + c * c * var_v + cross,
-            c * s * (var_u - var_v) + (c * c - s * s) * cov,
-        )
-
-
-_BLOCK = 2**14  # elements at a time: stays in the cache
-
-
-def _add_half_planes(
-    out: FloatArray, parts: list[tuple[IntArray, HalfPlaneRegion]], gaussians: list[_Gaussian], poses: Poses
-) -> None:
-    """Add what is seen of known half-planes: each Gaussian projected once for each distinct angle."""
-    rows = np.concatenate([r for r, _ in parts])
-    normal, offset, inside, outside = (
-        np.concatenate([np.full(len(r), value) for (r, _), value in zip(parts, values, strict=True)])
-        for values in (
-            [region.normal_rad[0] for _, region in parts],
-            [region.offset_mm[0] for _, region in parts],
-            [region.inside for _, region in parts],
-            [region.outside for _, region in parts],
-        )
-    )
-    place = np.cos(normal) * _columns_of(poses.x_mm, rows) + np.sin(normal) * _columns_of(poses.y_mm, rows) - offset
-    # In the sensor frame the normal is turned back by the sensor's orientation.
-    angles = np.broadcast_to(normal - _columns_of(poses.orientation_rad, rows)[0], rows.shape)
-    if any(gaussian.varies for gaussian in gaussians):
-        distinct, which = angles, np.arange(len(rows))
-    else:
-        distinct, which = np.unique(angles, return_inverse=True)
-    c, s = np.cos(distinct), np.sin(distinct)
-    together = bool((np.diff(rows) == 1).all())  # then a view of the result takes the place of a copy
-    share = out[:, rows[0] : rows[0] + len(rows)] if together else np.empty((len(out), len(rows)))
-    step = max(1, _BLOCK // max(1, len(rows)))
-    workspace = np.empty((min(step, len(out)), len(rows)))
-    by_product = len(distinct) <= 16 and len(place) == 1
-    hand_out = np.empty((0, 0))
-    if by_product:
-        own = np.eye(len(distinct))[:, which]
-        hand_out = np.concatenate([own * place, own])
-    for g, gaussian in enumerate(gaussians):
-        u, v, var_u, var_v, cov, weight = (
-            _columns_of(a, rows)
-            for a in (gaussian.u_mm, gaussian.v_mm, gaussian.var_u, gaussian.var_v, gaussian.cov_uv, gaussian.weight)
-        )
-        per_sd = 1 / np.sqrt(c * c * var_u + s * s * var_v + 2 * c * s * cov)
-        shift = c * u + s * v
-        for start in range(0, len(out), step):
-            block = slice(start, start + step)
-            z = workspace[: len(share[block])]
-            per_sd_here = _rows_of(per_sd, block)
-            if by_product and len(shift) == len(per_sd) == len(out):
-                # z = place / sd + shift / sd, each angle's handed out to its readings: one product.
-                np.matmul(np.concatenate([per_sd_here, _rows_of(shift, block) * per_sd_here], axis=1), hand_out, out=z)
-            else:
-                np.add(_rows_of(shift, block)[:, which], _rows_of(place, block), out=z)
-                z *= per_sd_here[:, which]
-            normal_cdf(z, out=z)
-            if g == 0:
-                np.multiply(z, _rows_of(weight, block), out=share[block])
-            else:
-                z *= _rows_of(weight, block)
-                share[block] += z
-    if (inside != 1.0).any() or (outside != 0.0).any():
-        share *= inside - outside
-        share += outside
-    if not together:
-        out[:, rows] = share
-
-
-def _add_quadrants(
-    out: FloatArray, parts: list[tuple[IntArray, QuadrantRegion]], gaussians: list[_Gaussian], poses: Poses
-) -> None:
-    """Add what is seen of known quadrants, all patterns in one call."""
-    rows = np.concatenate([r for r, _ in parts])
-    of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
-    corner = np.concatenate([region.corner_mm for _, region in parts])[of]
-    direction = np.concatenate([region.direction for _, region in parts])[of]
-    inside = np.array([region.inside for _, region in parts])[of]
-    outside = np.array([region.outside for _, region in parts])[of]
-    share = np.zeros((len(out), len(rows)))
-    for gaussian in gaussians:
-        found = mass_in_quadrant(
-            corner[:, 0], corner[:, 1], direction[:, 0], direction[:, 1], gaussian.spot(poses, rows)
-        )
-        share += _columns_of(gaussian.weight, rows) * found
-    out[:, rows] = outside + (inside - outside) * share
-
-
-def _rows_of(array: FloatArray, block: slice) -> FloatArray:
-    """Take a block of the hypotheses, of an array whose sample axis may be 1."""
-    return array if array.shape[0] == 1 else array[block]
-
-
-def _discrete_response(regions: Mapping[str, Region], ssf: FieldSSF, poses: Poses, plan: Plan) -> FloatArray:
-    found = []
-    for name, rows in plan.rows_by_pattern():
-        there = Poses(*(_columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
-        found.append((rows, seen_discrete(_region_named(regions, name), ssf.field, there)))
-    out = np.zeros((max((len(part) for _, part in found), default=1), len(plan)))
+def _discrete_response(layout: Layout, ssf: FieldSSF) -> FloatArray:
+    poses, found = layout.poses, []
+    for rows, region in layout.parts:
+        there = Poses(*(columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+        found.append((rows, seen_discrete(region, ssf.field, there)))
+    out = np.zeros((max((len(part) for _, part in found), default=1), len(layout.plan)))
     for rows, part in found:
         out[:, rows] = part
     return out
@@ -408,11 +329,6 @@ def _region_named(regions: Mapping[str, Region], name: str) -> Region:
         return regions[name]
     except KeyError:
         raise ParameterError("pattern", name, f"a pattern of the scene: {', '.join(regions) or 'none'}") from None
-
-
-def _columns_of(array: FloatArray, rows: IntArray) -> FloatArray:
-    """Take the columns of the readings `rows`, of an array whose point axis may be 1."""
-    return array if array.shape[1] == 1 else array[:, rows]
 
 
 def _by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:

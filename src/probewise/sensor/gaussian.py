@@ -30,7 +30,7 @@ from probewise.scene.regions import (
 )
 from probewise.sensor._normal import normal_cdf
 
-__all__ = ["ACCURATE_NODES", "FAST_NODES", "Spot", "mass_in_quadrant", "seen", "seen_by_one"]
+__all__ = ["ACCURATE_NODES", "FAST_NODES", "Spot", "mass_in_quadrant", "seen", "seen_by_one", "turned"]
 
 ACCURATE_NODES = 64
 FAST_NODES = 20
@@ -67,6 +67,21 @@ class Spot:
 
     def _arrays(self) -> tuple[FloatArray, ...]:
         return (self.x_mm, self.y_mm, self.dx_mm, self.dy_mm, self.var_x, self.var_y, self.cov_xy)
+
+
+def turned(
+    turn_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Turn mean and covariance anticlockwise into the lab frame: dx, dy, var_x, var_y, cov_xy; all broadcast."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    cross = 2 * c * s * cov_uv
+    return (
+        c * u_mm - s * v_mm,
+        s * u_mm + c * v_mm,
+        c * c * var_u + s * s * var_v - cross,
+        s * s * var_u + c * c * var_v + cross,
+        c * s * (var_u - var_v) + (c * c - s * s) * cov_uv,
+    )
 
 
 def seen(
@@ -225,7 +240,7 @@ def _(region: QuadrantRegion, spot: Spot, n_nodes: int) -> FloatArray:
 def mass_in_quadrant(
     corner_x: FloatArray, corner_y: FloatArray, dx: FloatArray, dy: FloatArray, spot: Spot
 ) -> FloatArray:
-    """Integrate a Gaussian over a quadrant, corner and directions broadcasting to (n_samples, n_points).
+    """Integrate Gaussians over quadrants: corner, directions and the spot's fields broadcast, whatever their shape.
 
     By the bivariate normal: two rays from the corner and the angle between them, in the frame
     in which the Gaussian is the unit one about the origin; Owen (1956).

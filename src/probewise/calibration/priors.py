@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -89,7 +90,7 @@ class SSFPrior:
         if self.unit_mass_mm2 is not None and not self.unit_mass_mm2 > 0:
             raise ParameterError("unit_mass_mm2", self.unit_mass_mm2, "greater than 0, or None")
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Parameter names in the sensor's order: a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max."""
         gaussians = (f"{p}_{n}" for n in range(1, self.n_gaussians + 1) for p in _PER_GAUSSIAN)
@@ -132,18 +133,16 @@ class SSFPrior:
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
         self._require_columns(theta)
-        total = self.i_min.log_prob(theta[:, -2]) + self.i_max.log_prob(theta[:, -1])
-        for n in range(self.n_gaussians):
-            a, u, v, p, q, c = theta[:, 6 * n : 6 * n + 6].T
-            total = total + self.offset_mm.log_prob(u) + self.offset_mm.log_prob(v)
-            total = total + self.precision.log_prob(p) + self.precision.log_prob(q)
-            scale = np.sqrt(np.maximum(p, 0) * np.maximum(q, 0))
-            inside = (scale > 0) & (np.abs(c) <= self.max_correlation * scale * (1 + 1e-12))
-            safe = np.where(inside, scale, 1.0)
-            total = total + np.where(inside, -np.log(2 * self.max_correlation * safe), -np.inf)
-            a_scale = self.amplitude_scale(np.where(inside, p * q - c * c, 1.0))
-            total = total + self.amplitude.log_prob(a / a_scale) - np.log(a_scale)
-        return total
+        g = theta[:, :-2].reshape(len(theta), self.n_gaussians, 6)
+        a, product, c = g[..., 0], np.maximum(g[..., 3], 0) * np.maximum(g[..., 4], 0), g[..., 5]
+        scale = np.sqrt(product)
+        inside = (scale > 0) & (np.abs(c) <= self.max_correlation * scale * (1 + 1e-12))
+        a_scale = self.amplitude_scale(np.where(inside, product - c * c, 1.0))
+        each = self.amplitude.log_prob(a / a_scale) - np.log(a_scale * np.where(inside, scale, 1.0))
+        each += self.offset_mm.log_prob(g[..., 1:3]).sum(axis=2) + self.precision.log_prob(g[..., 3:5]).sum(axis=2)
+        total = np.where(inside, each - math.log(2 * self.max_correlation), -np.inf).sum(axis=1)
+        total += self.i_min.log_prob(theta[:, -2]) + self.i_max.log_prob(theta[:, -1])
+        return np.asarray(total)
 
     @property
     def coordinates(self) -> MomentCoordinates:

@@ -89,7 +89,7 @@ class FreeMixture:
 
     n_gaussians: int
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """The paper's a_1 to C_N."""
         return mixture_names(self.n_gaussians)

@@ -257,7 +257,7 @@ def test_effects_before_the_footprint_act_a_hypothesis_each():
     base = CHAINS["two_free"][0]
     plan, theta = plan_of(), thetas(3, 2)
     moves = np.array([[0.0, 0.0], [2.0, 0.5], [-1.0, 3.0]])
-    found = base.with_effects(TURN, SHIFT).predict(np.concatenate([theta, moves[:, ::-1]], axis=1), plan)
+    found = base.with_effects(TURN, SHIFT).predict(np.concatenate([theta, moves], axis=1), plan)
     for i, (shift, turn) in enumerate(moves):
         moved = replace(plan, x_mm=plan.x_mm + shift, orientation_rad=plan.orientation_rad + turn)
         assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)

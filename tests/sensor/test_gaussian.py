@@ -79,6 +79,9 @@ def over_a_disc(mean, cov, center, radius):
 def test_the_fast_cumulative_is_the_normal_cumulative():
     z = np.concatenate([np.linspace(-12, 12, 100_001), [-np.inf, np.inf, 0.0]])
     assert np.abs(normal_cdf(z) - ndtr(z)).max() < 1e-10
+    # However the array lies in memory.
+    by_columns = np.asfortranarray(np.linspace(-9, 9, 3000).reshape(3, 1000))
+    assert np.abs(normal_cdf(by_columns) - ndtr(by_columns)).max() < 1e-10
 
 
 def test_a_half_plane_is_seen_by_the_error_function():

@@ -11,16 +11,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
-from probewise.nested.proposal import Proposal, fit_proposals, joined
+from probewise.nested.proposal import Proposal, find_parts, fit_proposals, joined
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
 
@@ -32,6 +32,10 @@ _FEW_EFFECTIVE = 100.0
 _MOST_FITTED = 2000
 _SURPRISED = 0.01
 _FIRST = 0.75
+_MOST_LOST = 0.2
+_HELD_BACK = 1 / 3
+_MOST_HELD = 1000
+_BRIDGE_STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,11 @@ class Weighted:
         Shape of the weights' tail; above 0.7 the error is not to be trusted.
     run
         The run that took over because the weights could not be trusted, or None.
+    missed
+        Share of the posterior that the draws reach too seldom, as samples held back show; `log_z` counts it, the
+        samples lack it.
+    lost
+        Share of the posterior that may be lost without a trace, see `refine`; the error counts it.
     """
 
     names: tuple[str, ...]
@@ -68,6 +77,8 @@ class Weighted:
     n_calls: int
     pareto_k: float
     run: NestedResult | None = field(default=None)
+    missed: float = 0.0
+    lost: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("theta", "log_likelihood", "log_weight"):
@@ -75,21 +86,35 @@ class Weighted:
 
     @property
     def sound(self) -> bool:
-        """Whether the weights' tail and number allow the error to be trusted."""
-        return self.run is not None or (self.pareto_k < _MOST_K and self.n_eff >= _FEW_EFFECTIVE)
+        """Whether nothing speaks against the error: see `doubts`."""
+        return not self.doubts
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the error is not to be trusted, in words; empty where nothing speaks against it."""
+        if self.run is not None:
+            return ()
+        told = (
+            (not self.pareto_k < _MOST_K, f"Pareto k of the weights is {self.pareto_k:.2f}, not below {_MOST_K}"),
+            (not self.n_eff >= _FEW_EFFECTIVE, f"only {self.n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
+            (not self.missed < _MOST_LOST, f"the draws miss {100 * self.missed:.0f} % of the posterior"),
+            (
+                not self.lost < _MOST_LOST,
+                f"{100 * self.lost:.0f} % of the posterior may be lost: too few live points for its parts",
+            ),
+        )
+        return tuple(words for so, words in told if so)
 
     @property
     def weight(self) -> FloatArray:
         """Posterior weights, summing to one, (n,)."""
         return np.asarray(np.exp(self.log_weight))
 
-    def rows(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
         """Rows of `n` equally weighted samples by systematic resampling, (n,), in random order."""
         if n < 1:
             raise ParameterError("n", n, "1 or more")
-        ladder = np.cumsum(self.weight)
-        rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-        return rng.permutation(np.minimum(rows, len(ladder) - 1))
+        return np.asarray(rng.permutation(_resampled(self.weight, n, rng)))
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
@@ -110,14 +135,13 @@ class Weighted:
             f"log Z        {self.log_z:.3f} ± {self.log_z_error:.3f}",
             f"samples      {len(self.theta)}, worth {self.n_eff:.0f} independent ones",
             f"cost         {self.n_calls} likelihood evaluations",
-            f"weights      Pareto k = {self.pareto_k:.2f}"
-            + ("" if self.sound else f": doubtful, it should be below {_MOST_K} with {_FEW_EFFECTIVE:.0f} effective"),
+            f"weights      Pareto k = {self.pareto_k:.2f}, missed {self.missed:.2g}, possibly lost {self.lost:.2g}",
         ]
         lines += [
             f"{name:<9}  {mean:>11.5g} ± {sd:.3g}"
             for name, mean, sd in zip(self.names, self.mean(), self.sd(), strict=True)
         ]
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"doubtful: {note}" for note in self.doubts)])
 
 
 Posterior: TypeAlias = NestedResult | Weighted
@@ -128,11 +152,17 @@ def refine(
 ) -> Weighted:
     """Sharpen the evidence and the posterior of a run by importance sampling.
 
-    A density is fitted to the run's posterior samples in two forms; a few draws of each are
-    weighed, the form with the more even weights gets the greater share, and its weighted draws join
+    A density is fitted to two thirds of the run's posterior samples in two forms; a few draws of each
+    are weighed, the form with the more even weights gets the greater share, and its weighted draws join
     the samples that the next densities are fitted to. At last `n_draws` points are drawn.
-    Only they count, so they are independent of each other and the error is that of a mean. A mode
-    that the run never saw is not found by this; what the run saw is weighed afresh.
+    Only they count, so they are independent of each other.
+
+    Three things are asked before the error is claimed. The samples that were held back form a bridge to
+    the draws (Meng & Wong 1996): what the density misses of them is counted as missed. A heavy tail of
+    the weights slows the mean down, and the error with it. And the run itself may have lost what no
+    sample can tell of any more: with n_live points and information H it knows a part's share of the
+    posterior as n_live / H independent samples would, so that a part of share s is lost with
+    probability exp(-s n_live / H); the sum of s times that over the parts found joins the error.
 
     Parameters
     ----------
@@ -165,18 +195,20 @@ def refine(
     if n_pilots < 1:
         raise ParameterError("n_pilots", n_pilots, "1 or more")
     space = unbounded(problem.prior)
-    known = [_unbounded_samples(result, space, rng)]
+    lines = _lines(result)
+    fitted, held = _parted(result, lines, space, rng)
+    known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_proposals(np.concatenate(known), rng=rng)
-        pilots = [_weigh(p, 0.0, space, evaluate, max(n_draws // 8, 50), rng) for p in proposals]
+        pilots = [_weigh(p, 0.0, _Held.nothing(), space, evaluate, max(n_draws // 8, 50), rng) for p in proposals]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         told = pilots[first]
         # The other form keeps a share: one may reach where the other does not.
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if told.n_eff > 2 * len(evaluate.names):
-            known.append(_unbounded_samples(told, space, rng))
-    return _weigh(best, 0.0, space, evaluate, n_draws, rng)
+            known.append(_to_fit(told.theta, told.log_weight, space, rng))
+    return _with_lost(_weigh(best, 0.0, held, space, evaluate, n_draws, rng), lines, space, rng)
 
 
 def update(
@@ -229,12 +261,14 @@ def update(
     log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
     # Rows of weight above 1 / 1000 were kept once: their weight stands for them.
     log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
-    found = Weighted(evaluate.names, theta, log_likelihood, *_normalised(log_weight), n_calls=0, pareto_k=0.0)
-    if found.n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
-        proposal = fit_proposals(_unbounded_samples(found, space, rng), rng=rng)[-1]
-        found = _weigh(proposal, prior_share, space, evaluate, n_draws, rng)
+    n_eff, k = _effective(log_weight), math.inf
+    if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
+        proposal = fit_proposals(_to_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng)[-1]
+        found = _weigh(proposal, prior_share, _Held.nothing(), space, evaluate, n_draws, rng)
+        found = _with_lost(found, _lines(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
+        k = found.pareto_k
     fallen = fall_back()
     return Weighted(
         fallen.names,
@@ -245,60 +279,167 @@ def update(
         fallen.log_z_error,
         fallen.n_eff,
         evaluate.n_calls + fallen.n_calls,
-        found.pareto_k,
+        k,
         fallen,
     )
 
 
-def _unbounded_samples(found: Posterior, space: Space, rng: np.random.Generator) -> FloatArray:
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """Samples of the posterior held back from the fit, and how many independent ones they are worth.
+
+    `x` (n, n_params) in coordinates without walls; the prior's log density there and the log likelihood, (n,).
+    """
+
+    x: FloatArray
+    log_density: FloatArray
+    log_likelihood: FloatArray
+    n_independent: float
+
+    @classmethod
+    def nothing(cls) -> _Held:
+        """Hold nothing back."""
+        return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
+
+
+def _lines(found: Posterior) -> float:
+    """Count the independent samples that the shares of a posterior's parts are known as well as by.
+
+    Many samples of a run descend from one live point: ln Z of a part that n live points follow scatters by
+    sqrt(H / n), as its share of n independent samples scatters by 1 / sqrt(n).
+    """
+    if isinstance(found, Weighted):
+        return found.n_eff if found.run is None else _lines(found.run)
+    return found.n_live / max(found.information, 1.0)
+
+
+def _parted(found: Posterior, lines: float, space: Space, rng: np.random.Generator) -> tuple[FloatArray, _Held]:
+    """Part samples at random: what a density is fitted to, (n, n_params), and what it is held against."""
+    lot = rng.random(len(found.theta)) < _HELD_BACK
+    chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
+    weight = np.exp(found.log_weight[chosen])
+    rows = chosen[_resampled(weight, min(_MOST_HELD, chosen.size), rng)]
+    x = space.enter(found.theta[rows])
+    held = _Held(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_BACK * lines)
+    return _to_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
+
+
+def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
     """Choose samples to fit a density to: about as many as the posterior is worth, so that few occur twice.
 
     A third more come from the posterior of the root of the likelihood's weight: a density that is
     to be weighed by must reach further than the posterior does.
     """
-    n = int(min(max(found.n_eff, 4 * len(found.names) + 4), _MOST_FITTED))
-    rows = found.rows(n, rng=rng)
-    tempered = np.exp(0.5 * (found.log_weight - found.log_weight.max()))
-    wide = rng.choice(len(tempered), size=n // 3, p=tempered / tempered.sum())
-    return space.enter(found.theta[np.unique(np.concatenate([rows, wide]))])
+    weight = np.exp(log_weight - log_weight.max())
+    n = int(min(max(_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
+    rows = [_resampled(weight, n, rng), _resampled(np.sqrt(weight), n // 3, rng)]
+    return space.enter(theta[np.unique(np.concatenate(rows))])
+
+
+def _resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
+    """Draw rows by weight, (n_weights,) -> (n,), systematically: each as often as its share of n, up or down."""
+    ladder = np.cumsum(weight)
+    rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
+    return np.asarray(np.minimum(rows, len(ladder) - 1))
+
+
+def _with_lost(found: Weighted, lines: float, space: Space, rng: np.random.Generator) -> Weighted:
+    """Add to the error what `lines` lines of descent may have lost of the posterior's parts."""
+    if not found.n_eff > 1:
+        return found
+    n = int(min(found.n_eff, 1000))
+    parts = find_parts(space.enter(found.theta[np.unique(found.rows(n, rng=rng))]))
+    share = parts.size / parts.size.sum()
+    lost = float(share @ np.exp(-lines * share))
+    return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
 
 
 def _weigh(
-    proposal: Proposal, prior_share: float, space: Space, evaluate: Evaluator, n_draws: int, rng: np.random.Generator
+    proposal: Proposal,
+    prior_share: float,
+    held: _Held,
+    space: Space,
+    evaluate: Evaluator,
+    n_draws: int,
+    rng: np.random.Generator,
 ) -> Weighted:
     """Draw, evaluate and weigh."""
     n_prior = round(prior_share * n_draws)
+
+    def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:
+        """Density that the draws come from; `log_density` is the prior's."""
+        log_fitted = proposal.log_density(x)
+        if not n_prior:
+            return log_fitted
+        share = n_prior / n_draws
+        return np.asarray(np.logaddexp(log_fitted + math.log1p(-share), log_density + math.log(share)))
+
     x = np.concatenate([proposal.draw(n_draws - n_prior, rng=rng), space.draw(n_prior, rng=rng)])
     theta, log_density = space.leave(x)
     possible = np.flatnonzero(np.isfinite(log_density))
     theta, log_density = theta[possible], log_density[possible]
     log_likelihood = evaluate.log_likelihood(theta) if possible.size else np.empty(0)
-    log_proposal = proposal.log_density(x[possible])
-    if n_prior:
-        share = n_prior / n_draws
-        log_proposal = np.logaddexp(log_proposal + math.log1p(-share), log_density + math.log(share))
-    log_ratio = log_density + log_likelihood - log_proposal
+    log_ratio = log_density + log_likelihood - log_proposal(x[possible], log_density)
     alive = np.isfinite(log_ratio)
     if not alive.any():
         nothing = np.empty(0)
         return Weighted(
             evaluate.names, theta[:0], nothing, nothing, -math.inf, math.inf, 0.0, evaluate.n_calls, math.inf
         )
-    log_weight, _, _, n_eff = _normalised(log_ratio[alive])
-    log_z = float(logsumexp(log_ratio[alive])) - math.log(n_draws)
-    # Draws that led nowhere count as weights of zero.
-    error = math.sqrt(max(1.0 / n_eff - 1.0 / n_draws, 0.0))
-    k = pareto_k(log_ratio[alive])
+    theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
+    k = pareto_k(log_ratio)
+    held_ratio = np.empty(0)
+    if len(held.x):
+        held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
+    log_z, error, missed, log_weight = _bridged(log_ratio, n_draws, held_ratio, held.n_independent)
+    # Weights without a variance average out as n^(k - 1), no longer as n^(-1/2) (Vehtari et al. 2024).
+    error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
+    n_eff = _effective(log_weight)
     return Weighted(
-        evaluate.names, theta[alive], log_likelihood[alive], log_weight, log_z, error, n_eff, evaluate.n_calls, k
+        evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, evaluate.n_calls, k, missed=missed
     )
 
 
-def _normalised(log_weight: FloatArray) -> tuple[FloatArray, float, float, float]:
-    """Normalise log weights; also log of their sum, no error, and Kish's sample size."""
-    total = float(logsumexp(log_weight))
-    normalised = log_weight - total
-    return normalised, total, 0.0, float(np.exp(-logsumexp(2.0 * normalised)))
+def _bridged(
+    log_ratio: FloatArray, n_draws: int, held_ratio: FloatArray, n_held: float
+) -> tuple[float, float, float, FloatArray]:
+    """Estimate the evidence from draws and from posterior samples (Meng & Wong 1996).
+
+    Parameters
+    ----------
+    log_ratio
+        Log of target over proposal density at the draws whose target is above zero, (n_alive,).
+    n_draws
+        Draws, those included that led nowhere.
+    held_ratio
+        The same at samples of the posterior, (n_samples,); plain importance sampling where there are none.
+    n_held
+        Independent samples that those are worth.
+
+    Returns
+    -------
+    log Z, its error, the share of the posterior that the draws miss, and the draws' log weights, (n_alive,).
+    """
+    log_z = float(logsumexp(log_ratio)) - math.log(n_draws)
+    missed, kept_error, cut = 0.0, 0.0, log_ratio
+    if len(held_ratio):
+        # The best bridge: weights above n_draws / n_held times their mean are cut, the samples say how much that is.
+        for _ in range(_BRIDGE_STEPS):
+            limit = log_z + math.log(n_draws / n_held)
+            cut = log_ratio - np.logaddexp(0.0, log_ratio - limit)
+            share = expit(limit - held_ratio)
+            kept = max(float(share.mean()), 1e-9)
+            log_z = float(logsumexp(cut)) - math.log(n_draws) - math.log(kept)
+        missed = float((held_ratio > limit).mean())
+        kept_error = float(share.std()) / math.sqrt(n_held) / kept
+    # Draws that led nowhere count as weights of zero.
+    spread = max(1.0 / _effective(cut) - 1.0 / n_draws, 0.0)
+    return log_z, math.sqrt(spread + kept_error**2), missed, cut - float(logsumexp(cut))
+
+
+def _effective(log_weight: FloatArray) -> float:
+    """Kish's effective number of samples."""
+    return math.exp(2.0 * float(logsumexp(log_weight)) - float(logsumexp(2.0 * log_weight)))
 
 
 def pareto_k(log_weight: FloatArray) -> float:

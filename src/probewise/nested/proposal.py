@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.special import gammaln, logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters, find_clusters
 
-__all__ = ["Proposal", "fit_proposals", "joined"]
+__all__ = ["Proposal", "find_parts", "fit_proposals", "joined"]
 
 # Tails heavier than a Gaussian's, so that weights stay bounded where the fit is too narrow.
 _DEGREES_OF_FREEDOM = 8.0
@@ -20,6 +23,7 @@ _MOST_KERNELS = 400
 _FEW = 40
 _SCALES = (1.0, 0.5, 0.2, 0.05, 0.01)
 _BLOCK = 2048
+_LINKS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,18 +72,41 @@ class Proposal:
 
 def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
     """Mix proposals, each with its share of the draws."""
-    clusters = [p.clusters for p in proposals]
     return Proposal(
-        Clusters(
-            np.concatenate([c.mean for c in clusters]),
-            np.concatenate([c.root for c in clusters]),
-            np.concatenate([c.inverse_root for c in clusters]),
-            np.concatenate([c.log_det for c in clusters]),
-            np.concatenate([c.size for c in clusters]),
-        ),
+        _all([p.clusters for p in proposals]),
         tuple(centres for p in proposals for centres in p.centres),
         tuple(width for p in proposals for width in p.width),
         np.concatenate([s * p.share for p, s in zip(proposals, share, strict=True)]),
+    )
+
+
+def find_parts(x: FloatArray) -> Clusters:
+    """Find the parts that samples lie in, (n_samples, n_params): pieces apart from each other, and their clusters.
+
+    Pieces are what nearest neighbours join, so they are found at any scale and in any number (a lattice of modes,
+    which no two Gaussians explain); what is too small to be measured goes to the nearest.
+    """
+    n_samples, n_params = x.shape
+    if n_samples <= _LINKS:
+        return Clusters.of([x])
+    white = (x - x.mean(axis=0)) @ Clusters.of([x]).inverse_root[0].T
+    near = np.asarray(cKDTree(white).query(white, k=_LINKS + 1)[1])[:, 1:].ravel()
+    links = coo_array((np.ones(near.size), (np.repeat(np.arange(n_samples), _LINKS), near)), 2 * (n_samples,))
+    n_pieces, piece = connected_components(links, directed=False)
+    large = [k for k in range(n_pieces) if (piece == k).sum() > 2 * n_params + 1]
+    if len(large) < 2:
+        return find_clusters(x)
+    home = Clusters.of([x[piece == k] for k in large]).assign(x)
+    return _all([find_clusters(x[home == k]) for k in range(len(large))])
+
+
+def _all(parts: Sequence[Clusters]) -> Clusters:
+    return Clusters(
+        np.concatenate([c.mean for c in parts]),
+        np.concatenate([c.root for c in parts]),
+        np.concatenate([c.inverse_root for c in parts]),
+        np.concatenate([c.log_det for c in parts]),
+        np.concatenate([c.size for c in parts]),
     )
 
 
@@ -105,7 +132,7 @@ def fit_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal,
 
 
 def _fit(x: FloatArray, split: bool, scale: float | None) -> Proposal:
-    clusters = find_clusters(x) if split else Clusters.of([x])
+    clusters = find_parts(x) if split else Clusters.of([x])
     home = clusters.assign(x)
     n_params = x.shape[1]
     centres, width = [], []

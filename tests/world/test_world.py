@@ -20,6 +20,7 @@ from probewise.world import (
     gaussian_spot,
     simulate,
 )
+from probewise.world.concealed import AlbedoPatch, EdgeShadow, Halo, HeightGradient, SensorTilt
 
 SPOT = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)], pixel_mm=0.5)
 PLAN = two_way_plan()
@@ -57,7 +58,17 @@ def test_the_shift_of_the_spot_parts_90_from_270_degrees(clean):
 
 
 def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
-    effects = world(Backlash(1.0), GainDrift(0.1, 300.0), AmbientGradient(0.01, 0.02), Saturation(50.0))
+    effects = world(
+        Backlash(1.0),
+        AlbedoPatch(-0.2, 3.0, 1.0, 6.0),
+        HeightGradient(0.01),
+        SensorTilt(0.5, 0.2),
+        Halo(0.1, 15.0),
+        EdgeShadow(0.05, 4.0),
+        GainDrift(0.1, 300.0),
+        AmbientGradient(0.01, 0.02),
+        Saturation(50.0),
+    )
     together = effects.expected(PLAN)
     for k in range(0, len(PLAN), 53):
         alone = effects.read(
@@ -148,7 +159,7 @@ def test_an_effect_of_ones_own_is_one_short_class(clean):
     @dataclass(frozen=True)
     class Step:
         name: ClassVar[str] = "ambient_step"
-        step: ClassVar = "offset"
+        stage: ClassVar = "offset"
 
         def change(self, values, rows):
             return values + (rows.time_s > 100)
@@ -156,13 +167,13 @@ def test_an_effect_of_ones_own_is_one_short_class(clean):
     np.testing.assert_allclose(world(Step()).expected(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
 
 
-def test_an_effect_at_no_known_step_is_refused():
+def test_an_effect_at_no_known_stage_is_refused():
     @dataclass(frozen=True)
     class Lost:
         name: ClassVar[str] = "lost"
-        step: ClassVar = "somewhere"
+        stage: ClassVar = "somewhere"
 
-    with pytest.raises(ParameterError, match=r"lost\.step"):
+    with pytest.raises(ParameterError, match=r"lost\.stage"):
         world(Lost())
 
 

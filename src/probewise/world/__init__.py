@@ -11,13 +11,13 @@ from probewise.world.concealed import (
     CorrelatedNoise,
     GainDrift,
     Nonlinearity,
-    Rows,
     Saturation,
 )
 from probewise.world.painting import Oval, Surface, paint
 from probewise.world.rays import seen_white
-from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, tailed_spot
-from probewise.world.world import World, simulate
+from probewise.world.rows import Rows
+from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
+from probewise.world.world import Look, World, simulate
 
 __all__ = [
     "AmbientGradient",
@@ -26,6 +26,7 @@ __all__ = [
     "Concealed",
     "CorrelatedNoise",
     "GainDrift",
+    "Look",
     "Nonlinearity",
     "Oval",
     "Rows",
@@ -37,6 +38,7 @@ __all__ = [
     "paint",
     "raster_spot",
     "ridge_spot",
+    "ring_spot",
     "seen_white",
     "simulate",
     "tailed_spot",

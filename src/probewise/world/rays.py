@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.recordings.patterns import Ramp, Uniform
+from probewise.recordings.patterns import Image, Ramp
+from probewise.world.edges import edge_distance
 from probewise.world.painting import Surface, paint
 from probewise.world.spots import Spot
 
-__all__ = ["seen_white"]
+__all__ = ["Retouch", "seen_white"]
+
+Retouch: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+"""(albedo, x_mm, y_mm), places in the lab frame, to albedo; arrays of one shape."""
 
 _BLOCK = 50_000  # pixels or rays at a time: what a processor's cache holds
 # Additive steps of a two-dimensional Kronecker sequence: 1/g and 1/g^2, g the root of g^3 = g + 1.
@@ -23,6 +31,9 @@ def seen_white(
     y_mm: FloatArray,
     orientation_rad: FloatArray,
     *,
+    scale: ArrayLike = 1.0,
+    pattern_mm: ArrayLike = (0.0, 0.0),
+    retouch: Retouch | None = None,
     n_rays: int = 64,
 ) -> FloatArray:
     """Sum weight times albedo over the spot for each pose, (n_points,) in, (n_points,) out.
@@ -31,48 +42,70 @@ def seen_white(
     `n_rays` rays of a low-discrepancy sequence, shifted from pixel to pixel so that the errors of
     neighbours along an edge do not add up. Features finer than a pixel of the spot need a finer spot.
     With the default 0.25 mm and 64 rays the result is within 1e-3 (tests/world refines both).
+
+    Parameters
+    ----------
+    surface, spot
+        What is seen, and by what.
+    x_mm, y_mm, orientation_rad
+        Where the sensor frame stands, (n_points,).
+    scale
+        How many times as large as drawn the spot is, about the sensor frame's origin, (n_points,) or one.
+    pattern_mm
+        How far the surface lies from where it is described, (n_points, 2) or (2,).
+    retouch
+        What became of the albedo at a place, pixel by pixel: to be smooth over a pixel.
+    n_rays
+        Rays for a pixel with an edge in it.
     """
-    if isinstance(surface, Uniform):
-        return np.full(len(x_mm), surface.albedo)
+    n_points = len(x_mm)
+    moved = np.broadcast_to(np.asarray(pattern_mm, dtype=np.float64), (n_points, 2)).T
     # A scan out and back stands twice at each place.
-    poses, again = np.unique(np.stack([x_mm, y_mm, orientation_rad]), axis=1, return_inverse=True)
-    seen = np.empty(poses.shape[1])
+    stands = np.stack([x_mm, y_mm, orientation_rad, np.broadcast_to(scale, n_points), *moved])
+    poses, again = np.unique(stands, axis=1, return_inverse=True)
+    seen = paint(surface, poses[0] - poses[4], poses[1] - poses[5])
+    rest = np.arange(len(seen))
+    if retouch is None and not isinstance(surface, Ramp | Image):
+        # No edge within the reach of the spot: what its origin sees, all of it sees.
+        u, v = spot.edges_mm()
+        reach = np.hypot(np.abs(u).max(), np.abs(v).max()) * poses[3]
+        rest = np.flatnonzero(edge_distance(surface, poses[0] - poses[4], poses[1] - poses[5]) <= reach)
     per_block = max(1, _BLOCK // spot.weights.size)
-    for start in range(0, len(seen), per_block):
-        part = slice(start, start + per_block)
-        seen[part] = _block(surface, spot, poses[0, part], poses[1, part], poses[2, part], n_rays)
+    for start in range(0, len(rest), per_block):
+        part = rest[start : start + per_block]
+        seen[part] = _block(surface, spot, poses[:, part], retouch, n_rays)
     return seen[again.ravel()]
 
 
-def _block(
-    surface: Surface, spot: Spot, x_mm: FloatArray, y_mm: FloatArray, orientation_rad: FloatArray, n_rays: int
-) -> FloatArray:
-    cos, sin = np.cos(orientation_rad), np.sin(orientation_rad)
+def _block(surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | None, n_rays: int) -> FloatArray:
+    x_mm, y_mm, turn, scale, pattern_x, pattern_y = poses[:, :, None, None]
+    cos, sin = scale * np.cos(turn), scale * np.sin(turn)
     u, v = spot.edges_mm()
+    # The surface is described where it does not lie: seen from there, the sensor has moved the other way.
+    origin_x, origin_y = x_mm - pattern_x, y_mm - pattern_y
     # Corners of all pixels, (n_points, n_v + 1, n_u + 1).
-    corners_x = x_mm[:, None, None] + cos[:, None, None] * u - sin[:, None, None] * v[:, None]
-    corners_y = y_mm[:, None, None] + sin[:, None, None] * u + cos[:, None, None] * v[:, None]
-    found = paint(surface, corners_x, corners_y)
+    corners_x, corners_y = cos * u - sin * v[:, None], sin * u + cos * v[:, None]
+    found = paint(surface, origin_x + corners_x, origin_y + corners_y)
     around = (found[:, :-1, :-1], found[:, :-1, 1:], found[:, 1:, :-1], found[:, 1:, 1:])
-    albedo = (around[0] + around[1] + around[2] + around[3]) / 4
-    seen: FloatArray = np.einsum("kvu,vu->k", albedo, spot.weights)
-    if isinstance(surface, Ramp):
-        return seen  # the mean of the corners is exact where albedo is linear
-    mixed = (around[1] != around[0]) | (around[2] != around[0]) | (around[3] != around[0])
-    mixed &= spot.weights > 0
-    mixed_at = np.nonzero(mixed)
-    per_block = max(1, _BLOCK // n_rays)
-    for start in range(0, mixed_at[0].size, per_block):
-        pose, row, column = (index[start : start + per_block] for index in mixed_at)
-        first_u, first_v = _shift(row, column)
-        ray_u = u[column][:, None] + spot.pixel_mm * np.mod(first_u[:, None] + np.arange(n_rays) * _STEP_U, 1.0)
-        ray_v = v[row][:, None] + spot.pixel_mm * np.mod(first_v[:, None] + np.arange(n_rays) * _STEP_V, 1.0)
-        c, s = cos[pose][:, None], sin[pose][:, None]
-        landed_x = x_mm[pose][:, None] + c * ray_u - s * ray_v
-        landed_y = y_mm[pose][:, None] + s * ray_u + c * ray_v
-        better = paint(surface, landed_x, landed_y).mean(axis=1) - albedo[pose, row, column]
-        np.add.at(seen, pose, spot.weights[row, column] * better)
-    return seen
+    albedo: FloatArray = (around[0] + around[1] + around[2] + around[3]) / 4
+    # The mean of the corners is exact where albedo is linear.
+    if not isinstance(surface, Ramp):
+        mixed = (around[1] != around[0]) | (around[2] != around[0]) | (around[3] != around[0])
+        mixed_at = np.nonzero(mixed & (spot.weights > 0))
+        per_block = max(1, _BLOCK // n_rays)
+        for start in range(0, mixed_at[0].size, per_block):
+            at = pose, row, column = tuple(index[start : start + per_block] for index in mixed_at)
+            first_u, first_v = _shift(row, column)
+            ray_u = u[column][:, None] + spot.pixel_mm * np.mod(first_u[:, None] + np.arange(n_rays) * _STEP_U, 1.0)
+            ray_v = v[row][:, None] + spot.pixel_mm * np.mod(first_v[:, None] + np.arange(n_rays) * _STEP_V, 1.0)
+            c, s = cos[pose, 0], sin[pose, 0]
+            landed_x = origin_x[pose, 0] + c * ray_u - s * ray_v
+            landed_y = origin_y[pose, 0] + s * ray_u + c * ray_v
+            albedo[at] = paint(surface, landed_x, landed_y).mean(axis=1)
+    if retouch is not None:
+        mid_u, mid_v = u[:-1] + spot.pixel_mm / 2, (v[:-1] + spot.pixel_mm / 2)[:, None]
+        albedo = retouch(albedo, x_mm + cos * mid_u - sin * mid_v, y_mm + sin * mid_u + cos * mid_v)
+    return np.asarray(np.einsum("kvu,vu->k", albedo, spot.weights))
 
 
 def _shift(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:

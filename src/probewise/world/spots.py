@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["Blob", "Spot", "gaussian_spot", "raster_spot", "ridge_spot", "tailed_spot"]
+__all__ = ["Blob", "Spot", "blurred", "gaussian_spot", "raster_spot", "ridge_spot", "ring_spot", "tailed_spot"]
 
 Density = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -173,3 +174,38 @@ def tailed_spot(
 
     half_width = 14 * max(core_mm[0] * (1 + skew), core_mm[1])
     return raster_spot(density, half_width, center_mm=center_mm, pixel_mm=pixel_mm)
+
+
+def ring_spot(
+    radius_mm: float = 4.0,
+    width_mm: float = 1.6,
+    *,
+    center_mm: tuple[float, float] = (0.0, 1.5),
+    off_axis: float = 0.4,
+    pixel_mm: float = 0.25,
+) -> Spot:
+    """Make a ring, brighter on one side: the LED stands off the axis of the lens. No mixture of Gaussians.
+
+    The ring is a Gaussian of sd `width_mm` about a circle; `off_axis`, 0 to 1, brightens it towards +v.
+    """
+    if not 0 <= off_axis <= 1:
+        raise ParameterError("off_axis", off_axis, "0 to 1")
+
+    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+        p, q = u - center_mm[0], v - center_mm[1]
+        r = np.hypot(p, q)
+        sided = 1 + off_axis * q / np.maximum(r, 1e-12)
+        return np.asarray(sided * np.exp(-(((r - radius_mm) / width_mm) ** 2) / 2))
+
+    return raster_spot(density, radius_mm + 6 * width_mm, center_mm=center_mm, pixel_mm=pixel_mm)
+
+
+def blurred(spot: Spot, sd_mm: float) -> Spot:
+    """Smear a spot by a round Gaussian."""
+    # A Gaussian sampled more coarsely than its sd is too narrow: cut the pixels until it is not.
+    cuts = math.ceil(spot.pixel_mm / sd_mm)
+    pixel_mm = spot.pixel_mm / cuts
+    margin = math.ceil(5 * sd_mm / pixel_mm)
+    weights = np.pad(np.kron(spot.weights, np.ones((cuts, cuts))), margin)
+    corner = (spot.corner_mm[0] - margin * pixel_mm, spot.corner_mm[1] - margin * pixel_mm)
+    return Spot(gaussian_filter(weights, sd_mm / pixel_mm, mode="constant", truncate=5.0), pixel_mm, corner)

@@ -3,19 +3,53 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.concealed import STEPS, Concealed, Rows, Step
+from probewise.world.concealed.stages import (
+    STAGES,
+    Changes,
+    Concealed,
+    Disturbs,
+    Glimpse,
+    Looks,
+    Retouches,
+    Stage,
+)
+from probewise.world.edges import across_edge, edge_distance
 from probewise.world.painting import Surface
 from probewise.world.rays import seen_white
+from probewise.world.rows import Rows
 from probewise.world.spots import Spot
 
-__all__ = ["World", "simulate"]
+__all__ = ["Look", "World", "simulate"]
+
+_Surfaces = Sequence[tuple[Surface, IntArray]]
+"""Each surface with the rows that are read over it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the sensor looks at, before it answers: the dear half of a reading.
+
+    Parameters
+    ----------
+    seen
+        Seen white fraction u, shape (n_points,).
+    dimming
+        Signal at the real height, as a factor, shape (n_points,).
+    rows
+        Where the sensor really stands.
+    """
+
+    seen: FloatArray
+    dimming: FloatArray
+    rows: Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +67,9 @@ class World:
     step
         Readings are rounded to multiples of it; None: not rounded.
     concealed
-        What a plain model leaves out.
+        What a plain model leaves out. Effects act in the order of the stages, those of one stage as they stand.
+    height_mm
+        Height of the sensor that the spot and the levels belong to.
     """
 
     spot: Spot
@@ -42,15 +78,18 @@ class World:
     noise_sd: float = 0.6
     step: float | None = None
     concealed: tuple[Concealed, ...] = ()
+    height_mm: float = 14.0
 
     def __post_init__(self) -> None:
         if not self.noise_sd >= 0:
             raise ParameterError("noise_sd", self.noise_sd, "0 or more")
         if self.step is not None and not self.step > 0:
             raise ParameterError("step", self.step, "greater than 0, or None")
+        if not self.height_mm > 0:
+            raise ParameterError("height_mm", self.height_mm, "greater than 0")
         for effect in self.concealed:
-            if effect.step not in STEPS:
-                raise ParameterError(f"{effect.name}.step", effect.step, f"one of {', '.join(STEPS)}")
+            if effect.stage not in STAGES:
+                raise ParameterError(f"{effect.name}.stage", effect.stage, f"one of {', '.join(STAGES)}")
 
     def read(
         self,
@@ -81,14 +120,41 @@ class World:
         rows = Rows(
             place_mm=np.array([[x_mm, y_mm]]),
             direction=np.array([direction]),
+            orientation_rad=np.array([orientation_rad]),
             time_s=np.array([time_s]),
             scan=np.zeros(1, dtype=np.int64),
+            scan_names=("",),
+            covariates={},
+            across=np.array([across_edge(surface)]),
+            edge_mm=edge_distance(surface, np.array([x_mm]), np.array([y_mm])),
         )
-        clean = self._clean({"": surface}, [("", np.zeros(1, dtype=np.int64))], rows, np.array([orientation_rad]))
-        return float(self._noisy(clean, rows, rng)[0])
+        look = self._look([(surface, np.zeros(1, dtype=np.int64))], rows)
+        return float(self._noisy(look, rng)[0])
+
+    def look(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> Look:
+        """Carry out a plan up to what the sensor sees: the part of `expected` that sums light.
+
+        Effects from the stage "response" on play no part in it, so `answer` may be asked of a world
+        that differs in those alone.
+        """
+        found = self._surfaces(plan, surfaces)
+        across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
+        for surface, chosen in found:
+            across[chosen] = across_edge(surface)
+            edge_mm[chosen] = edge_distance(surface, plan.x_mm[chosen], plan.y_mm[chosen])
+        return self._look(found, Rows.of(plan, across, edge_mm))
+
+    def answer(self, look: Look) -> FloatArray:
+        """Return the noise-free readings, not rounded, shape (n_points,)."""
+        rows = look.rows
+        signal = (self.white - self.black) * self._changed("response", look.seen, rows) * look.dimming
+        reading = self.black + self._changed("gain", signal, rows)
+        for stage in ("offset", "lag", "saturation"):
+            reading = self._changed(stage, reading, rows)
+        return reading
 
     def expected(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
-        """Return the noise-free readings of a plan, shape (n_points,).
+        """Return the noise-free readings of a plan, not rounded, shape (n_points,).
 
         Parameters
         ----------
@@ -102,10 +168,15 @@ class World:
         ParameterError
             If the plan reads a pattern that nobody describes.
         """
-        return self._clean(self._surfaces(plan, surfaces), plan.rows_by_pattern(), _rows(plan), plan.orientation_rad)
+        return self.answer(self.look(plan, surfaces))
 
     def simulate(
-        self, plan: Plan, *, rng: np.random.Generator, surfaces: Mapping[str, Surface] | None = None
+        self,
+        plan: Plan,
+        *,
+        rng: np.random.Generator | None,
+        surfaces: Mapping[str, Surface] | None = None,
+        look: Look | None = None,
     ) -> Recording:
         """Carry out a plan.
 
@@ -114,58 +185,90 @@ class World:
         plan
             Where, when and over what.
         rng
-            Where the noise comes from.
+            Where the noise comes from; None: readings without noise, rounded all the same.
         surfaces
             What lies under a pattern's name, in place of what the plan says.
+        look
+            What the sensor sees, where `look` has told already.
 
         Raises
         ------
         ParameterError
             If the plan reads a pattern that nobody describes.
         """
-        return Recording(plan, self._noisy(self.expected(plan, surfaces), _rows(plan), rng))
+        return Recording(plan, self._noisy(self.look(plan, surfaces) if look is None else look, rng))
 
-    def _clean(
-        self,
-        surfaces: Mapping[str, Surface],
-        rows_by_pattern: Sequence[tuple[str, IntArray]],
-        rows: Rows,
-        orientation_rad: FloatArray,
-    ) -> FloatArray:
-        place = self._changed("place", rows.place_mm, rows)
-        seen = np.empty(len(place))
-        for name, chosen in rows_by_pattern:
-            x_mm, y_mm = place[chosen].T
-            seen[chosen] = seen_white(surfaces[name], self.spot, x_mm, y_mm, orientation_rad[chosen])
-        there = Rows(place, rows.direction, rows.time_s, rows.scan)
-        signal = (self.white - self.black) * self._changed("response", seen, there)
-        reading = self.black + self._changed("gain", signal, there)
-        return self._changed("saturation", self._changed("offset", reading, there), there)
+    def _look(self, surfaces: _Surfaces, sent: Rows) -> Look:
+        place = self._changed("place", sent.place_mm, sent)
+        there = replace(sent, place_mm=place, orientation_rad=self._changed("turn", sent.orientation_rad, sent))
+        pattern = self._changed("pattern", np.zeros_like(place), there)
+        center = place + self._changed("tilt", np.zeros_like(place), there)
+        scale = self._changed("height", np.full(len(place), self.height_mm), there) / self.height_mm
+        if scale.min() <= 0:
+            raise ParameterError("height_mm", float(scale.min() * self.height_mm), "greater than 0 at every reading")
+        retouch = self._retouched if any(isinstance(effect, Retouches) for effect in self.concealed) else None
+        seen, edge_mm = np.zeros(len(place)), np.empty(len(place))
+        for surface, chosen in surfaces:
+            edge_mm[chosen] = edge_distance(surface, *(place - pattern)[chosen].T)
+            white = partial(
+                seen_white,
+                surface,
+                orientation_rad=there.orientation_rad[chosen],
+                scale=scale[chosen],
+                pattern_mm=pattern[chosen],
+                retouch=retouch,
+            )
+            for glimpse in self._glimpses():
+                x_mm, y_mm = (center[chosen] + glimpse.shift_mm).T
+                seen[chosen] += glimpse.share * white(glimpse.spot, x_mm, y_mm)
+        there = replace(there, edge_mm=edge_mm)
+        # The LED lights less of what is farther away: the inverse square of the distance.
+        return Look(self._changed("seen", seen, there), scale**-2.0, there)
 
-    def _noisy(self, clean: FloatArray, rows: Rows, rng: np.random.Generator | None) -> FloatArray:
-        readings = clean
+    def _noisy(self, look: Look, rng: np.random.Generator | None) -> FloatArray:
+        readings = self.answer(look)
         if rng is not None:
-            readings = clean + self.noise_sd * self._changed("noise", rng.standard_normal(len(clean)), rows)
-        return readings if self.step is None else np.round(readings / self.step) * self.step
+            noise = self._disturbed("noise", rng.standard_normal(len(readings)), look, rng)
+            readings = readings + self.noise_sd * noise
+        readings = self._changed("quantisation", readings, look.rows)
+        if self.step is not None:
+            readings = np.round(readings / self.step) * self.step
+        return readings if rng is None else self._disturbed("loss", readings, look, rng)
 
-    def _changed(self, step: Step, values: FloatArray, rows: Rows) -> FloatArray:
+    def _changed(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
         for effect in self.concealed:
-            if effect.step == step:
+            if effect.stage == stage and isinstance(effect, Changes):
                 values = effect.change(values, rows)
         return values
 
-    def _surfaces(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> dict[str, Surface]:
-        out: dict[str, Surface] = {**plan.patterns, **(surfaces or {})}
-        for name, _ in plan.rows_by_pattern():
-            if name not in out:
-                raise ParameterError("pattern", name, f"one of {', '.join(out) or 'none'}, or give it in surfaces")
-        return out
+    def _retouched(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        for effect in self.concealed:
+            if isinstance(effect, Retouches):
+                albedo = effect.retouch(albedo, x_mm, y_mm)
+        return albedo
+
+    def _glimpses(self) -> tuple[Glimpse, ...]:
+        glimpses: tuple[Glimpse, ...] = (Glimpse(1.0, self.spot),)
+        for effect in self.concealed:
+            if isinstance(effect, Looks):
+                glimpses = effect.look(glimpses)
+        return glimpses
+
+    def _disturbed(self, stage: Stage, values: FloatArray, look: Look, rng: np.random.Generator) -> FloatArray:
+        for effect in self.concealed:
+            if effect.stage == stage and isinstance(effect, Disturbs):
+                values = effect.disturb(values, look.rows, look.seen, rng)
+        return values
+
+    def _surfaces(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> _Surfaces:
+        known: dict[str, Surface] = {**plan.patterns, **(surfaces or {})}
+        rows_by_pattern = plan.rows_by_pattern()
+        for name, _ in rows_by_pattern:
+            if name not in known:
+                raise ParameterError("pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
+        return [(known[name], rows) for name, rows in rows_by_pattern]
 
 
 def simulate(plan: Plan, world: World, *, rng: np.random.Generator) -> Recording:
     """Carry out a plan in a world (World.simulate, as a function)."""
     return world.simulate(plan, rng=rng)
-
-
-def _rows(plan: Plan) -> Rows:
-    return Rows(np.stack([plan.x_mm, plan.y_mm], axis=-1), plan.direction, plan.time_s, plan.scan)

@@ -1,0 +1,113 @@
+"""What a case may conceal: everything about an effect is drawn, only its amplitude is left open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+
+from probewise.recordings.patterns import Uniform
+from probewise.recordings.plan import Plan
+from probewise.world.concealed import Concealed
+from probewise.world.world import World
+
+__all__ = ["Candidate", "Draw", "OfAmplitude", "Setting", "log_uniform", "plain", "sign", "signed"]
+
+OfAmplitude: TypeAlias = Callable[[float], Concealed]
+"""The effect of an amplitude greater than 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Where an effect is to be concealed: a plan, and a sensor that conceals nothing yet."""
+
+    plan: Plan
+    world: World
+
+    @property
+    def start_s(self) -> float:
+        """Time of the first reading."""
+        return float(self.plan.time_s[0])
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first reading to the last."""
+        return float(self.plan.time_s[-1] - self.plan.time_s[0])
+
+    @property
+    def fastest_hz(self) -> float:
+        """Half the median rate of the readings."""
+        return 0.5 / float(np.median(np.diff(self.plan.time_s)))
+
+    @cached_property
+    def scans(self) -> tuple[str, ...]:
+        """Names of the scans of 20 readings or more over something with an edge."""
+        return tuple(
+            self.plan.scan_names[k]
+            for k, rows in enumerate(self.plan.rows_by_scan())
+            if rows.size >= 20
+            and not isinstance(self.plan.patterns[self.plan.pattern_names[self.plan.pattern[rows[0]]]], Uniform)
+        )
+
+    def mounting_of(self, scan: str) -> tuple[str, ...]:
+        """Return the names of all scans that share this one's orientation, in order of taking."""
+        first = {name: rows[0] for name, rows in zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)}
+        turn = self.plan.orientation_rad
+        return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])
+
+
+Draw: TypeAlias = Callable[[Setting, np.random.Generator], OfAmplitude]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect to be drawn.
+
+    Parameters
+    ----------
+    shows_in
+        Covariates that its residual shows in.
+    draw
+        Draws all but the amplitude.
+    first
+        Amplitude to begin with when a size is looked for.
+    limit
+        Largest amplitude that makes sense.
+    sized
+        Whether its size can be chosen; otherwise the first amplitude is taken.
+    """
+
+    shows_in: tuple[str, ...]
+    draw: Draw
+    first: float
+    limit: float
+    sized: bool = True
+
+
+def sign(rng: np.random.Generator) -> float:
+    """Draw +1 or -1."""
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+
+def plain(make: OfAmplitude) -> Draw:
+    """Draw nothing: the amplitude is all there is."""
+    return lambda setting, rng: make
+
+
+def signed(make: OfAmplitude) -> Draw:
+    """Draw the sign of the amplitude."""
+
+    def draw(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+        s = sign(rng)
+        return lambda a: make(s * a)
+
+    return draw

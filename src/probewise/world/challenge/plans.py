@@ -1,0 +1,114 @@
+"""The plans of a challenge, their patterns off any grid, and what is read for the test and kept back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant
+from probewise.recordings.plan import Plan
+from probewise.recordings.plans import jittered, paper_plan, two_way_plan
+
+__all__ = ["PLANS", "draw_plan", "kept_back_plans"]
+
+PLANS: Mapping[str, Callable[[], Plan]] = {"paper": paper_plan, "two_way": two_way_plan}
+
+_READING_S, _BREAK_S = 1.2, 30.0
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """One scan over one pattern: places (n, 2) in mm."""
+
+    name: str
+    pattern: Pattern
+    places_mm: FloatArray
+    orientation_rad: float
+
+
+def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
+    """Lay a plan's patterns off every grid, truly described, and take its times as an arm does."""
+    plan = PLANS[name]()
+    patterns = {key: _off_grid(pattern, rng) for key, pattern in plan.patterns.items()}
+    return jittered(replace(plan, patterns=patterns), rng=rng)
+
+
+def kept_back_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
+    """Lay out what the recording of `plan` has not: "angle", "pattern" and "direction", each read after it.
+
+    A scan across a boundary with the sensor turned by an odd angle; a scan over a triangle, or one to
+    the side of a disc where the plan had no disc; and a boundary read the other way: from +x to -x where
+    the plan goes one way only, along a slant where it goes both.
+    """
+    one_way = not (plan.direction[:, 0] < 0).any()
+    line = np.stack([np.linspace(-50, 50, 101), np.zeros(101)], axis=-1)
+    boundary = _off_grid(HalfPlane(0.0, 0.0), rng)
+    angle = math.radians(rng.choice([0, 90, 180, 270]) + rng.uniform(25, 65))
+    beside = [0.0, float(rng.uniform(4, 9))]
+    if any(isinstance(pattern, Disc) for pattern in plan.patterns.values()):
+        corners = tuple(
+            (28 * math.cos(turn), 28 * math.sin(turn)) for turn in rng.uniform(0, 2) + np.arange(3) * 2 * math.pi / 3
+        )
+        pattern: Pattern = Polygon(corners)
+    else:
+        pattern = _off_grid(Disc((0.0, 0.0), 30.0), rng)
+    slant = math.radians(rng.uniform(30, 60))
+    other = (
+        _Scan("test_direction", boundary, line[::-1], 0.0)
+        if one_way
+        else _Scan(
+            "test_direction", HalfPlane(slant, 0.0), line[:, :1] * [math.cos(slant), math.sin(slant)], math.pi / 2
+        )
+    )
+    scans = {
+        "angle": _Scan("test_angle", boundary, line, angle),
+        "pattern": _Scan("test_pattern", pattern, line + beside, 0.0),
+        "direction": other,
+    }
+    start_s, plans = float(plan.time_s[-1]), {}
+    for name, scan in scans.items():
+        plans[name] = _after(plan, scan, start_s + _BREAK_S)
+        start_s = float(plans[name].time_s[-1])
+    return plans
+
+
+def _off_grid(pattern: Pattern, rng: np.random.Generator) -> Pattern:
+    """Move a pattern by up to half a millimetre each way and turn a boundary by up to two degrees."""
+    dx, dy, turn = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), math.radians(rng.uniform(-2, 2))
+    match pattern:
+        case HalfPlane():
+            return replace(pattern, normal_rad=pattern.normal_rad + turn, offset_mm=pattern.offset_mm + dx)
+        case Quadrant():
+            return replace(pattern, corner_mm=(pattern.corner_mm[0] + dx, pattern.corner_mm[1] + dy))
+        case Disc():
+            center = (pattern.center_mm[0] + dx, pattern.center_mm[1] + dy)
+            return replace(pattern, center_mm=center, radius_mm=pattern.radius_mm + dx)
+        case _:
+            return pattern
+
+
+def _after(plan: Plan, scan: _Scan, start_s: float) -> Plan:
+    n_points = len(scan.places_mm)
+    time_s = start_s + _READING_S * np.arange(n_points)
+    # The battery goes on draining as it did.
+    covariates = {
+        name: np.asarray(np.round(np.polyval(np.polyfit(plan.time_s, values, 1), time_s)), dtype=np.float64)
+        for name, values in plan.covariates.items()
+    }
+    return Plan(
+        x_mm=scan.places_mm[:, 0],
+        y_mm=scan.places_mm[:, 1],
+        orientation_rad=np.full(n_points, scan.orientation_rad),
+        time_s=np.round(time_s, 3),
+        scan=np.zeros(n_points, dtype=np.int64),
+        scan_names=(scan.name,),
+        pattern=np.zeros(n_points, dtype=np.int64),
+        pattern_names=(scan.name.removeprefix("test_"),),
+        patterns={scan.name.removeprefix("test_"): scan.pattern},
+        covariates=covariates,
+        instrumentation=plan.instrumentation,
+    )

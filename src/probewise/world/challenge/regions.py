@@ -1,0 +1,61 @@
+"""Where a local effect is: what a diagnosis should find when it looks for the place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import BoolArray
+from probewise.world.challenge.sizing import Ruler
+from probewise.world.concealed import (
+    AlbedoPatch,
+    AmbientStep,
+    Concealed,
+    EdgeShadow,
+    Glint,
+    HeightOffset,
+    PlaceStep,
+    Saturation,
+    ScanAngleError,
+    ScanMisplacement,
+)
+
+__all__ = ["Region", "region_of"]
+
+
+@dataclass(frozen=True)
+class Region:
+    """An interval of a covariate in its unit, or scans by name."""
+
+    covariate: str
+    low: float | None = None
+    high: float | None = None
+    scans: tuple[str, ...] = ()
+
+
+def region_of(effect: Concealed, ruler: Ruler) -> Region | None:
+    """Say where a local effect is; None for one that is everywhere.
+
+    At a place and near an edge it is where it has at least half its greatest strength, in scans along X.
+    """
+    plan, clean = ruler.clean.plan, ruler.clean.readings
+    match effect:
+        case ScanMisplacement():
+            return Region("scan", scans=(effect.scan,))
+        case ScanAngleError() | HeightOffset():
+            return Region("scan", scans=effect.scans)
+        case AmbientStep():
+            return Region("time", effect.at_s, float(plan.time_s[-1]))
+        case Saturation():
+            return Region("level", effect.level, float(clean.max()))
+        case EdgeShadow():
+            return Region("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
+        case AlbedoPatch() | Glint() | PlaceStep():
+            along_x: BoolArray = np.abs(plan.direction[:, 0]) > 0
+            strength = np.where(along_x, np.abs(ruler.recording(effect).readings - clean), 0.0)
+            there = plan.x_mm[strength >= strength.max() / 2]
+            return Region("place", float(there.min()), float(there.max()))
+        case _:
+            return None

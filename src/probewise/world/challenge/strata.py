@@ -1,0 +1,47 @@
+"""How a campaign's cases are spread over what is to be measured: a wheel that turns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+__all__ = ["WHEEL", "Kind", "Stratum", "stratum_of"]
+
+Kind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """One kind of case: at what size lambda (0 for clean), and whether its noise is white or of another kind."""
+
+    kind: Kind
+    size: float = 0.0
+    other_noise: bool = False
+
+
+WHEEL: tuple[Stratum, ...] = (
+    *[Stratum("clean")] * 20,
+    *[Stratum("clean", other_noise=True)] * 5,
+    *[Stratum("single", 8.0)] * 12,
+    Stratum("single", 8.0, other_noise=True),
+    *[Stratum("single", 5.0)] * 2,
+    *[Stratum("single", 6.0)] * 2,
+    *[Stratum("single", 12.0)] * 3,
+    *[Stratum("single", 20.0)] * 5,
+    *[Stratum("pair", 12.0)] * 3,
+    *[Stratum("outside", 12.0)] * 3,
+    *[Stratum("outside", 20.0)] * 2,
+    Stratum("alias", 12.0),
+    Stratum("ssf_order", 12.0),
+)
+"""A hundred turns, 6,000 cases: 2,000 clean, 1,200 single at lambda 8, 500 at 20, 300 pairs, 500 outside."""
+
+_STRIDE = 23  # has no divisor in common with the wheel: cases in a row are of different kinds
+
+
+def stratum_of(number: int) -> tuple[Stratum, int]:
+    """Return the stratum of a case and how many of that stratum come before it."""
+    turn, slot = divmod(number, len(WHEEL))
+    order = [WHEEL[k * _STRIDE % len(WHEEL)] for k in range(len(WHEEL))]
+    stratum = order[slot]
+    return stratum, turn * order.count(stratum) + order[:slot].count(stratum)

@@ -1,0 +1,122 @@
+"""What a world may do that a plain sensor model leaves out: one small value an effect, formulas of its own.
+
+A concealed effect acts at one stage of the way from pose to reading. To add one, write a frozen
+dataclass with `name`, `stage` and the method of that stage (`stages`); `World` applies it there.
+"""
+
+from probewise.world.concealed.arm import (
+    Backlash,
+    OrientationError,
+    PeriodicPositionError,
+    PositionScale,
+    ScanAngleError,
+)
+from probewise.world.concealed.converter import Lag, Quantisation, Saturation
+from probewise.world.concealed.footprint import (
+    EdgeBlur,
+    EdgeShadow,
+    Halo,
+    HeightGradient,
+    HeightOffset,
+    SensorTilt,
+    SSFOrder,
+)
+from probewise.world.concealed.light import BatterySag, GainDrift, Nonlinearity
+from probewise.world.concealed.noise import (
+    CorrelatedNoise,
+    DriftingNoise,
+    Dropouts,
+    HeavyTails,
+    Outliers,
+    SignalDependentNoise,
+)
+from probewise.world.concealed.offsets import (
+    AmbientGradient,
+    AmbientStep,
+    Flicker,
+    Glint,
+    Hysteresis,
+    OffsetDrift,
+)
+from probewise.world.concealed.outside import (
+    AfterGlow,
+    BentRail,
+    Chirp,
+    CrossTalk,
+    Floor,
+    Ghost,
+    PeakMemory,
+    PlaceStep,
+    SlippedPaper,
+    StickSlip,
+    ThermalGain,
+    TwistedRail,
+)
+from probewise.world.concealed.stages import (
+    STAGES,
+    Changes,
+    Concealed,
+    Disturbs,
+    Glimpse,
+    Looks,
+    Retouches,
+    Stage,
+)
+from probewise.world.concealed.surface import AlbedoGradient, AlbedoPatch, EdgeMisplacement, ScanMisplacement
+
+__all__ = [
+    "STAGES",
+    "AfterGlow",
+    "AlbedoGradient",
+    "AlbedoPatch",
+    "AmbientGradient",
+    "AmbientStep",
+    "Backlash",
+    "BatterySag",
+    "BentRail",
+    "Changes",
+    "Chirp",
+    "Concealed",
+    "CorrelatedNoise",
+    "CrossTalk",
+    "Disturbs",
+    "DriftingNoise",
+    "Dropouts",
+    "EdgeBlur",
+    "EdgeMisplacement",
+    "EdgeShadow",
+    "Flicker",
+    "Floor",
+    "GainDrift",
+    "Ghost",
+    "Glimpse",
+    "Glint",
+    "Halo",
+    "HeavyTails",
+    "HeightGradient",
+    "HeightOffset",
+    "Hysteresis",
+    "Lag",
+    "Looks",
+    "Nonlinearity",
+    "OffsetDrift",
+    "OrientationError",
+    "Outliers",
+    "PeakMemory",
+    "PeriodicPositionError",
+    "PlaceStep",
+    "PositionScale",
+    "Quantisation",
+    "Retouches",
+    "SSFOrder",
+    "Saturation",
+    "ScanAngleError",
+    "ScanMisplacement",
+    "SensorTilt",
+    "SignalDependentNoise",
+    "SlippedPaper",
+    "Stage",
+    "StickSlip",
+    "ThermalGain",
+    "TwistedRail",
+]

@@ -1,0 +1,120 @@
+"""The footprint is displaced, of another size, blurred or has a skirt; or an edge casts a shadow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.concealed.stages import Glimpse, Stage
+from probewise.world.rows import Rows
+from probewise.world.spots import Blob, blurred, gaussian_spot
+
+__all__ = ["EdgeBlur", "EdgeShadow", "Halo", "HeightGradient", "HeightOffset", "SSFOrder", "SensorTilt"]
+
+
+@dataclass(frozen=True)
+class SensorTilt:
+    """The sensor hangs askew in the lab: the footprint is shifted there, however it is turned."""
+
+    name: ClassVar[str] = "sensor_tilt"
+    stage: ClassVar[Stage] = "tilt"
+    dx_mm: float
+    dy_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Shift the footprint in the lab frame."""
+        return np.asarray(values + np.array([self.dx_mm, self.dy_mm]))
+
+
+@dataclass(frozen=True)
+class HeightGradient:
+    """The table slopes: the sensor is `mm_per_mm` X higher at X."""
+
+    name: ClassVar[str] = "height_gradient"
+    stage: ClassVar[Stage] = "height"
+    mm_per_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Raise the sensor along X."""
+        return values + self.mm_per_mm * rows.place_mm[:, 0]
+
+
+@dataclass(frozen=True)
+class HeightOffset:
+    """The sensor was mounted higher for some scans, by their names."""
+
+    name: ClassVar[str] = "height_offset"
+    stage: ClassVar[Stage] = "height"
+    mm: float
+    scans: tuple[str, ...]
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Raise the sensor in these scans."""
+        return values + self.mm * rows.in_scans(self.scans)
+
+
+@dataclass(frozen=True)
+class EdgeBlur:
+    """Printed edges are soft, by a Gaussian: the same light as through a spot blurred by it."""
+
+    name: ClassVar[str] = "edge_blur"
+    stage: ClassVar[Stage] = "footprint"
+    sd_mm: float
+
+    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
+        """Blur what the sensor sees by."""
+        return tuple(replace(g, spot=blurred(g.spot, self.sd_mm)) for g in glimpses)
+
+
+@dataclass(frozen=True)
+class Halo:
+    """A share of the light comes by way of a wide Gaussian skirt of sd `r_mm` about the spot's middle."""
+
+    name: ClassVar[str] = "halo"
+    stage: ClassVar[Stage] = "footprint"
+    share: float
+    r_mm: float
+
+    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
+        """Take the share from every glimpse and give it to the skirt."""
+        middle = np.sum([g.share * g.spot.moments()[0] for g in glimpses], axis=0)
+        blob = Blob(1.0, (float(middle[0]), float(middle[1])), (self.r_mm, self.r_mm))
+        # Edges are found by rays within the pixels, and over a third of its sd the skirt is straight enough.
+        skirt = gaussian_spot([blob], pixel_mm=self.r_mm / 3)
+        return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, skirt))
+
+
+@dataclass(frozen=True)
+class SSFOrder:
+    """The spot has one round Gaussian more, in the sensor frame: no physics at all."""
+
+    name: ClassVar[str] = "ssf_order"
+    stage: ClassVar[Stage] = "footprint"
+    share: float
+    u_mm: float
+    v_mm: float
+    sd_mm: float
+
+    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
+        """Take the share from every glimpse and give it to the Gaussian."""
+        blob = Blob(1.0, (self.u_mm, self.v_mm), (self.sd_mm, self.sd_mm))
+        more = gaussian_spot([blob], pixel_mm=glimpses[0].spot.pixel_mm)
+        return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, more))
+
+
+@dataclass(frozen=True)
+class EdgeShadow:
+    """The edge of the paper casts a shadow: light is lost where the sensor stands within about `w` mm of an edge."""
+
+    name: ClassVar[str] = "edge_shadow"
+    stage: ClassVar[Stage] = "seen"
+    amp: float
+    w: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Take amp exp(-d^2 / 2 w^2) from the seen fraction, d the distance to the nearest edge."""
+        return values - self.amp * np.exp(-((rows.edge_mm / self.w) ** 2) / 2)

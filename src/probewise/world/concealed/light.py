@@ -1,0 +1,58 @@
+"""From the light to the signal: the response curve, and a gain that changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.world.concealed.stages import Stage
+from probewise.world.rows import Rows
+
+__all__ = ["BatterySag", "GainDrift", "Nonlinearity"]
+
+
+@dataclass(frozen=True)
+class Nonlinearity:
+    """The photodiode's answer is a power of the light."""
+
+    name: ClassVar[str] = "nonlinearity"
+    stage: ClassVar[Stage] = "response"
+    gamma: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Raise the seen fraction to gamma."""
+        return np.asarray(np.power(np.maximum(values, 0.0), self.gamma), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class GainDrift:
+    """The LED warms up: the signal starts off by `frac` and settles with `tau_s`."""
+
+    name: ClassVar[str] = "gain_drift"
+    stage: ClassVar[Stage] = "gain"
+    frac: float
+    tau_s: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Multiply the signal by 1 + frac exp(-t/tau)."""
+        return values * (1 + self.frac * np.exp(-rows.time_s / self.tau_s))
+
+
+@dataclass(frozen=True)
+class BatterySag:
+    """The LED follows the battery: `per_volt` of the signal for each volt above `full_v`."""
+
+    name: ClassVar[str] = "battery_sag"
+    stage: ClassVar[Stage] = "gain"
+    per_volt: float
+    full_v: float = 8.3
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Multiply the signal by 1 + per_volt (V - full_v)."""
+        if "battery_mv" not in rows.covariates:
+            raise ParameterError("covariates", ", ".join(rows.covariates) or "none", "battery_mv among them")
+        return values * (1 + self.per_volt * (rows.covariates["battery_mv"] / 1000 - self.full_v))

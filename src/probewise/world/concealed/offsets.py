@@ -1,0 +1,103 @@
+"""Light that is no signal: something is added to the reading, on black too."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.concealed.stages import Stage
+from probewise.world.rows import Rows
+
+__all__ = ["AmbientGradient", "AmbientStep", "Flicker", "Glint", "Hysteresis", "OffsetDrift"]
+
+
+@dataclass(frozen=True)
+class AmbientGradient:
+    """Room light falls in from one side."""
+
+    name: ClassVar[str] = "ambient_gradient"
+    stage: ClassVar[Stage] = "offset"
+    per_mm_x: float
+    per_mm_y: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add a plane over the lab frame."""
+        return values + self.per_mm_x * rows.place_mm[:, 0] + self.per_mm_y * rows.place_mm[:, 1]
+
+
+@dataclass(frozen=True)
+class AmbientStep:
+    """A lamp is switched on."""
+
+    name: ClassVar[str] = "ambient_step"
+    stage: ClassVar[Stage] = "offset"
+    amp: float
+    at_s: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add `amp` after `at_s`."""
+        return values + self.amp * (rows.time_s > self.at_s)
+
+
+@dataclass(frozen=True)
+class OffsetDrift:
+    """The dark level creeps."""
+
+    name: ClassVar[str] = "offset_drift"
+    stage: ClassVar[Stage] = "offset"
+    per_hour: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add `per_hour` for each hour."""
+        return values + self.per_hour * rows.time_s / 3600
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """The mains, aliased by the sampling, or a slow lamp: one frequency."""
+
+    name: ClassVar[str] = "flicker"
+    stage: ClassVar[Stage] = "offset"
+    amp: float
+    alias_hz: float
+    phase: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp sin(2 pi f t + phase)."""
+        return values + self.amp * np.sin(2 * math.pi * self.alias_hz * rows.time_s + self.phase)
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """The way out reads higher than the way back."""
+
+    name: ClassVar[str] = "hysteresis"
+    stage: ClassVar[Stage] = "offset"
+    amp: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add `amp` times the sign of the move along X, or along Y where X stands still."""
+        along_x, along_y = np.sign(rows.direction).T
+        sign: FloatArray = np.where(along_x != 0, along_x, along_y)
+        return values + self.amp * sign
+
+
+@dataclass(frozen=True)
+class Glint:
+    """A lamp mirrors in the surface at a place: a Gaussian of sd `r` about it."""
+
+    name: ClassVar[str] = "glint"
+    stage: ClassVar[Stage] = "offset"
+    amp: float
+    x: float
+    y: float
+    r: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add the mirrored light where the sensor stands."""
+        squared = (rows.place_mm[:, 0] - self.x) ** 2 + (rows.place_mm[:, 1] - self.y) ** 2
+        return values + self.amp * np.exp(-squared / (2 * self.r**2))

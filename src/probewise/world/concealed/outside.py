@@ -1,0 +1,226 @@
+"""What no name of the vocabulary stands for: a diagnosis can only say that something is there, and where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.concealed.stages import Glimpse, Stage
+from probewise.world.rows import Rows
+
+__all__ = [
+    "AfterGlow",
+    "BentRail",
+    "Chirp",
+    "CrossTalk",
+    "Floor",
+    "Ghost",
+    "PeakMemory",
+    "PlaceStep",
+    "SlippedPaper",
+    "StickSlip",
+    "ThermalGain",
+    "TwistedRail",
+]
+
+
+@dataclass(frozen=True)
+class BentRail:
+    """The arm's X errs by a square: `amp_mm` at 10 mm from the origin."""
+
+    name: ClassVar[str] = "bent_rail"
+    stage: ClassVar[Stage] = "place"
+    amp_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp (x / 10 mm)^2 to X."""
+        return _along_x(values, self.amp_mm * (values[:, 0] / 10) ** 2)
+
+
+@dataclass(frozen=True)
+class TwistedRail:
+    """The arm's X errs by a cube: `amp_mm` at 10 mm from the origin."""
+
+    name: ClassVar[str] = "twisted_rail"
+    stage: ClassVar[Stage] = "place"
+    amp_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp (x / 10 mm)^3 to X."""
+        return _along_x(values, self.amp_mm * (values[:, 0] / 10) ** 3)
+
+
+@dataclass(frozen=True)
+class PlaceStep:
+    """A tooth is missing: X is `amp_mm` too far from `at_mm` on."""
+
+    name: ClassVar[str] = "place_step"
+    stage: ClassVar[Stage] = "place"
+    amp_mm: float
+    at_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp to X beyond the place."""
+        return _along_x(values, np.where(values[:, 0] > self.at_mm, self.amp_mm, 0.0))
+
+
+@dataclass(frozen=True)
+class StickSlip:
+    """The slide sticks and jumps: X lags behind by a sawtooth of X."""
+
+    name: ClassVar[str] = "stick_slip"
+    stage: ClassVar[Stage] = "place"
+    amp_mm: float
+    period_mm: float
+    phase: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp times a sawtooth from -1 to 1 to X."""
+        turns = values[:, 0] / self.period_mm + self.phase
+        return _along_x(values, self.amp_mm * (2 * (turns - np.floor(turns)) - 1))
+
+
+@dataclass(frozen=True)
+class SlippedPaper:
+    """The paper slips across its edge at a moment, and stays there."""
+
+    name: ClassVar[str] = "slipped_paper"
+    stage: ClassVar[Stage] = "pattern"
+    offset_mm: float
+    at_s: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Shift the pattern under all later readings."""
+        return values + self.offset_mm * rows.across * (rows.time_s > self.at_s)[:, None]
+
+
+@dataclass(frozen=True)
+class Ghost:
+    """A glass plate mirrors: a faint second image, displaced in the lab frame."""
+
+    name: ClassVar[str] = "ghost"
+    stage: ClassVar[Stage] = "footprint"
+    share: float
+    dx_mm: float
+    dy_mm: float
+
+    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
+        """See everything twice."""
+        first = (replace(g, share=g.share * (1 - self.share)) for g in glimpses)
+        second = (
+            replace(g, share=g.share * self.share, shift_mm=(g.shift_mm[0] + self.dx_mm, g.shift_mm[1] + self.dy_mm))
+            for g in glimpses
+        )
+        return (*first, *second)
+
+
+@dataclass(frozen=True)
+class ThermalGain:
+    """The gain wanders with the room's heat: slow waves, the power of each as its period (1/f).
+
+    The waves are the first multiples of 1/`longest_s`, one for each of `phases` (rad).
+    """
+
+    name: ClassVar[str] = "thermal_gain"
+    stage: ClassVar[Stage] = "gain"
+    frac: float
+    longest_s: float
+    phases: tuple[float, ...]
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Multiply the signal by 1 + frac w, w of sd 1 over the longest wave."""
+        order = np.arange(1, len(self.phases) + 1)
+        waves = np.cos(2 * math.pi * np.outer(rows.time_s / self.longest_s, order) + np.array(self.phases))
+        heights = np.sqrt(1 / order)
+        wave: FloatArray = waves @ heights * math.sqrt(2 / float(heights @ heights))
+        return values * (1 + self.frac * wave)
+
+
+@dataclass(frozen=True)
+class CrossTalk:
+    """The cable pulls at the sensor as it turns: the gain follows twice the orientation."""
+
+    name: ClassVar[str] = "cross_talk"
+    stage: ClassVar[Stage] = "gain"
+    frac: float
+    phase: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Multiply the signal by 1 + frac cos(2 orientation + phase)."""
+        return values * (1 + self.frac * np.cos(2 * rows.orientation_rad + self.phase))
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A dead zone: light below a share of white is not seen."""
+
+    name: ClassVar[str] = "floor"
+    stage: ClassVar[Stage] = "response"
+    share: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Answer with nothing below the share, as usual above it."""
+        return np.where(values < self.share, 0.0, values)
+
+
+@dataclass(frozen=True)
+class PeakMemory:
+    """The photodiode does not forget: it adds a share of the brightest light since the scan began."""
+
+    name: ClassVar[str] = "peak_memory"
+    stage: ClassVar[Stage] = "response"
+    share: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add share times the running maximum of the scan."""
+        peaks = values.copy()
+        for part in np.split(np.arange(len(values)), np.flatnonzero(rows.starts_scan())[1:]):
+            peaks[part] = np.maximum.accumulate(values[part])
+        return values + self.share * peaks
+
+
+@dataclass(frozen=True)
+class AfterGlow:
+    """The input discharges: each time that the reading rises through `level`, a pulse dies off with `tau_s`."""
+
+    name: ClassVar[str] = "after_glow"
+    stage: ClassVar[Stage] = "offset"
+    amp: float
+    tau_s: float
+    level: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp exp(-t / tau), t the time since each rise."""
+        bright = values > self.level
+        rises = rows.time_s[np.flatnonzero(bright & ~np.concatenate([[True], bright[:-1]]))]
+        since = rows.time_s[:, None] - rises
+        pulses: FloatArray = np.where(since >= 0, np.exp(-np.maximum(since, 0.0) / self.tau_s), 0.0)
+        pulse: FloatArray = pulses.sum(axis=1)
+        return values + self.amp * pulse
+
+
+@dataclass(frozen=True)
+class Chirp:
+    """A fan runs up: the offset swings faster and faster, `first_hz` at the start and `rate_hz_per_s` on from it."""
+
+    name: ClassVar[str] = "chirp"
+    stage: ClassVar[Stage] = "offset"
+    amp: float
+    first_hz: float
+    rate_hz_per_s: float
+    phase: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Add amp sin(2 pi (f t + r t^2 / 2) + phase)."""
+        t = rows.time_s
+        turns = self.first_hz * t + self.rate_hz_per_s * t * t / 2
+        return values + self.amp * np.sin(2 * math.pi * turns + self.phase)
+
+
+def _along_x(place_mm: FloatArray, error_mm: FloatArray) -> FloatArray:
+    return place_mm + np.stack([error_mm, np.zeros_like(error_mm)], axis=-1)

@@ -1,0 +1,72 @@
+"""What lies under the sensor is not what the description says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.concealed.stages import Stage
+from probewise.world.rows import Rows
+
+__all__ = ["AlbedoGradient", "AlbedoPatch", "EdgeMisplacement", "ScanMisplacement"]
+
+
+@dataclass(frozen=True)
+class EdgeMisplacement:
+    """Every pattern lies too far on, across its edge (along X where it has no one edge)."""
+
+    name: ClassVar[str] = "edge_misplacement"
+    stage: ClassVar[Stage] = "pattern"
+    offset_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Shift the pattern under every reading."""
+        return values + self.offset_mm * rows.across
+
+
+@dataclass(frozen=True)
+class ScanMisplacement:
+    """The same in one scan, by its name."""
+
+    name: ClassVar[str] = "scan_misplacement"
+    stage: ClassVar[Stage] = "pattern"
+    offset_mm: float
+    scan: str
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Shift the pattern under the readings of this scan."""
+        return values + self.offset_mm * rows.across * rows.in_scans((self.scan,))[:, None]
+
+
+@dataclass(frozen=True)
+class AlbedoGradient:
+    """The print is whiter on one side: a plane over the lab frame as a factor."""
+
+    name: ClassVar[str] = "albedo_gradient"
+    stage: ClassVar[Stage] = "albedo"
+    per_mm_x: float
+    per_mm_y: float
+
+    def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Multiply by 1 + per_mm_x X + per_mm_y Y."""
+        return albedo * (1 + self.per_mm_x * x_mm + self.per_mm_y * y_mm)
+
+
+@dataclass(frozen=True)
+class AlbedoPatch:
+    """A stain at a place, in every pattern: `albedo` more in its middle, a Gaussian of sd `r` about it."""
+
+    name: ClassVar[str] = "albedo_patch"
+    stage: ClassVar[Stage] = "albedo"
+    albedo: float
+    x: float
+    y: float
+    r: float
+
+    def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Add the stain."""
+        squared = (x_mm - self.x) ** 2 + (y_mm - self.y) ** 2
+        return albedo + self.albedo * np.exp(-squared / (2 * self.r**2))

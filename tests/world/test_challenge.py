@@ -1,0 +1,276 @@
+"""Challenge cases: what they hold follows from seed and number, and is what the truth says."""
+
+import functools
+import json
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from probewise.errors import NotConvergedError
+from probewise.recordings import fingerprint, read_recording, write_recording
+from probewise.world.challenge import (
+    INSIDE,
+    NEEDS_SENSOR,
+    NOISE_LEVELS,
+    NOISE_NAMES,
+    OUTSIDE,
+    PLANS,
+    SINGLES,
+    SSFS,
+    WHEEL,
+    Stratum,
+    draw_case,
+    draw_plan,
+    draw_sensor,
+    kept_back,
+    kept_back_plans,
+    stratum_of,
+)
+from probewise.world.challenge.candidates import Setting
+from probewise.world.challenge.regions import Region, region_of
+from probewise.world.challenge.sensors import draw_spot
+from probewise.world.challenge.sizing import Ruler
+
+
+def left_by_levels(clean, changed):
+    """A null model that may change its two levels alone: quick, and enough to draw by."""
+    line = np.polyfit(clean.readings, changed.readings, 1)
+    return float(np.linalg.norm(changed.readings - np.polyval(line, clean.readings)))
+
+
+def number_of(kind, *, skip=0, **wanted):
+    """Number of the first case of this stratum, after some."""
+    numbers = (
+        k
+        for k in range(100 * len(WHEEL))
+        for stratum, turn in [stratum_of(k)]
+        if stratum.kind == kind and turn >= skip and all(getattr(stratum, key) == v for key, v in wanted.items())
+    )
+    return next(numbers)
+
+
+def draw(number, seed=11):
+    return draw_case(seed, number, surviving=left_by_levels)
+
+
+case = functools.cache(draw)
+
+
+def test_a_campaign_of_a_hundred_turns_meets_the_strata_asked_for():
+    """Diagnosis, section 4."""
+    strata = Counter(stratum_of(k)[0] for k in range(100 * len(WHEEL)))
+    kinds = Counter()
+    for stratum, n in strata.items():
+        kinds[stratum.kind] += n
+    assert sum(strata.values()) >= 5000
+    assert strata[Stratum("clean")] >= 2000
+    assert strata[Stratum("single", 8.0)] // len(SINGLES) >= 40
+    assert strata[Stratum("single", 20.0)] >= 500
+    assert kinds["pair"] >= 300
+    assert kinds["outside"] >= 500
+    assert {"alias", "ssf_order"} <= set(kinds)
+
+
+def test_the_cases_of_a_stratum_are_counted_through():
+    for stratum in set(WHEEL):
+        turns = [turn for k in range(3 * len(WHEEL)) for s, turn in [stratum_of(k)] if s == stratum]
+        assert turns == list(range(len(turns)))
+
+
+@pytest.mark.parametrize("number", [number_of("clean", other_noise=True), number_of("single", size=20.0, skip=1)])
+def test_seed_and_number_alone_make_the_case(number):
+    first, again, other = case(number), draw(number), draw(number, seed=12)
+    assert fingerprint(first.recording) == fingerprint(again.recording)
+    assert first.truth.to_json() == again.truth.to_json()
+    assert fingerprint(first.recording) != fingerprint(other.recording)
+    once, twice = kept_back(first), kept_back(first)
+    for name, recording in kept_back(again).items():
+        np.testing.assert_array_equal(recording.readings, once[name].readings)
+        np.testing.assert_array_equal(recording.readings, twice[name].readings)
+
+
+def test_clean_cases_are_their_sensor_and_white_noise():
+    numbers = [k for k in range(40) if stratum_of(k)[0] == Stratum("clean")][:4]
+    z = []
+    for made in map(case, numbers):
+        assert made.truth.combination == ()
+        assert made.truth.hidden == made.world.concealed == ()
+        sd = NOISE_LEVELS[made.truth.noise_level]
+        z.append((made.recording.readings - made.world.expected(made.recording.plan)) / sd)
+    z = np.concatenate(z)
+    assert kstest(z, "norm").pvalue > 1e-4
+    assert abs(np.mean(z[1:] * z[:-1])) < 4 / np.sqrt(len(z))
+
+
+def test_a_single_case_conceals_its_effect_at_its_size():
+    made = case(number_of("single", size=12.0))
+    (hidden,) = made.truth.hidden
+    assert hidden.name == SINGLES[0]
+    assert made.truth.combination == (hidden.name,)
+    assert hidden.size_lambda == pytest.approx(12.0, rel=0.02)
+    # Second route: the worlds with and without it, by hand.
+    plan = made.recording.plan
+    clean, changed = (replace(made.world, concealed=c).simulate(plan, rng=None) for c in ((), (hidden.effect,)))
+    assert left_by_levels(clean, changed) / made.truth.noise_sd == pytest.approx(12.0, rel=0.02)
+    noise = (made.recording.readings - changed.readings) / made.truth.noise_sd
+    assert abs(noise.std() - 1) < 4 / np.sqrt(2 * len(noise))
+
+
+def test_the_name_of_the_noise_is_part_of_the_truth():
+    clean = number_of("clean", other_noise=True)
+    named = [k for k in range(clean, clean + 120) if stratum_of(k)[0] == stratum_of(clean)[0]]
+    truths = [case(k).truth for k in named]
+    assert len({truth.noise_model for truth in truths}) > 3
+    for truth in truths:
+        assert truth.combination == ((NOISE_NAMES[truth.noise_model],) if truth.noise_model in NOISE_NAMES else ())
+
+
+def test_a_case_with_an_effect_on_the_noise_has_no_other_kind_of_noise():
+    noise_only = SINGLES.index("correlated_noise")
+    made = case(number_of("single", size=8.0, other_noise=True, skip=noise_only))
+    assert made.truth.combination == ("correlated_noise",)
+    assert made.truth.noise_model == "white"
+    assert made.truth.hidden[0].size_lambda == pytest.approx(8.0, rel=0.02)
+
+
+def test_a_pair_is_two_effects_that_can_be_told_apart():
+    truth = case(number_of("pair")).truth
+    assert len(truth.combination) == 2
+    assert all(hidden.size_lambda == pytest.approx(12.0, rel=0.1) for hidden in truth.hidden)
+    assert abs(truth.cosine) < 0.5
+
+
+def test_an_alias_is_what_three_nats_cannot_tell_apart():
+    made = case(number_of("alias", skip=3))
+    assert made.truth.plan == "paper"
+    assert made.truth.alias is not None
+    assert 144 * (1 - made.truth.alias.cosine**2) / 2 < 3
+    assert made.truth.alias.effect.name not in made.truth.combination
+
+
+def test_an_effect_outside_the_vocabulary_is_unknown_and_one_gaussian_more_is_clean():
+    assert case(number_of("outside")).truth.combination == ("unknown",)
+    trap = case(number_of("ssf_order")).truth
+    assert trap.combination == ()
+    assert trap.ssf == "gaussian"
+    assert trap.hidden[0].name == "ssf_order"
+
+
+def test_no_null_model_sees_what_cannot_be_seen():
+    with pytest.raises(NotConvergedError):
+        draw_case(1, number_of("single"), surviving=lambda clean, changed: 0.0)
+
+
+def test_the_truth_is_strict_json_and_the_recording_does_not_tell(tmp_path):
+    made = case(number_of("single", size=8.0, skip=SINGLES.index("scan_angle_error")))
+    content = json.loads(made.truth.to_json(), parse_constant=pytest.fail)
+    (hidden,) = content["hidden"]
+    assert content["format"] == "truth/1"
+    assert hidden["name"] == "scan_angle_error"
+    assert set(hidden["parameters"]) == {"deg", "scans"}
+    assert hidden["shows_in"] == ["scan", "orientation"]
+    assert hidden["region"]["scans"] == hidden["parameters"]["scans"]
+    path = tmp_path / "case.csv"
+    write_recording(made.recording, path)
+    assert fingerprint(read_recording(path)) == fingerprint(made.recording)
+    text = path.with_suffix(".json").read_text()
+    assert not any(name in text for name in (*INSIDE, *OUTSIDE, *SSFS))
+
+
+def test_what_belongs_to_a_scan_is_not_in_the_readings_kept_back():
+    made = case(number_of("single", size=8.0, skip=SINGLES.index("scan_misplacement")))
+    assert made.truth.combination == ("scan_misplacement",)
+    for plan in made.test_plans.values():
+        clean = replace(made.world, concealed=()).expected(plan)
+        np.testing.assert_array_equal(made.world.expected(plan), clean)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_kept_back_are_a_new_angle_a_new_pattern_and_another_direction(name):
+    plan = draw_plan(name, rng=np.random.default_rng(1))
+    tests = kept_back_plans(plan, rng=np.random.default_rng(2))
+    assert list(tests) == ["angle", "pattern", "direction"]
+    angles = np.unique(plan.orientation_rad)
+    assert np.abs(np.sin(2 * (tests["angle"].orientation_rad[0] - angles))).min() > 0.5
+    (pattern,) = tests["pattern"].patterns.values()
+    assert type(pattern) not in {type(known) for known in plan.patterns.values()}
+    ways = {tuple(way) for way in np.round(plan.direction, 2)}
+    assert tuple(np.round(tests["direction"].direction[0], 2)) not in ways
+    latest = plan.time_s[-1]
+    for test in tests.values():
+        assert test.time_s[0] > latest
+        assert not set(test.scan_names) & set(plan.scan_names)
+        assert test.covariates["battery_mv"].max() < plan.covariates["battery_mv"].mean()
+        latest = test.time_s[-1]
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_patterns_lie_off_the_grid_and_are_described_so(name):
+    plan, drawn = PLANS[name](), draw_plan(name, rng=np.random.default_rng(1))
+    offset = drawn.patterns["boundary"].offset_mm
+    assert 0 < abs(offset - plan.patterns["boundary"].offset_mm) < 0.5
+    assert drawn.patterns["quadrant_a"].corner_mm != plan.patterns["quadrant_a"].corner_mm
+    assert not np.allclose(drawn.time_s, plan.time_s)
+
+
+@pytest.mark.parametrize("ssf", SSFS)
+def test_every_ssf_is_about_as_large_as_a_lego_sensors(ssf):
+    mean, covariance = draw_spot(ssf, rng=np.random.default_rng(3)).moments()
+    assert np.abs(mean).max() < 4
+    assert 1 < np.sqrt(np.linalg.eigvalsh(covariance)).min() < np.sqrt(np.linalg.eigvalsh(covariance)).max() < 6
+
+
+@pytest.fixture(scope="module", params=list(PLANS))
+def setting(request):
+    rng = np.random.default_rng(5)
+    return Setting(draw_plan(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng))
+
+
+def test_every_candidate_makes_effects_of_its_name(setting):
+    for name, candidate in {**INSIDE, **OUTSIDE}.items():
+        of_amplitude = candidate.draw(setting, np.random.default_rng(6))
+        for amplitude in (candidate.first, candidate.limit):
+            assert of_amplitude(amplitude).name == name
+        assert of_amplitude(candidate.first) == candidate.draw(setting, np.random.default_rng(6))(candidate.first)
+
+
+def test_scans_can_be_drawn_that_cross_an_edge_and_their_mounting(setting):
+    assert "edge_0" in setting.scans or "edge_0_out" in setting.scans
+    assert not any(name.startswith(("white", "black", "quadrants")) for name in setting.scans)
+    mounting = setting.mounting_of(next(name for name in setting.scans if "90" in name))
+    assert all("90" in name for name in mounting)
+
+
+def test_a_local_effect_is_found_where_it_is(setting):
+    ruler = Ruler(setting, left_by_levels)
+
+    def region(name, amplitude):
+        return region_of(INSIDE[name].draw(setting, np.random.default_rng(8))(amplitude), ruler)
+
+    glint = INSIDE["glint"].draw(setting, np.random.default_rng(8))(2.0)
+    found = region("glint", 2.0)
+    # Half as strong at 1.18 sd, seen along y = 0, to the millimetre of the plan.
+    half = glint.r * np.sqrt(2 * np.log(2))
+    assert found.covariate == "place"
+    assert found.low == pytest.approx(glint.x - half, abs=1.01)
+    assert found.high == pytest.approx(glint.x + half, abs=1.01)
+    step = region("ambient_step", 1.0)
+    assert (step.covariate, step.high) == ("time", setting.plan.time_s[-1])
+    assert region("scan_misplacement", 1.0).scans
+    assert region("backlash", 1.0) is None
+    assert isinstance(region("saturation", 0.1), Region)
+
+
+@pytest.mark.slow
+def test_every_single_and_outsider_can_be_drawn_at_its_size():
+    """One turn through all names: with a null model this simple, everything that is in the mean survives."""
+    for kind, size, names in [("single", 8.0, SINGLES), ("outside", 12.0, list(OUTSIDE))]:
+        for turn, name in enumerate(names):
+            truth = case(number_of(kind, size=size, other_noise=False, skip=turn)).truth
+            assert truth.hidden[0].name == name
+            if INSIDE.get(name, OUTSIDE.get(name)).sized:
+                assert truth.hidden[0].size_lambda == pytest.approx(size, rel=0.1)
+    assert not NEEDS_SENSOR & set(SINGLES)

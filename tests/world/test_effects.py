@@ -1,0 +1,284 @@
+"""Every name of the vocabulary against a second, simple route: its formula, or a closed form for one Gaussian."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from probewise.errors import ParameterError
+from probewise.recordings import Disc, HalfPlane
+from probewise.world import Blob, World, gaussian_spot
+from probewise.world.concealed import (
+    AlbedoGradient,
+    AlbedoPatch,
+    AmbientGradient,
+    AmbientStep,
+    Backlash,
+    BatterySag,
+    EdgeBlur,
+    EdgeMisplacement,
+    EdgeShadow,
+    Flicker,
+    GainDrift,
+    Glint,
+    Halo,
+    HeightGradient,
+    HeightOffset,
+    Hysteresis,
+    Lag,
+    Nonlinearity,
+    OffsetDrift,
+    OrientationError,
+    PeriodicPositionError,
+    PositionScale,
+    Quantisation,
+    Saturation,
+    ScanAngleError,
+    ScanMisplacement,
+    SensorTilt,
+    SSFOrder,
+)
+
+CENTER, SD, RHO = (0.4, 1.5), (4.0, 2.5), 0.2
+SPOT = gaussian_spot([Blob(1.0, CENTER, SD, RHO)], pixel_mm=0.4)
+BLACK, SPAN = 10.0, 50.0
+
+
+def read(plan, *concealed, **more):
+    return World(SPOT, black=BLACK, white=BLACK + SPAN, concealed=concealed, **more).expected(plan)
+
+
+@pytest.fixture(scope="module")
+def clean(plan):
+    return read(plan)
+
+
+def places(plan):
+    return np.stack([plan.x_mm, plan.y_mm], axis=-1)
+
+
+def sent_to(plan, place_mm, **changes):
+    """Send the sensor where it really stood: only what depends on the place changes."""
+    return replace(plan, x_mm=place_mm[:, 0], y_mm=place_mm[:, 1], **changes)
+
+
+def boundary(plan, *, shift=(0.0, 0.0), more_variance=0.0, scale=1.0, center=CENTER, covariance=None):
+    """Seen fraction over the boundary by the normal integral, (n_points,); anything elsewhere."""
+    edge = plan.patterns["boundary"]
+    own = edge.normal_rad - plan.orientation_rad  # the normal in the sensor frame
+    c, s = np.cos(own), np.sin(own)
+    (vu, cuv), (_, vv) = covariance or ((SD[0] ** 2, RHO * SD[0] * SD[1]), (0, SD[1] ** 2))
+    sd = np.sqrt(scale**2 * (vu * c**2 + vv * s**2 + 2 * cuv * c * s) + more_variance)
+    along = (plan.x_mm + shift[0]) * math.cos(edge.normal_rad) + (plan.y_mm + shift[1]) * math.sin(edge.normal_rad)
+    return ndtr((along + scale * (center[0] * c + center[1] * s) - edge.offset_mm) / sd)
+
+
+def on_boundary(plan):
+    return plan.pattern == 0
+
+
+def test_the_clean_reading_is_the_normal_integral(plan, clean):
+    rows = on_boundary(plan)
+    np.testing.assert_allclose(clean[rows], BLACK + SPAN * boundary(plan)[rows], atol=1e-3 * SPAN)
+
+
+FORMULAS = {
+    "ambient_gradient": (AmbientGradient(0.01, -0.02), lambda y, p: y + 0.01 * p.x_mm - 0.02 * p.y_mm),
+    "ambient_step": (AmbientStep(2.0, 40.0), lambda y, p: y + np.where(p.time_s > 40, 2.0, 0.0)),
+    "offset_drift": (OffsetDrift(30.0), lambda y, p: y + 30 * p.time_s / 3600),
+    "gain_drift": (GainDrift(0.1, 50.0), lambda y, p: 10 + (y - 10) * (1 + 0.1 * np.exp(-p.time_s / 50))),
+    "battery_sag": (
+        BatterySag(0.4),
+        lambda y, p: 10 + (y - 10) * (1 + 0.4 * (p.covariates["battery_mv"] - 8300) / 1000),
+    ),
+    "flicker": (Flicker(1.5, 0.07, 0.3), lambda y, p: y + 1.5 * np.sin(2 * np.pi * 0.07 * p.time_s + 0.3)),
+    "saturation": (Saturation(45.0), lambda y, p: np.where(y > 45, 45.0, y)),
+    "nonlinearity": (Nonlinearity(1.3), lambda y, p: 10 + 50 * ((y - 10) / 50) ** 1.3),
+    "hysteresis": (
+        Hysteresis(0.8),
+        lambda y, p: y + 0.8 * np.array([1.0, -1.0, 1.0, 1.0])[p.scan],
+    ),
+    "glint": (
+        Glint(3.0, 4.0, 1.0, 5.0),
+        lambda y, p: y + 3 * np.exp(-((p.x_mm - 4) ** 2 + (p.y_mm - 1) ** 2) / 50),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_an_effect_on_the_reading_follows_its_formula(name, plan, clean):
+    effect, formula = FORMULAS[name]
+    assert effect.name == name
+    np.testing.assert_allclose(read(plan, effect), formula(clean, plan), atol=1e-9)
+
+
+STANDS = {
+    "backlash": (Backlash(2.0), lambda p: places(p) - np.array([[1, 0], [-1, 0], [1, 0], [0, 1]])[p.scan]),
+    "position_scale": (PositionScale(0.1, -0.2), lambda p: places(p) * [1.1, 0.8]),
+    "periodic_position_error": (
+        PeriodicPositionError(0.5, 7.0, 0.4),
+        lambda p: places(p) + np.stack([0.5 * np.sin(2 * np.pi * p.x_mm / 7 + 0.4), 0 * p.x_mm], axis=-1),
+    ),
+    "sensor_tilt": (SensorTilt(0.6, -0.3), lambda p: places(p) + np.array([0.6, -0.3])),
+}
+
+
+@pytest.mark.parametrize("name", STANDS)
+def test_an_effect_on_the_place_reads_what_a_right_arm_reads_there(name, plan):
+    effect, stands = STANDS[name]
+    assert effect.name == name
+    np.testing.assert_allclose(read(plan, effect), read(sent_to(plan, stands(plan))), atol=1e-9)
+
+
+def test_a_tilt_shifts_what_is_seen_and_not_where_the_sensor_stands(plan, clean):
+    """The ambient light is that of the sensor's own place."""
+    light = AmbientGradient(0.05, 0.0)
+    tilt = SensorTilt(0.6, -0.3)
+    np.testing.assert_allclose(read(plan, tilt, light) - read(plan, tilt), 0.05 * plan.x_mm, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "scans"),
+    [(ScanAngleError(25.0, ("back", "white")), (1, 2)), (OrientationError(25.0), (0, 1, 2, 3))],
+)
+def test_an_angle_error_reads_what_a_turned_sensor_reads(effect, scans, plan):
+    turned = plan.orientation_rad + math.radians(25) * np.isin(plan.scan, scans)
+    np.testing.assert_allclose(read(plan, effect), read(replace(plan, orientation_rad=turned)), atol=1e-9)
+
+
+def test_a_misplaced_edge_is_a_pattern_that_lies_elsewhere(plan):
+    """Across the edge for a boundary, along X for a disc."""
+    moved = {
+        **plan.patterns,
+        "boundary": HalfPlane(0.1, 0.7 + 0.9),
+        "disc": Disc((1.3 + 0.9, -0.4), 12.0),
+    }
+    expected = read(replace(plan, patterns=moved))
+    assert np.abs(read(plan, EdgeMisplacement(0.9)) - expected).max() < 1e-9
+    one = read(plan, ScanMisplacement(0.9, "back"))
+    np.testing.assert_allclose(one, np.where(plan.scan == 1, expected, read(plan)), atol=1e-9)
+
+
+def test_lag_is_an_exponential_memory_within_the_scan(plan, clean):
+    """Second route: the weights of all earlier readings, written out."""
+    got = read(plan, Lag(2.5))
+    for k in range(len(plan)):
+        rows = np.flatnonzero((plan.scan == plan.scan[k]) & (np.arange(len(plan)) <= k))
+        forgotten = 1 - np.exp(-np.diff(plan.time_s[rows]) / 2.5)
+        weights = np.concatenate([[1.0], forgotten]) * np.exp(-(plan.time_s[k] - plan.time_s[rows]) / 2.5)
+        assert weights.sum() == pytest.approx(1)
+        assert got[k] == pytest.approx(weights @ clean[rows], abs=1e-9)
+
+
+def test_a_soft_ceiling_is_approached_and_never_passed(plan, clean):
+    soft = read(plan, Saturation(45.0, softness=1.0))
+    np.testing.assert_allclose(soft, 45 - np.log1p(np.exp(45 - clean)), atol=1e-9)
+
+
+def test_coarse_rounding_is_to_multiples_of_the_step(plan, clean):
+    got = World(SPOT, concealed=(Quantisation(3.0),)).simulate(plan, rng=None).readings
+    np.testing.assert_allclose(got, 3 * np.round(clean / 3))
+    noisy = World(SPOT, concealed=(Quantisation(3.0),)).simulate(plan, rng=np.random.default_rng(1)).readings
+    np.testing.assert_array_equal(noisy % 3, 0)
+
+
+def test_a_blurred_edge_adds_its_variance(plan, clean):
+    rows = on_boundary(plan)
+    for sd_mm in (0.3, 3.0):
+        expected = BLACK + SPAN * boundary(plan, more_variance=sd_mm**2)[rows]
+        np.testing.assert_allclose(read(plan, EdgeBlur(sd_mm))[rows], expected, atol=1e-3 * SPAN)
+
+
+def test_a_halo_is_a_share_of_a_wide_gaussian_about_the_spots_middle(plan):
+    rows = on_boundary(plan)
+    skirt = boundary(plan, covariance=((225.0, 0.0), (0.0, 225.0)))
+    expected = BLACK + SPAN * (0.8 * boundary(plan) + 0.2 * skirt)[rows]
+    np.testing.assert_allclose(read(plan, Halo(0.2, 15.0))[rows], expected, atol=1e-3 * SPAN)
+
+
+def test_one_gaussian_more_is_a_share_of_it(plan):
+    rows = on_boundary(plan)
+    more = boundary(plan, center=(-3.0, 4.0), covariance=((4.0, 0.0), (0.0, 4.0)))
+    expected = BLACK + SPAN * (0.7 * boundary(plan) + 0.3 * more)[rows]
+    np.testing.assert_allclose(read(plan, SSFOrder(0.3, -3.0, 4.0, 2.0))[rows], expected, atol=1e-3 * SPAN)
+
+
+@pytest.mark.parametrize(
+    ("effect", "height"),
+    [
+        (HeightGradient(0.05), lambda p: 14 + 0.05 * p.x_mm),
+        (HeightOffset(-3.0, ("out",)), lambda p: np.where(p.scan == 0, 11.0, 14.0)),
+    ],
+)
+def test_height_scales_the_footprint_and_dims_by_the_inverse_square(effect, height, plan):
+    rows, scale = on_boundary(plan), height(plan) / 14
+    got = read(plan, effect)
+    expected = BLACK + SPAN * boundary(plan, scale=scale) / scale**2
+    np.testing.assert_allclose(got[rows], expected[rows], atol=1.5e-3 * SPAN)
+    white = plan.pattern == 1
+    np.testing.assert_allclose(got[white], BLACK + SPAN / scale[white] ** 2, atol=1e-9)
+
+
+def test_a_sensor_on_the_table_is_refused(plan):
+    with pytest.raises(ParameterError, match="height_mm"):
+        read(plan, HeightOffset(-14.0, ("out",)))
+
+
+def middle(plan):
+    """Lab place of the spot's mean, (n_points, 2)."""
+    c, s = np.cos(plan.orientation_rad), np.sin(plan.orientation_rad)
+    return places(plan) + np.stack([c * CENTER[0] - s * CENTER[1], s * CENTER[0] + c * CENTER[1]], axis=-1)
+
+
+def test_a_gradient_of_albedo_shows_its_value_at_the_spots_middle_on_white(plan):
+    white = plan.pattern == 1
+    got = read(plan, AlbedoGradient(0.01, 0.02))[white]
+    np.testing.assert_allclose(got, BLACK + SPAN * (1 + middle(plan)[white] @ [0.01, 0.02]), atol=1e-3 * SPAN)
+
+
+def test_a_gradient_of_albedo_weights_the_seen_half_of_a_boundary(plan):
+    """E[n . p ; beyond the edge] of a normal variable: m F(z) + s f(z)."""
+    rows, k = on_boundary(plan), 0.01
+    straight = replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(0.0, 0.7)})
+    c, s = np.cos(plan.orientation_rad), -np.sin(plan.orientation_rad)
+    mean = middle(plan)[:, 0]
+    sd = np.sqrt(SD[0] ** 2 * c**2 + SD[1] ** 2 * s**2 + 2 * RHO * SD[0] * SD[1] * c * s)
+    z = (mean - 0.7) / sd
+    beyond = mean * ndtr(z) + sd * np.exp(-(z**2) / 2) / math.sqrt(2 * math.pi)
+    got = read(straight, AlbedoGradient(k, 0.0))
+    np.testing.assert_allclose(got[rows], (BLACK + SPAN * (ndtr(z) + k * beyond))[rows], atol=1e-3 * SPAN)
+
+
+def test_a_patch_is_seen_through_the_spot(plan, clean):
+    """Two Gaussians convolved: covariances add."""
+    effect = AlbedoPatch(-0.3, 2.0, 1.0, 5.0)
+    c, s = np.cos(plan.orientation_rad), np.sin(plan.orientation_rad)
+    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    own = np.array([[SD[0] ** 2, RHO * SD[0] * SD[1]], [RHO * SD[0] * SD[1], SD[1] ** 2]])
+    covariance = turn @ own @ turn.transpose(0, 2, 1) + 25 * np.eye(2)
+    apart = middle(plan) - [2.0, 1.0]
+    squared = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart)
+    seen = -0.3 * 25 / np.sqrt(np.linalg.det(covariance)) * np.exp(-squared / 2)
+    np.testing.assert_allclose(read(plan, effect) - clean, SPAN * seen, atol=1e-3 * SPAN)
+
+
+def test_an_edge_casts_its_shadow_by_the_distance_of_the_sensor(plan, clean):
+    along = plan.x_mm * math.cos(0.1) + plan.y_mm * math.sin(0.1) - 0.7
+    rim = np.hypot(plan.x_mm - 1.3, plan.y_mm + 0.4) - 12
+    distance = np.where(plan.pattern == 0, along, np.where(plan.pattern == 1, np.inf, rim))
+    expected = clean - SPAN * 0.1 * np.exp(-(distance**2) / (2 * 9))
+    np.testing.assert_allclose(read(plan, EdgeShadow(0.1, 3.0)), expected, atol=1e-9)
+
+
+def test_a_shadow_moves_with_the_edge(plan):
+    """The edge of the real pattern and the sensor's real place."""
+    both = read(plan, EdgeMisplacement(0.9), EdgeShadow(0.1, 3.0))
+    moved = {**plan.patterns, "boundary": HalfPlane(0.1, 1.6), "disc": Disc((2.2, -0.4), 12.0)}
+    np.testing.assert_allclose(both, read(replace(plan, patterns=moved), EdgeShadow(0.1, 3.0)), atol=1e-9)
+
+
+def test_a_sagging_battery_needs_its_voltage(plan):
+    with pytest.raises(ParameterError, match="battery_mv"):
+        read(replace(plan, covariates={}), BatterySag(0.4))

@@ -1,0 +1,117 @@
+"""The noise of a world: what its statistics are to be. Bounds: 4 sigma, a right program fails one in 10 000."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, norm, t
+
+from probewise.recordings import Plan, Ramp
+from probewise.world import World, gaussian_spot
+from probewise.world.challenge import NOISE_MODELS, with_noise
+from probewise.world.concealed import (
+    CorrelatedNoise,
+    DriftingNoise,
+    Dropouts,
+    HeavyTails,
+    Outliers,
+    SignalDependentNoise,
+)
+from probewise.world.spots import Blob
+
+N, N_SCANS = 20_000, 20
+SPOT = gaussian_spot([Blob(1.0, (0.0, 0.0), (1.0, 1.0))], pixel_mm=0.5)
+
+
+@pytest.fixture(scope="module")
+def ramp():
+    """Readings over a ramp from black to white, so that every level comes."""
+    x = np.tile(np.linspace(0, 100, N // N_SCANS), N_SCANS)
+    return Plan(
+        x_mm=x,
+        y_mm=np.zeros(N),
+        orientation_rad=np.zeros(N),
+        time_s=np.arange(N, dtype=float),
+        scan=np.repeat(np.arange(N_SCANS), N // N_SCANS),
+        scan_names=tuple(f"scan_{k}" for k in range(N_SCANS)),
+        pattern=np.zeros(N, dtype=int),
+        pattern_names=("ramp",),
+        patterns={"ramp": Ramp(0.0, 0.01)},
+    )
+
+
+@pytest.fixture(scope="module")
+def noise(ramp):
+    look = World(SPOT).look(ramp)
+
+    def of(*concealed, noise_sd=0.6):
+        world = World(SPOT, noise_sd=noise_sd, concealed=concealed)
+        made = world.simulate(ramp, rng=np.random.default_rng(5), look=look).readings
+        return (made - world.answer(look)) / noise_sd
+
+    return of
+
+
+def test_noise_is_white_and_normal(noise):
+    z = noise()
+    assert kstest(z, "norm").pvalue > 1e-4
+    assert abs(np.mean(z[1:] * z[:-1])) < 4 / math.sqrt(N)
+
+
+def test_correlated_noise_remembers_within_a_scan_and_keeps_its_sd(noise, ramp):
+    z = noise(CorrelatedNoise(0.5))
+    within = ramp.scan[1:] == ramp.scan[:-1]
+    assert abs(z.var() - 1) < 4 * math.sqrt(2 / N * 1.25 / 0.75)
+    assert abs(np.mean((z[1:] * z[:-1])[within]) - 0.5) < 4 * math.sqrt(3 / N)
+    assert abs(np.mean((z[1:] * z[:-1])[~within])) < 4 / math.sqrt(N_SCANS - 1) * 1.2
+
+
+def test_signal_dependent_noise_has_a_variance_in_proportion(noise, ramp):
+    z = noise(SignalDependentNoise(3.0)) / np.sqrt(1 + 3 * 0.01 * ramp.x_mm)
+    for part in np.split(z[np.argsort(ramp.x_mm)], 4):
+        assert abs(part.var() - 1) < 4 * math.sqrt(2 / len(part))
+
+
+def test_drifting_noise_grows_to_its_factor_and_stays(noise, ramp):
+    z = noise(DriftingNoise(2.0, N / 2))
+    late = z[ramp.time_s > N / 2]
+    assert abs(late.std() / 2 - 1) < 4 / math.sqrt(2 * len(late))
+    early = z[:1000] / (1 + ramp.time_s[:1000] / (N / 2))
+    assert abs(early.std() - 1) < 4 / math.sqrt(2 * len(early))
+
+
+def test_heavy_tails_are_student_t_of_the_same_sd(noise):
+    z = noise(HeavyTails(4.0))
+    assert kstest(z * math.sqrt(2), t(4).cdf).pvalue > 1e-4
+
+
+def test_outliers_come_in_their_share_and_size(noise):
+    """Beyond 4 sd there is next to nothing but outliers."""
+    z = noise(Outliers(0.02, 10.0))
+    expected = 0.02 * 2 * norm.sf(4, scale=math.sqrt(101)) + 0.98 * 2 * norm.sf(4)
+    assert abs(np.mean(np.abs(z) > 4) - expected) < 4 * math.sqrt(expected / N)
+    assert abs(z.var() - 3) < 4 * math.sqrt((3 * (0.98 + 0.02 * 101**2) - 9) / N)
+
+
+def test_dropouts_are_lost_to_one_value(ramp):
+    world = World(SPOT, concealed=(Dropouts(0.03, -1.0),))
+    lost = world.simulate(ramp, rng=np.random.default_rng(5)).readings == -1
+    assert abs(lost.mean() - 0.03) < 4 * math.sqrt(0.03 / N)
+
+
+def test_without_a_generator_there_is_no_noise_and_nothing_is_lost(ramp):
+    world = World(SPOT, concealed=(Dropouts(0.5, -1.0), Outliers(0.5, 10.0)))
+    np.testing.assert_array_equal(world.simulate(ramp, rng=None).readings, world.expected(ramp))
+
+
+@pytest.mark.parametrize("model", NOISE_MODELS)
+def test_every_kind_of_noise_differs_from_white_as_it_is_called(model, ramp, noise):
+    world = with_noise(World(SPOT), model, duration_s=float(N))
+    assert (world.step == 1.0) == (model == "quantised")
+    z = noise(*world.concealed)
+    kept = z[np.abs(z) < 6]  # without outliers and dropouts
+    spread = {"drifting": math.sqrt(7 / 3), "signal_dependent": math.sqrt(2)}.get(model, 1.0)
+    assert kept.std() == pytest.approx(spread, rel=0.1)
+    assert np.mean(np.abs(z) >= 6) == pytest.approx(
+        {"outliers": 0.02 * 2 * norm.sf(6 / math.sqrt(65)), "dropouts": 0.01}.get(model, 0.0), abs=0.003
+    )

@@ -198,3 +198,12 @@ def test_a_reading_that_surprises_is_inferred_from_scratch() -> None:
     assert found.sound
     assert abs(found.log_z - odd.log_z) < 4 * found.log_z_error
     assert found.n_calls > found.run.n_calls
+
+
+def test_a_mixture_of_what_was_fitted_is_whole_however_many_forms_there_are() -> None:
+    """Few samples allow one form only; its share is then all there is."""
+    rng = np.random.default_rng(5)
+    (only,) = fit_proposals(rng.standard_normal((30, 2)), rng=rng)
+    mixed = joined((only,), [0.75])
+    assert mixed.share.sum() == pytest.approx(1.0)
+    assert mixed.draw(100, rng=rng).shape == (100, 2)

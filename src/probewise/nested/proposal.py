@@ -71,12 +71,13 @@ class Proposal:
 
 
 def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
-    """Mix proposals, each with its share of the draws."""
+    """Mix proposals, each with its share of the draws; shares need not be normalised."""
+    total = math.fsum(share)
     return Proposal(
         _all([p.clusters for p in proposals]),
         tuple(centres for p in proposals for centres in p.centres),
         tuple(width for p in proposals for width in p.width),
-        np.concatenate([s * p.share for p, s in zip(proposals, share, strict=True)]),
+        np.concatenate([s / total * p.share for p, s in zip(proposals, share, strict=True)]),
     )
 
 

@@ -44,9 +44,8 @@ class Prior(Protocol):
 class Coordinates(Protocol):
     """Coordinates in which a problem is simpler than in its parameters or the unit cube.
 
-    A prior that has a property `charts`, a tuple of these, is sampled in them: what readings fix
-    sharply should be an axis there, not a bent surface through several. Chains walk in each chart in
-    turn, so one may suit the prior and another the posterior, which comes last.
+    A prior that has a property `coordinates` of this kind is sampled in them: what readings fix
+    sharply should be an axis there, not a bent surface through several.
     """
 
     def enter(self, theta: FloatArray) -> FloatArray:

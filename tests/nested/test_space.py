@@ -8,7 +8,7 @@ from scipy.stats import multivariate_t
 
 from probewise.calibration import SSFPrior, default_prior
 from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
-from probewise.nested.space import spaces_of, unbounded
+from probewise.nested.space import space_of, unbounded
 from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
 from probewise.recordings import Recording, paper_plan
 from probewise.scene import AnyOf, Circle, Ellipse, Rectangle, RegularPolygon
@@ -46,10 +46,6 @@ PRIORS = {
     "SSF by mass": derived_prior(2),
 }
 MOMENTS = {"one": paper_prior(1), "two": paper_prior(2), "three by mass": derived_prior(3)}
-CHARTS = pytest.mark.parametrize(
-    ("prior", "chart"),
-    [pytest.param(p, c, id=f"{name}, chart {k}") for name, p in MOMENTS.items() for k, c in enumerate(p.charts)],
-)
 
 
 def cube(prior, n=200, seed=0):
@@ -85,10 +81,10 @@ def test_parameters_are_found_again_from_coordinates_without_walls(prior):
     assert np.isinf(space.high).all()
 
 
-@pytest.mark.parametrize("prior", [p for p in PRIORS.values() if not hasattr(p, "charts")])
+@pytest.mark.parametrize("prior", [p for p in PRIORS.values() if not hasattr(p, "coordinates")])
 def test_chains_step_in_the_unit_cube_where_a_prior_has_no_better(prior):
     assert isinstance(prior, Prior)
-    (space,) = spaces_of(prior)
+    space = space_of(prior)
     u = cube(prior)
     theta, log_density = space.leave(u)
     np.testing.assert_array_equal(theta, prior.from_unit_cube(u))
@@ -96,11 +92,11 @@ def test_chains_step_in_the_unit_cube_where_a_prior_has_no_better(prior):
     np.testing.assert_allclose(space.enter(theta), u, atol=1e-7)
 
 
-@CHARTS
-def test_moments_give_back_the_gaussians_sorted_by_mass(prior, chart):
+@pytest.mark.parametrize("prior", MOMENTS.values(), ids=MOMENTS)
+def test_moments_give_back_the_gaussians_sorted_by_mass(prior):
     theta = prior.from_unit_cube(cube(prior))
     n = prior.n_gaussians
-    back, _ = chart.leave(chart.enter(theta))
+    back, _ = prior.coordinates.leave(prior.coordinates.enter(theta))
     g = theta[:, : 6 * n].reshape(-1, n, 6)
     mass = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
     sorted_g = np.take_along_axis(g, np.argsort(-mass, axis=1)[..., None], axis=1)
@@ -108,19 +104,19 @@ def test_moments_give_back_the_gaussians_sorted_by_mass(prior, chart):
     np.testing.assert_array_equal(back[:, 6 * n :], theta[:, 6 * n :])
 
 
-@CHARTS
-def test_the_density_over_moments_has_the_jacobian_of_finite_differences(prior, chart):
+@pytest.mark.parametrize("prior", MOMENTS.values(), ids=MOMENTS)
+def test_the_density_over_moments_has_the_jacobian_of_finite_differences(prior):
     """Log density over x = log N! + log density over theta + log |d theta / d x|, by central differences."""
     n_params, step = len(prior.names), 1e-6
     # Away from the walls, where a difference would reach over them.
-    x = chart.enter(prior.from_unit_cube(0.1 + 0.8 * cube(prior, 20)))
-    theta, log_density = chart.leave(x)
+    x = prior.coordinates.enter(prior.from_unit_cube(0.1 + 0.8 * cube(prior, 20)))
+    theta, log_density = prior.coordinates.leave(x)
     slopes = np.empty((len(x), n_params, n_params))
     for k in range(n_params):
         ahead, behind = x.copy(), x.copy()
         ahead[:, k] += step
         behind[:, k] -= step
-        slopes[:, :, k] = (chart.leave(ahead)[0] - chart.leave(behind)[0]) / (2 * step)
+        slopes[:, :, k] = (prior.coordinates.leave(ahead)[0] - prior.coordinates.leave(behind)[0]) / (2 * step)
     jacobian = np.linalg.slogdet(slopes)[1]
     wanted = prior.log_prob(theta) + jacobian + math.lgamma(prior.n_gaussians + 1)
     np.testing.assert_allclose(log_density, wanted, atol=1e-4)
@@ -130,20 +126,18 @@ def test_the_density_over_moments_has_the_jacobian_of_finite_differences(prior, 
 def test_the_folded_density_over_moments_integrates_to_one(prior):
     """Importance sampling from a Student-t about the prior's own draws; within five standard errors."""
     rng = np.random.default_rng(6)
-    chart = prior.charts[0]  # the one that the prior's own draws are compact in
-    drawn = chart.enter(prior.from_unit_cube(rng.random((20_000, len(prior.names)))))
+    drawn = unbounded(prior).draw(20_000, rng=rng)
     around = multivariate_t(drawn.mean(axis=0), np.cov(drawn, rowvar=False), df=6, seed=rng)
     x = around.rvs(150_000)
-    ratio = np.exp(chart.leave(x)[1] - around.logpdf(x))
+    ratio = np.exp(prior.coordinates.leave(x)[1] - around.logpdf(x))
     error = ratio.std() / math.sqrt(len(x))
     assert error < 0.05
     assert ratio.mean() == pytest.approx(1.0, abs=5 * error)
 
 
-@pytest.mark.parametrize("chart", paper_prior(2).charts, ids=["each", "of the whole"])
-def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing(chart):
+def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():
     prior = paper_prior(2)
-    inside = chart.enter(prior.from_unit_cube(0.3 + 0.4 * cube(prior, 1)))[0]
+    inside = prior.coordinates.enter(prior.from_unit_cube(0.3 + 0.4 * cube(prior, 1)))[0]
     n_params = len(prior.names)
     far = np.concatenate([np.full((1, n_params), v) for v in (1e4, -1e4, 800.0, -800.0)])
     mixed = np.random.default_rng(5).choice([-1e4, -300.0, 300.0, 1e4], size=(500, n_params))
@@ -159,9 +153,9 @@ def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing(chart):
     moved = np.repeat(inside[None, :], len(changes), axis=0)
     for row, (column, value) in enumerate(changes.values()):
         moved[row, column] = value
-    assert np.isfinite(chart.leave(inside[None, :])[1]).all()
+    assert np.isfinite(prior.coordinates.leave(inside[None, :])[1]).all()
     for x in (far, mixed, moved):
-        theta, log_density = chart.leave(x)
+        theta, log_density = prior.coordinates.leave(x)
         assert (log_density == -np.inf).all()
         assert not np.isnan(theta).any()
 

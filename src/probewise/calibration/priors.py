@@ -145,10 +145,9 @@ class SSFPrior:
         return np.asarray(total)
 
     @property
-    def charts(self) -> tuple[MomentCoordinates, ...]:
-        """The coordinates that a sampler should step in: each Gaussian's own moments, then the whole footprint's."""
-        each = MomentCoordinates(self)
-        return (each,) if self.n_gaussians == 1 else (each, MomentCoordinates(self, of_the_whole=True))
+    def coordinates(self) -> MomentCoordinates:
+        """The coordinates that a sampler should step in."""
+        return MomentCoordinates(self)
 
     def describe(self) -> tuple[PriorRow, ...]:
         """Return the table of priors for the report, one row a kind of parameter."""

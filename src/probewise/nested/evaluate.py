@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.nested.space import Space, spaces_of
+from probewise.nested.space import Space, space_of
 
 if TYPE_CHECKING:
     from probewise.priors import Prior
@@ -71,11 +71,6 @@ class Points:
         self.u[rows], self.theta[rows], self.log_density[rows] = points.u, points.theta, points.log_density
         self.log_likelihood[rows], self.label[rows] = points.log_likelihood, points.label
 
-    def entering(self, space: Space) -> Points:
-        """Describe the same points in another space."""
-        u = space.enter(self.theta)
-        return Points(u, self.theta, space.leave(u)[1], self.log_likelihood, self.label)
-
     def order(self) -> IntArray:
         """Row numbers from worst to best, ties by label."""
         return np.lexsort((self.label, self.log_likelihood))
@@ -123,16 +118,11 @@ class Evaluator:
     executor: Executor | None = None
     n_parts: int = 1
     names: tuple[str, ...] = field(init=False)
-    spaces: tuple[Space, ...] = field(init=False)
+    space: Space = field(init=False)
 
     def __post_init__(self) -> None:
         self.names = self.problem.prior.names
-        self.spaces = spaces_of(self.problem.prior)
-
-    @property
-    def space(self) -> Space:
-        """The space that points are kept in between moves."""
-        return self.spaces[0]
+        self.space = space_of(self.problem.prior)
 
     def from_prior(self, n: int, rng: np.random.Generator) -> Points:
         """Draw from the prior and evaluate."""

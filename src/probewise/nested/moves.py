@@ -12,7 +12,6 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
-from probewise.nested.space import Space
 
 __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
@@ -33,15 +32,6 @@ class Tally:
     n_accepted: int
     n_stuck: int = 0
     n_tried: int = 0
-
-    def joined(self, other: Tally) -> Tally:
-        """Add up what the same chains did one after another; stuck are those that never moved, at most the fewer."""
-        return Tally(
-            self.n_evaluated + other.n_evaluated,
-            self.n_accepted + other.n_accepted,
-            min(self.n_stuck, other.n_stuck),
-            self.n_tried + other.n_tried,
-        )
 
 
 class Move(Protocol):
@@ -114,8 +104,6 @@ class SliceMove:
     below its density at the point, and candidates must lie above that too (Neal's auxiliary
     height): refusing one for that reason costs no likelihood.
 
-    Where the prior has several charts of space a chain walks in each in turn, its lines shared among them.
-
     Four kinds of steps, every one reversible by itself:
 
     - along the axes of the space, each on a scale drawn between the conditional and the marginal
@@ -163,33 +151,10 @@ class SliceMove:
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start; see `Move`."""
-        same = (live[None, :, :] == start.u[:, None, :]).all(axis=2)
-        own_row = np.where(same.any(axis=1), np.argmax(same, axis=1), -1)
-        n_lines = max(2, math.ceil(self.steps_per_param * start.u.shape[1] / len(evaluate.spaces)))
-        now, tally = self._walked(start, own_row, bound, live, evaluate.space, n_lines, evaluate, rng)
-        if len(evaluate.spaces) > 1:
-            theta = evaluate.space.leave(live)[0]
-            for space in evaluate.spaces[1:]:
-                there = now.entering(space)
-                now, more = self._walked(there, own_row, bound, space.enter(theta), space, n_lines, evaluate, rng)
-                tally = tally.joined(more)
-            now = now.entering(evaluate.space)
-        return now, tally
-
-    def _walked(
-        self,
-        start: Points,
-        own_row: IntArray,
-        bound: Bound,
-        live: FloatArray,
-        space: Space,
-        n_lines: int,
-        evaluate: Evaluator,
-        rng: np.random.Generator,
-    ) -> tuple[Points, Tally]:
-        """Walk a chain from each start within one space, by so many lines; `own_row`: where it began among `live`."""
         n_chains, n_params = start.u.shape
+        space = evaluate.space
         clusters = find_clusters(live)
+        n_lines = max(2, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
         kind = self._kinds(n_chains, n_steps, n_hops, rng)
@@ -197,7 +162,7 @@ class SliceMove:
         axis = _axes(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
-        view = _View.of(clusters, start.u, own_row, live)
+        view = _View.of(clusters, start.u, home, live)
         line = np.empty((n_chains, n_params))
         low, high, level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
@@ -350,12 +315,11 @@ class _View:
     own_row: IntArray  # where the start stands among the live points
 
     @classmethod
-    def of(cls, clusters: Clusters, start: FloatArray, own_row: IntArray, live: FloatArray) -> _View:
-        known, row = own_row >= 0, np.maximum(own_row, 0)
-        u = np.where(known[:, None], live[row], start)
-        home = clusters.assign(u)
+    def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _View:
+        same = (live[None, :, :] == u[:, None, :]).all(axis=2)
         # A start that is no live point is in no cluster's measure either.
-        return cls(clusters, clusters.without(u, home), np.where(known, home, -1), row)
+        own_home = np.where(same.any(axis=1), home, -1)
+        return cls(clusters, clusters.without(u, home), own_home, np.argmax(same, axis=1))
 
     def measures(self, rows: IntArray, home: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Mean, root, inverse root and log determinant of cluster `home` as chains `rows` see it."""

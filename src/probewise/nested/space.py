@@ -11,7 +11,7 @@ from scipy.special import ndtr, ndtri
 from probewise._arrays import FloatArray
 from probewise.priors import Coordinates, Prior
 
-__all__ = ["Space", "spaces_of", "unbounded"]
+__all__ = ["Space", "space_of", "unbounded"]
 
 _EDGE = 1e-15
 
@@ -93,7 +93,7 @@ class _Normal:
 
 @dataclass(frozen=True)
 class _Own:
-    """One of the prior's own charts."""
+    """The prior's own coordinates."""
 
     prior: Prior
     coordinates: Coordinates
@@ -117,18 +117,16 @@ class _Own:
 
 
 @runtime_checkable
-class _HasCharts(Protocol):
+class _HasCoordinates(Protocol):
     @property
-    def charts(self) -> tuple[Coordinates, ...]: ...
+    def coordinates(self) -> Coordinates: ...
 
 
-def spaces_of(prior: Prior) -> tuple[Space, ...]:
-    """Choose where chains step, one space after another: the prior's charts if it has any, else the unit cube."""
-    if isinstance(prior, _HasCharts):
-        return tuple(_Own(prior, chart) for chart in prior.charts)
-    return (_Cube(prior),)
+def space_of(prior: Prior) -> Space:
+    """Choose where chains step: the prior's own coordinates if it has any, else the unit cube."""
+    return _Own(prior, prior.coordinates) if isinstance(prior, _HasCoordinates) else _Cube(prior)
 
 
 def unbounded(prior: Prior) -> Space:
-    """Choose coordinates without walls, for densities that know none: the prior's last chart, else normal scores."""
-    return _Own(prior, prior.charts[-1]) if isinstance(prior, _HasCharts) else _Normal(prior)
+    """Choose coordinates without walls, for densities that know none: the prior's own, else normal scores."""
+    return _Own(prior, prior.coordinates) if isinstance(prior, _HasCoordinates) else _Normal(prior)

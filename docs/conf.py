@@ -8,6 +8,7 @@ from pathlib import Path
 
 from probewise import __version__
 from probewise.cli import VERBS, main
+from probewise.cli.arm import TASKS
 
 HERE = Path(__file__).parent
 
@@ -62,11 +63,11 @@ def write_help(app: object) -> None:
     """Write what `--help` says to files that the reference includes, so that it cannot fall behind."""
     folder = HERE / "api" / "cli"
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("", *(verb.name for verb in VERBS)):
+    for name in ("", *(verb.name for verb in VERBS), *(f"arm {task}" for task in TASKS)):
         text = io.StringIO()
         with redirect_stdout(text):
-            main([name, "--help"] if name else ["--help"])
-        (folder / f"{name or 'probewise'}.txt").write_text(text.getvalue(), encoding="utf-8")
+            main([*name.split(), "--help"])
+        (folder / f"{name.replace(' ', '-') or 'probewise'}.txt").write_text(text.getvalue(), encoding="utf-8")
 
 
 def setup(app: object) -> None:

@@ -24,7 +24,7 @@ robot = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, a
 circle = Circle(radius_mm=(50.0, 150.0), inside=True)
 mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
 model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
-experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, n_live=80, n_diversify=300)
+experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, n_live=80)
 
 # %%
 # Measure, infer, inquire, until every length is known to 4 mm.

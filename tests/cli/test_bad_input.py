@@ -122,6 +122,10 @@ def test_a_sensor_model_with_a_field_missing_says_which(sensor_file, recording_f
         ("--live", "1"),
         ("--model", "perfect"),
         ("--arm", "third"),
+        ("--utility", "spiral"),
+        ("--batch", "0"),
+        ("--batch", "2", "--utility", "entropy"),
+        ("--learn-sensor", "--model", "naive"),
         ("--resume",),
         ("--unheard-of",),
     ],
@@ -141,6 +145,9 @@ def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, r
         "predict": ["predict", sensor_file, recording_file, "--out", out / "p.csv"],
         "explore": ["explore", "--sensor", sensor_file, "--out", out],
         "diagnose": ["diagnose", recording_file, "--out", out],
+        "study": ["study", "--out", out],
+        "arm": ["arm", "check", "--out", out / "reach.png"],
+        "emulate-nxt": ["emulate-nxt", "--log", out / "log.txt"],
     }[verb]
     refused(capsys, out, *arguments)
     assert out.read_text() == "mine"

@@ -77,8 +77,11 @@ class QuickArm:
     def reachable(self, places_mm):
         return np.hypot(places_mm[:, 0] - 200.0, places_mm[:, 1]) <= self.reach_mm
 
+    def orientation_rad(self, places_mm):
+        return np.zeros(len(places_mm))
+
     def travel_s(self, start, places_mm):
-        return np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm) / 100.0
+        return 1.0 + np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm) / 100.0
 
     def measure(self, pose: Pose) -> Reading:
         self.poses.append(pose)
@@ -99,10 +102,10 @@ def small_experiment(**changes):
         "model": EdgeSensor(blur_mm),
         "likelihood": Gaussian(),
         "noise_sd": 1.0,
-        "grid": Grid(400.0, 300.0, 51, 39),
+        "grid": Grid(400.0, 300.0, 26, 20),
         "n_live": 40,
         "n_samples": 20,
-        "n_diversify": 50,
+        "n_particles": 600,
     }
     return Experiment(**{**options, **changes})
 

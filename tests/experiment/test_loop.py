@@ -15,11 +15,14 @@ import pytest
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
 from probewise.experiment import Exploration, OneScan, begin, explore, read_journal, run, step
+from probewise.experiment import Field as FieldOf
 from probewise.inference import GaussianKnown, StudentT
-from probewise.inquiry import Grid, gaussian_entropy, prior_entropy
+from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, gaussian_entropy, prior_entropy
 from probewise.scene.scenes import HypothesisScene
 from probewise.scene.shapes import AnyOf, Circle, Field, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
+
+COARSE = Grid(400.0, 300.0, 14, 10)
 
 
 def rng(seed=2013):
@@ -49,7 +52,7 @@ def test_each_step_holds_what_its_reading_taught(found):
         assert info.number == number
         assert info.samples.shape == (20, 3)
         assert len(np.unique(info.samples, axis=0)) == 20
-        assert 0 <= info.map.highest <= math.log2(20)
+        assert 0 <= info.map.highest <= math.log2(50)
         assert np.isfinite([info.bits, info.log_z, info.p_value, info.posterior.log_z_error]).all()
     poses = [info.next_pose for info in result.steps]
     assert poses[-1] is None
@@ -101,18 +104,16 @@ def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
 def test_a_step_by_hand_is_a_step_of_the_loop(small):
     experiment, arm = small.experiment(), small.arm()
     first = next(iter(explore(arm, experiment, rng=rng())))
-    reachable = np.ones(experiment.grid.n_places, bool)
+    field = FieldOf.under(arm, experiment.grid)
     # explore() takes the first child of the generator's seed, and of that a child for each reading.
     child = np.random.SeedSequence(2013).spawn(1)[0]
     start, then = (
         np.random.default_rng(np.random.SeedSequence(child.entropy, spawn_key=(*child.spawn_key, k))) for k in (0, 1)
     )
     prior_bits = prior_entropy(experiment.prior, rng=start)
-    state = begin(experiment, reachable, rng=start)
+    state = begin(experiment, field, rng=start)
     assert state.next_pose == first.reading.pose
-    state, info = step(
-        state, small.arm().measure(state.next_pose), experiment, reachable, prior_bits=prior_bits, rng=then
-    )
+    state, info = step(state, small.arm().measure(state.next_pose), experiment, field, prior_bits=prior_bits, rng=then)
     np.testing.assert_array_equal(info.samples, first.samples)
     assert (info.bits, info.log_z, info.next_pose) == (first.bits, first.log_z, first.next_pose)
     assert state.readings == (first.reading,)
@@ -201,7 +202,7 @@ def test_a_run_killed_while_it_infers_keeps_the_reading_just_taken(small, found,
     journal = tmp_path / "journal.jsonl"
     steps = explore(small.arm(), small.experiment(), rng=rng(), journal=journal)
     next(steps)
-    monkeypatch.setattr("probewise.experiment.loop.run_nested", lambda *_, **__: os._exit(9))
+    monkeypatch.setattr("probewise.experiment.loop.update", lambda *_, **__: os._exit(9))
     pid = os.fork()
     if pid == 0:
         next(steps)  # measures, writes the reading, dies in the inference
@@ -306,7 +307,7 @@ def test_a_space_that_excludes_the_reading_altogether_is_an_error(small):
 
 @pytest.mark.parametrize(
     "change",
-    [{"stop_sd_mm": 0.0}, {"noise_sd": math.nan}, {"n_samples": 1}, {"n_diversify": -1}, {"stop_probability": 1.0}],
+    [{"stop_sd_mm": 0.0}, {"noise_sd": math.nan}, {"n_samples": 1}, {"n_particles": 10}, {"stop_probability": 1.0}],
 )
 def test_an_option_out_of_range_is_refused_by_name(small, change):
     with pytest.raises(ParameterError, match=next(iter(change))):
@@ -343,6 +344,12 @@ class ChainArm:
 
     def reachable(self, places_mm):
         return np.ones(len(places_mm), bool)
+
+    def orientation_rad(self, places_mm):
+        return np.zeros(len(places_mm))
+
+    def travel_s(self, start, places_mm):
+        return np.ones(len(places_mm))
 
     def measure(self, pose):
         plan = Grid(2.0, 2.0, 2, 2).plan("field").take(np.array([0]))
@@ -394,3 +401,92 @@ def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
     assert isinstance(result, Exploration)
     assert all(info.map.highest <= 1.0 + 1e-12 for info in result.steps)
     assert Pose(result.readings[0].pose.x_mm, result.readings[0].pose.y_mm) == result.readings[0].pose
+
+
+def test_a_run_that_nothing_explains_does_not_call_itself_known(small):
+    """A sensor whose edges are four times as soft as the model believes, asked for half a millimetre."""
+    blurred = small.arm(sensor=small.sensor(32.0))
+    result = run(blurred, small.experiment(stop_sd_mm=1.0, grid=COARSE), rng=rng(), max_readings=40)
+    said = [info.number for info in result.steps if any("no hypothesis explains" in note for note in info.notes)]
+    assert said
+    assert not result.reached
+    assert result.experiment.is_known(result.last.sd, result.last.shapes)
+    assert "is not to be trusted" in result.stop_reason
+    assert f"p = {result.last.p_value:.1g}" in result.stop_reason
+
+
+def test_a_coarse_model_may_be_told_not_to_doubt_itself(small):
+    """The naive model never fits a reading on the edge; with doubt_p = 0 it goes by its posterior all the same."""
+    naive = small.experiment(blur_mm=0.0, doubt_p=0.0)
+    result = run(small.arm(), naive, rng=rng(), max_readings=60)
+    assert result.reached
+    assert result.stop_reason == "every length is known to better than 4 mm"
+
+
+def test_a_reading_outside_the_sensors_range_is_an_error(small):
+    class Broken(small.arm):
+        def measure(self, pose):
+            return replace(super().measure(pose), value=1023.0)
+
+    with pytest.raises(ParameterError, match=r"reading is 1023.0; allowed: 1 to 100, the range of the sensor"):
+        run(Broken(), small.experiment(reading_range=(1.0, 100.0)), rng=rng())
+
+
+def test_a_sensor_that_sees_no_shape_is_refused_before_the_first_reading(small):
+    """No hypothesis predicts anything else than another: the map is flat."""
+
+    class Blind(small.sensor):
+        def predict(self, theta, plan):
+            return np.full((len(theta), len(plan.x_mm)), 10.0)
+
+    arm = small.arm()
+    with pytest.raises(ParameterError, match=r"utility is '0 everywhere'; allowed: one that differs between places"):
+        run(arm, small.experiment(model=Blind()), rng=rng())
+    assert arm.poses == []
+
+
+def test_several_readings_are_chosen_at_a_time(small):
+    """Poses of a batch are those planned after its first reading, whatever they return."""
+    arm = small.arm()
+    steps = list(explore(arm, small.experiment(batch=3, grid=COARSE), rng=rng(), max_readings=6))
+    poses = [(info.reading.pose.x_mm, info.reading.pose.y_mm) for info in steps]
+    assert len(set(poses)) == 6
+    other = small.arm(truth=(90.0, 60.0, 40.0))
+    again = [
+        (info.reading.pose.x_mm, info.reading.pose.y_mm)
+        for info in explore(other, small.experiment(batch=3, grid=COARSE), rng=rng(), max_readings=3)
+    ]
+    assert again == poses[:3]
+    with pytest.raises(ParameterError, match="batch"):
+        small.experiment(batch=2, utility=ReadingEntropy())
+
+
+def test_repeats_are_taken_on_the_spot(small):
+    experiment = small.experiment(repeats=(3,), noise_sd=6.0, likelihood=small.gaussian(6.0))
+    result = run(small.arm(), experiment, rng=rng(), max_readings=6)
+    places = [(r.pose.x_mm, r.pose.y_mm) for r in result.readings]
+    assert places[0] == places[1] == places[2] != places[3]
+    assert places[3] == places[4] == places[5]
+
+
+def test_a_batch_that_was_interrupted_goes_on_bit_for_bit(small, tmp_path):
+    whole = run(small.arm(), small.experiment(batch=3, grid=COARSE), rng=rng(), max_readings=6)
+    journal = tmp_path / "journal.jsonl"
+    for info in explore(
+        small.arm(), small.experiment(batch=3, grid=COARSE), rng=rng(), max_readings=6, journal=journal
+    ):
+        if info.number == 4:
+            break
+    resumed = run(small.arm(), small.experiment(batch=3, grid=COARSE), rng=rng(), max_readings=6, journal=journal)
+    assert all(same(a, b) for a, b in zip(whole.steps, resumed.steps, strict=True))
+
+
+def test_worth_a_second_saves_travel(small):
+    """The same circle: shorter ways from reading to reading than without regard to them."""
+
+    def way(utility):
+        result = run(small.arm(), small.experiment(utility=utility), rng=rng(), max_readings=8)
+        places = np.array([(r.pose.x_mm, r.pose.y_mm) for r in result.readings])
+        return np.hypot(*np.diff(places, axis=0).T).mean()
+
+    assert way(PerSecond()) < 0.8 * way(InformationGain())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from probewise.errors import ParameterError, ReachError, ShapeError
-from probewise.inquiry import Grid, Prospect, ReadingEntropy, choose, entropy_map, label_entropy
+from probewise.inquiry import Grid, ReadingEntropy, choose, entropy_map, label_entropy
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ def counted_entropy(column):
     return -sum(p * log2(p) for p in shares)
 
 
-def test_the_entropy_is_that_of_counting_each_place_by_itself():
+def test_the_entropy_is_that_of_counting_each_place_by_itself(made):
     predicted = np.random.default_rng(1).normal(30.0, 4.0, (50, 40))
     expected = [counted_entropy(np.rint(column).tolist()) for column in predicted.T]
-    np.testing.assert_allclose(ReadingEntropy()(Prospect(predicted, np.array(1.0))), expected, atol=1e-12)
+    np.testing.assert_allclose(ReadingEntropy()(made.listed(predicted)), expected, atol=1e-12)
 
 
-def test_wider_bins_hold_more_and_tell_less():
-    prospect = Prospect(np.random.default_rng(2).normal(30.0, 8.0, (50, 30)), np.array(1.0))
+def test_wider_bins_hold_more_and_tell_less(made):
+    prospect = made.listed(np.random.default_rng(2).normal(30.0, 8.0, (50, 30)))
     wide = ReadingEntropy(bin_width=5.0)(prospect)
     assert (wide <= ReadingEntropy()(prospect) + 1e-12).all()
     expected = [counted_entropy(np.rint(column / 5.0).tolist()) for column in prospect.predicted.T]
@@ -121,9 +121,9 @@ def test_a_field_out_of_reach_is_an_error_that_says_so():
         entropy_map(PointSensor(), circles(5), grid, grid.plan("f"), reachable=np.zeros(20, bool), noise_sd=1.0)
 
 
-def test_predictions_that_are_not_finite_are_refused():
+def test_predictions_that_are_not_finite_are_refused(made):
     with pytest.raises(ParameterError, match="finite"):
-        Prospect(np.array([[1.0, np.nan]]), np.array(1.0))
+        ReadingEntropy()(made.listed([[1.0, np.nan]]))
 
 
 def test_the_map_of_50_circles_over_8515_places_is_fast():

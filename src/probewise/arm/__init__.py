@@ -1,7 +1,35 @@
-"""Where readings come from: one interface, and the simulated arm behind it (paper, "Robotic Arm Test Bed")."""
+"""Where readings come from: one interface, simulated arm and LEGO arm behind it (paper, "Robotic Arm Test Bed")."""
 
+from probewise.arm.carry_out import carry_out, recorded
+from probewise.arm.geometry import Geometry, Joint
+from probewise.arm.geometry_file import read_geometry, shipped_geometry
 from probewise.arm.instrument import Instrument, Pose, Reading
-from probewise.arm.reach import FIELD_MM, Reach
-from probewise.arm.simulated import LegoScale, Light, SimulatedArm, Speed
+from probewise.arm.lego import LegoArm
+from probewise.arm.limits import SoftLimits
+from probewise.arm.machine import Machine, Rehearsal
+from probewise.arm.reach import FIELD_MM, Reach, Workspace
+from probewise.arm.scale import LegoScale
+from probewise.arm.simulated import Light, SimulatedArm, Speed
 
-__all__ = ["FIELD_MM", "Instrument", "LegoScale", "Light", "Pose", "Reach", "Reading", "SimulatedArm", "Speed"]
+__all__ = [
+    "FIELD_MM",
+    "Geometry",
+    "Instrument",
+    "Joint",
+    "LegoArm",
+    "LegoScale",
+    "Light",
+    "Machine",
+    "Pose",
+    "Reach",
+    "Reading",
+    "Rehearsal",
+    "SimulatedArm",
+    "SoftLimits",
+    "Speed",
+    "Workspace",
+    "carry_out",
+    "read_geometry",
+    "recorded",
+    "shipped_geometry",
+]

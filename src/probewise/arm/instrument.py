@@ -23,7 +23,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Reading:
-    """What the sensor returned, where it was sent and when."""
+    """What the sensor returned, where and when: the pose that was asked for, or a better one that the arm knows of."""
 
     value: float
     pose: Pose
@@ -42,6 +42,13 @@ class Instrument(Protocol):
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Tell which places, shape (n_places, 2), the arm can take: shape (n_places,)."""
+        ...
+
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n_places, 2), where nothing turns it: shape (n_places,).
+
+        A sensor whose arm turns with its base has no choice: this is the orientation of every pose there.
+        """
         ...
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:

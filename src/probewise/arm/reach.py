@@ -4,17 +4,38 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError, ReachError
 
-__all__ = ["FIELD_MM", "Reach"]
+__all__ = ["FIELD_MM", "Reach", "Workspace"]
 
 FIELD_MM = (1048.0, 520.0)
 """Width and height of the paper's playing field, 131 x 65 LEGO units of 8 mm."""
+
+
+class Workspace(Protocol):
+    """Where an arm can put its sensor, and how the sensor then stands: a `Reach`, or the `Geometry` of a real arm."""
+
+    @property
+    def rest_mm(self) -> tuple[float, float]:
+        """Where the sensor rests."""
+        ...
+
+    def holds(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n_places, 2), can be taken: shape (n_places,)."""
+        ...
+
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n_places, 2), where nothing turns it: shape (n_places,)."""
+        ...
+
+    def sentence(self) -> str:
+        """Say where a place may be."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -76,6 +97,16 @@ class Reach:
     def axis_mm(self) -> tuple[float, float]:
         """Where the axis stands, lab frame."""
         return self.field_mm[0] / 2, self.field_mm[1] + self.axis_beyond_mm
+
+    @property
+    def rest_mm(self) -> tuple[float, float]:
+        """Below the axis, as near to it as the arm folds (or, with the axis far off, at the field's side)."""
+        x_mm, y_mm = self.axis_mm
+        return x_mm, max(0.0, min(self.field_mm[1], y_mm - self.nearest_mm))
+
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n_places, 2): never turned, shape (n_places,)."""
+        return np.zeros(len(places_mm))
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
         """Tell which places, shape (n_places, 2), are within reach and on the field: shape (n_places,)."""

@@ -12,10 +12,13 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Pose, Reading
-from probewise.arm.reach import Reach
+from probewise.arm.reach import Reach, Workspace
+from probewise.arm.scale import LegoScale
 from probewise.errors import ParameterError, ReachError, ShapeError
 
-__all__ = ["LegoScale", "Light", "SimulatedArm", "Speed"]
+__all__ = ["Light", "SimulatedArm", "Speed"]
+
+LEGO = LegoScale()
 
 Light: TypeAlias = Callable[[Pose, float, float], float]
 """What the sensor would read at a pose, at a time in s, at a height in mm."""
@@ -35,31 +38,6 @@ class Speed:
             raise ParameterError("read_s", self.read_s, "0 or more")
 
 
-@dataclass(frozen=True)
-class LegoScale:
-    """The brick's conversion: whole steps from `low` to `high`; `step` None leaves fractions."""
-
-    low: float = 1.0
-    high: float = 100.0
-    step: float | None = 1.0
-
-    def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise ParameterError("low", self.low, f"less than high, {self.high:g}")
-        if self.step is not None and not self.step > 0:
-            raise ParameterError("step", self.step, "greater than 0, or None")
-
-    def convert(self, value: float) -> float:
-        """Round to a step, then keep within the scale; NaN, a reading that did not come, stays NaN."""
-        if math.isnan(value):
-            return value
-        value = min(max(value, self.low), self.high)
-        if self.step is not None:
-            value = round(value / self.step) * self.step
-        # A step that does not divide the range may have rounded past its end.
-        return min(max(value, self.low), self.high)
-
-
 class SimulatedArm:
     """Move, lower to 14 mm, read, raise: an Instrument whose clock is advanced, never slept.
 
@@ -68,7 +46,8 @@ class SimulatedArm:
     light
         What the sensor would read at a pose, a time and a height, before the brick's conversion.
     reach
-        Where the sensor can be put; a field out of reach cannot be made (Reach raises ReachError).
+        Where the sensor can be put, and how it then stands: a `Reach`, whose sensor never turns by itself, or
+        the `Geometry` of a real arm.
     speed
         How long moving and reading take.
     scale
@@ -83,18 +62,18 @@ class SimulatedArm:
         self,
         light: Light,
         *,
-        reach: Reach | None = None,
+        reach: Workspace | None = None,
         speed: Speed | None = None,
-        scale: LegoScale | None = LegoScale(),
+        scale: LegoScale | None = LEGO,
         height_mm: float = 14.0,
         start_s: float = 0.0,
     ) -> None:
         if not height_mm > 0:
             raise ParameterError("height_mm", height_mm, "greater than 0")
         self._light, self._scale, self._height_mm, self._time_s = light, scale, height_mm, start_s
-        self.reach = Reach() if reach is None else reach
+        self.reach: Workspace = Reach() if reach is None else reach
         self.speed = Speed() if speed is None else speed
-        self._home = self._pose = self._resting_pose()
+        self._home = self._pose = Pose(*self.reach.rest_mm)
 
     def __enter__(self) -> Self:
         return self
@@ -125,6 +104,16 @@ class SimulatedArm:
         """
         return self.reach.holds(_pairs(places_mm))
 
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n_places, 2), where nothing turns it: shape (n_places,).
+
+        Raises
+        ------
+        ShapeError
+            If the places are not pairs.
+        """
+        return self.reach.orientation_rad(_pairs(places_mm))
+
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Seconds to move from `start` to each place (n_places, 2) and read there, shape (n_places,).
 
@@ -153,11 +142,6 @@ class SimulatedArm:
         value = self._light(pose, self._time_s, self._height_mm)
         value = value if self._scale is None else self._scale.convert(value)
         return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": self._height_mm})
-
-    def _resting_pose(self) -> Pose:
-        """Rest below the axis, as near to it as the arm folds (or, with the axis far off, at the field's side)."""
-        x_mm, y_mm = self.reach.axis_mm
-        return Pose(x_mm, max(0.0, min(self.reach.field_mm[1], y_mm - self.reach.nearest_mm)))
 
 
 def _pairs(places_mm: FloatArray) -> FloatArray:

@@ -2,10 +2,11 @@
 
 The paper's road as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
 (sections 2.2-2.3, the robot finds a shape), `diagnose` (what the model leaves out), `predict`
-(eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once.
+(eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once; `arm`
+moves and reads the LEGO arm, `emulate-nxt` stands in for it.
 
-Exit status 0: done; 2: input that cannot be used, told in one line, nothing written;
-130: stopped by Ctrl-C.
+Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
+2: input that cannot be used, told in one line, nothing written; 130: stopped by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -15,13 +16,22 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from probewise.cli import calibrate, demo, diagnose, explore, predict
+from probewise.cli import arm, calibrate, demo, diagnose, emulate_nxt, explore, predict, study
 from probewise.cli._common import OneLineParser, Verb
-from probewise.errors import NotConvergedError, ProbewiseError
+from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
 
-VERBS: tuple[Verb, ...] = (demo.VERB, calibrate.VERB, predict.VERB, explore.VERB, diagnose.VERB)
+VERBS: tuple[Verb, ...] = (
+    demo.VERB,
+    calibrate.VERB,
+    predict.VERB,
+    explore.VERB,
+    study.VERB,
+    diagnose.VERB,
+    arm.VERB,
+    emulate_nxt.VERB,
+)
 
 
 def parser() -> OneLineParser:
@@ -60,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             kept = str(stop) or "nothing was written"
             _complain(verb, f"stopped; {kept}")
             return 130
-        except NotConvergedError as error:
+        except (NotConvergedError, LinkError) as error:
             _complain(verb, str(error))
             return 1
         except BrokenPipeError:  # the reader of a pipe left; what was written is complete

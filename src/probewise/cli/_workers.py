@@ -1,4 +1,4 @@
-"""Two processes of our own, which end with the command, also when it is stopped."""
+"""Processes of our own, which end with the command, also when it is stopped."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 
-__all__ = ["two_workers"]
+__all__ = ["workers"]
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @contextlib.contextmanager
-def two_workers() -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of two processes with one thread of linear algebra each.
+def workers(n: int) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of `n` processes with one thread of linear algebra each.
 
     Processes are spawned, not forked, so that it works alike on every system.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet_worker)
+    pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet_worker)
     try:
         yield pool
     except BaseException:

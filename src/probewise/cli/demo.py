@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
-    from probewise.cli._workers import two_workers
+    from probewise.cli._workers import workers
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = check_out_directory(arguments.out)
     truth = hidden_circle(seed)
     with (
-        two_workers() as pool,
+        workers(2) as pool,
         tqdm(total=4, desc="demo", unit=" part", disable=True if arguments.quiet else None) as bar,
     ):
         diagnosing = pool.submit(_diagnose, seed)

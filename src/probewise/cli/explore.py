@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise.cli._arm import add_geometry, geometry_of, open_nxt, parse_arm, telling_what_is_kept
 from probewise.cli._common import (
     Verb,
     add_common,
@@ -16,10 +17,12 @@ from probewise.cli._common import (
     say,
     staged,
 )
-from probewise.errors import FileError
+from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Reading
+    from probewise.arm import Geometry, Instrument, Reading
+    from probewise.experiment import Step
+    from probewise.scene import Field
 
 __all__ = ["VERB"]
 
@@ -45,17 +48,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what the simulated world hides, a circle as X,Y,R in mm (default: drawn from the seed)",
     )
     parser.add_argument(
-        "--field", default="1048,520", metavar="W,H", help="width and height of the field in mm (default 1048,520)"
+        "--field", metavar="W,H", help="width and height of the field in mm (default: the geometry's, or 1048,520)"
     )
     parser.add_argument(
-        "--arm", choices=("simulated",), default="simulated", help="where the readings come from (default simulated)"
+        "--arm",
+        default="simulated",
+        metavar="ARM",
+        help="where the readings come from: simulated (the default), or nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5",
     )
+    add_geometry(parser)
     parser.add_argument(
         "--max-readings", type=positive_int, default=100, metavar="N", help="stop here at the latest (default 100)"
     )
     parser.add_argument(
         "--live", type=positive_int, default=200, metavar="N", help="live points of nested sampling (default 200)"
     )
+    parser.add_argument(
+        "--utility",
+        default="finishing",
+        metavar="NAME",
+        help="what a reading is worth: information and, finishing (default), near the end whether it ends the run; "
+        "information alone; the paper's entropy; information per-second of arm time, "
+        "information about:PARAMETER such as about:radius_mm, or on which-shape of several lies there",
+    )
+    parser.add_argument(
+        "--learn-sensor",
+        action="store_true",
+        help="infer the SSF's size and place and both levels along with the shape, from what sensor.json says of them",
+    )
+    parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
     parser.add_argument("--resume", action="store_true", help="go on from the journal in DIR")
     add_common(parser)
 
@@ -67,66 +88,92 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise import experiment as posing
     from probewise.calibration import read_sensor
-    from probewise.cli._geometry import parse_field, parse_truth
+    from probewise.cli._geometry import parse_truth
     from probewise.experiment import Exploration, explore
+    from probewise.inquiry import utility_named
     from probewise.recordings import write_bytes_atomically
     from probewise.report import exploration as report
     from probewise.scene import outlines
 
     out = check_out_directory(arguments.out)
+    port = parse_arm(arguments.arm)
+    geometry = geometry_of(arguments) if port is not None or arguments.geometry is not None else None
+    field = _field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
-    field = parse_field(arguments.field)
     run_rng, truth_rng = np.random.default_rng(arguments.seed).spawn(2)
-    name, truth = parse_truth(arguments.truth, arguments.shape, field, rng=truth_rng)
     experiment = posing.experiment_for(
         sensor,
         posing.shape_named(arguments.shape, field),
         field,
         model=arguments.model,
         n_live=arguments.live,
+        utility=utility_named(arguments.utility),
+        learn_sensor=arguments.learn_sensor,
+        batch=arguments.batch,
     )
     check_live(arguments.live, len(experiment.names))
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
-    arm = posing.arm_over(
-        posing.world_like(sensor),
-        posing.surface_of(name, truth, field),
-        field,
-        seed=arguments.seed,
-        taken=taken,
-    )
+    arm: Instrument
+    truth_mm, known = None, None
+    if port is not None and geometry is not None:
+        if arguments.truth is not None:
+            raise ParameterError("--truth", arguments.truth, "none with a real arm: what lies there is for it to find")
+        arm = open_nxt(port, geometry, start_s=taken[-1].time_s if taken else 0.0)
+    else:
+        name, truth = parse_truth(arguments.truth, arguments.shape, field, rng=truth_rng)
+        surface = posing.surface_of(name, truth, field)
+        world = posing.world_like(sensor)
+        arm = posing.arm_over(world, surface, field, seed=arguments.seed, taken=taken, workspace=geometry)
+        truth_mm = outlines(posing.SHAPES[name](field).region(truth[None, :]))[0]
+        prior_names = posing.SHAPES[name](field).prior.names
+        known = _truth_by_name(name, dict(zip(prior_names, truth.tolist(), strict=True)), experiment.names)
     means = sensor.mean()
     levels = (means["I_min"], means["I_max"])
-    truth_mm = outlines(posing.SHAPES[name](field).region(truth[None, :]))[0]
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     folder = out / "frames"
     folder.mkdir(parents=True, exist_ok=True)
-    steps, frames, readings = [], [], []
+    steps: list[Step] = []
+    frames, readings = [], []
+
+    def kept() -> str:
+        return f"{journal} keeps {len(steps)} readings; go on with --resume" if journal.exists() else "nothing was read"
+
     with (
+        telling_what_is_kept(kept),
         arm,
         tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
     ):
-        try:
-            for step in explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal):
-                steps.append(step)
-                pose = step.reading.pose
-                readings.append((pose.x_mm, pose.y_mm, step.reading.value))
-                frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
-                write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
-                bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
-                bar.update()
-        except KeyboardInterrupt as stop:
-            kept = f"{journal} keeps {len(steps)} readings; go on with --resume"
-            raise KeyboardInterrupt(kept) from stop
+        for step in explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal):
+            steps.append(step)
+            pose = step.reading.pose
+            readings.append((pose.x_mm, pose.y_mm, step.reading.value))
+            frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
+            write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
+            bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
+            bar.update()
     result = Exploration(experiment, tuple(steps))
-    prior_names = posing.SHAPES[name](field).prior.names
-    known = _truth_by_name(name, dict(zip(prior_names, truth.tolist(), strict=True)), experiment.names)
     with staged(out) as stage:
         page = report.write_page(result, frames, seed=arguments.seed, model=arguments.model, truth=known)
         (stage / "report.html").write_text(page, encoding="utf-8")
-    say(f"{result.summary()}\nerror        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
+    say(result.summary(), quiet=arguments.quiet)
+    if known is not None:
+        say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _field(text: str | None, geometry: Geometry | None) -> Field:
+    """Take the field that was asked for, which must be the geometry's where there is one."""
+    from probewise.cli._geometry import parse_field
+    from probewise.scene import Field
+
+    if geometry is None:
+        return parse_field("1048,520" if text is None else text)
+    own = Field(*geometry.field_mm)
+    if text is not None and parse_field(text) != own:
+        raise ParameterError("--field", text, f"{own.width_mm:g},{own.height_mm:g}, the geometry's; or none")
+    return own
 
 
 def _taken_before(journal: Path, *, resume: bool) -> tuple[Reading, ...]:

@@ -1,5 +1,6 @@
 """The autonomous experiment: measure, infer, inquire, and write down each measurement (paper, section 2.2 and 2.3)."""
 
+from probewise.experiment.asking import Field
 from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import (
     Belief,
@@ -10,7 +11,10 @@ from probewise.experiment.journal import (
     recording_of,
     require_same_settings,
 )
+from probewise.experiment.learning import AdjustedMixture, Change, sensor_prior
+from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
+from probewise.experiment.setting import Experiment, OneScan
 from probewise.experiment.simulation import (
     SHAPES,
     Model,
@@ -20,15 +24,18 @@ from probewise.experiment.simulation import (
     surface_of,
     world_like,
 )
-from probewise.experiment.values import PAPER_BITS, Experiment, Exploration, OneScan, State, Step
+from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 
 __all__ = [
     "PAPER_BITS",
     "SHAPES",
+    "AdjustedMixture",
     "Belief",
+    "Change",
     "Entry",
     "Experiment",
     "Exploration",
+    "Field",
     "Journal",
     "JournalWriter",
     "Model",
@@ -39,10 +46,12 @@ __all__ = [
     "begin",
     "experiment_for",
     "explore",
+    "least_readings",
     "read_journal",
     "recording_of",
     "require_same_settings",
     "run",
+    "sensor_prior",
     "shape_named",
     "step",
     "surface_of",

@@ -13,59 +13,70 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
 
-from probewise._arrays import BoolArray, FloatArray
-from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.arm.instrument import Instrument, Reading
 from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.experiment.asking import Field, inquire, next_poses
 from probewise.experiment.journal import (
-    PATTERN,
     Belief,
     Journal,
     JournalWriter,
     read_journal,
     require_same_settings,
 )
-from probewise.experiment.values import Experiment, Exploration, State, Step, widest_mm
+from probewise.experiment.judging import doubt, fit, information, learnt, moments, stop_reason
+from probewise.experiment.particles import prior_particles, update
+from probewise.experiment.setting import Experiment
+from probewise.experiment.values import Exploration, State, Step
 from probewise.inference.problem import SensorProblem
-from probewise.inquiry import EntropyMap, bits_gained, entropy_map, prior_entropy
-from probewise.nested.kernels import KernelMove, diversify_by_kernels
+from probewise.inquiry import bits_gained, prior_entropy
+from probewise.nested.kernels import KernelMove
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import run as run_nested
 from probewise.nested.stop import RemainingEvidence
-from probewise.scene.shapes import AnyOf
 
 __all__ = ["begin", "explore", "run", "step"]
 
-NO_FIT = 1e-6  # below this probability of the best hypothesis a step says that none explains the readings
-
 DLOGZ = 0.5  # the last live points are posterior samples too: letting them die one by one would only refine log Z
-N_KERNELS = 100  # posterior samples that proposals stand about
 
 
-def begin(experiment: Experiment, reachable: BoolArray, *, rng: np.random.Generator) -> State:
+def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> State:
     """Choose the first place: the map of hypotheses drawn from the prior.
 
     Parameters
     ----------
     experiment
         What is asked.
-    reachable
-        Places of the grid that the arm can take, (n_places,).
+    field
+        Where the arm can go, and how long it takes.
     rng
         Source of randomness.
+
+    Raises
+    ------
+    ReachError
+        If no place is reachable.
+    ParameterError
+        If the prior has no mass, or every place promises the same.
     """
-    prior = experiment.prior
-    theta = prior.from_unit_cube(rng.random((experiment.n_samples, len(prior.names))))
-    outlook = _inquire(experiment, theta, reachable, time_s=0.0)
-    return State((), Pose(*outlook.choose(rng=rng)))
+    posterior = prior_particles(experiment.prior, experiment.n_particles, rng=rng)
+    prospect, outlook = inquire(experiment, posterior, field, at=None, rng=rng)
+    if outlook.flat:
+        raise ParameterError(
+            "utility",
+            f"{outlook.highest:g} everywhere",
+            "one that differs between places: as it is, no reading within reach is expected to tell anything; "
+            "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
+        )
+    pose, *planned = next_poses(experiment, prospect, outlook, rng=rng)
+    return State((), posterior, pose, tuple(planned))
 
 
 def step(
     state: State,
     reading: Reading,
     experiment: Experiment,
-    reachable: BoolArray,
+    field: Field,
     *,
     prior_bits: float,
     rng: np.random.Generator,
@@ -76,10 +87,10 @@ def step(
     Parameters
     ----------
     state
-        The readings so far.
+        The readings so far and the posterior given them.
     reading
         The new one.
-    experiment, reachable
+    experiment, field
         See `begin`.
     prior_bits
         Differential entropy of the prior, see `inquiry.prior_entropy`.
@@ -90,62 +101,61 @@ def step(
 
     Raises
     ------
+    ParameterError
+        If the reading is outside the sensor's range.
     NotConvergedError
         If no hypothesis could have given these readings.
     """
+    experiment.readout.require(reading.value)
     readings = (*state.readings, reading)
     problem = experiment.problem(readings)
     with warnings.catch_warnings():
         # Each step keeps its own doubts; a warning a reading would bury them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        posterior = run_nested(
+        posterior = update(
+            state.posterior,
             problem,
             rng=rng,
-            n_live=experiment.n_live,
-            move=KernelMove(),
-            stop=RemainingEvidence(DLOGZ),
-            return_interrupted=False,
+            fall_back=lambda: _from_scratch(problem, experiment, rng),
+            blocks=experiment.blocks,
         )
-    drawn = posterior.samples(experiment.n_samples, rng=rng)
-    cloud = posterior.samples(N_KERNELS, rng=rng)
-    samples, _ = diversify_by_kernels(drawn, cloud, problem, rng=rng, n_steps=experiment.n_diversify)
-    samples.flags.writeable = False
-    mean, sd, shapes = _moments(experiment, posterior)
-    p_value, worst = _fit(experiment, posterior, problem)
-    notes = posterior.warnings
-    if p_value < NO_FIT:
-        notes = (
-            *notes,
-            f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
-            f"({readings[worst].value:g}); the hypothesis space excludes what lies there, or the sensor model "
-            "leaves something out",
-        )
-    stop_reason = None
-    if experiment.is_known(sd, shapes):
-        stop_reason = f"every length is known to better than {experiment.stop_sd_mm:g} mm"
-    elif max_readings is not None and len(readings) >= max_readings:
-        widest = widest_mm(experiment.names, sd)
-        stop_reason = f"max_readings = {max_readings} is reached; the widest length is known to {widest:.1f} mm"
-    outlook = _inquire(experiment, samples, reachable, time_s=reading.time_s)
-    next_pose = Pose(*outlook.choose(rng=rng))
-    log_prior = problem.prior.log_prob(posterior.theta)
+    mean, sd, shapes = moments(experiment, posterior)
+    p_value, worst = fit(experiment, posterior, problem)
+    notes = () if posterior.run is None else posterior.run.warnings
+    if p_value < experiment.doubt_p:
+        notes = (*notes, doubt(p_value, worst, readings))
+    prospect, outlook = inquire(experiment, posterior, field, at=reading, rng=rng)
+    reason = stop_reason(experiment, sd, shapes, p_value, outlook, len(readings), max_readings)
+    pose, *planned = state.planned or next_poses(experiment, prospect, outlook, rng=rng)
     info = Step(
         number=len(readings),
         reading=reading,
-        names=experiment.names,
+        names=experiment.shape.prior.names,
         mean=mean,
         sd=sd,
         shapes=shapes,
-        samples=samples,
+        samples=prospect.drawn[:, experiment.shape_columns],
         map=outlook,
-        next_pose=None if stop_reason else next_pose,
-        bits=bits_gained(posterior.information, log_prior, posterior.weight, prior_bits),
+        next_pose=None if reason else pose,
+        bits=bits_gained(information(posterior), problem.prior.log_prob(posterior.theta), posterior.weight, prior_bits),
         p_value=p_value,
         posterior=posterior,
-        stop_reason=stop_reason,
+        sensor=learnt(experiment, posterior),
+        stop_reason=reason,
         notes=notes,
     )
-    return State(readings, next_pose), info
+    return State(readings, posterior, pose, tuple(planned)), info
+
+
+def _from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.Generator) -> NestedResult:
+    return run_nested(
+        problem,
+        rng=rng,
+        n_live=max(experiment.n_live, 2 * len(experiment.names)),
+        move=KernelMove(),
+        stop=RemainingEvidence(DLOGZ),
+        return_interrupted=False,
+    )
 
 
 def explore(
@@ -226,10 +236,10 @@ def _steps(
 ) -> Iterator[Step]:
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
     with _writer(path, before, experiment, seed) as writer:
-        reachable = np.asarray(instrument.reachable(experiment.grid.places_mm), dtype=np.bool_)
+        field = Field.under(instrument, experiment.grid)
         first = _rng_of(seed, 0)
         prior_bits = prior_entropy(experiment.prior, rng=first)
-        state = begin(experiment, reachable, rng=first)
+        state = begin(experiment, field, rng=first)
         stopped = False
         while not stopped:
             number = len(state.readings) + 1
@@ -241,13 +251,13 @@ def _steps(
                 state,
                 reading,
                 experiment,
-                reachable,
+                field,
                 prior_bits=prior_bits,
                 rng=_rng_of(seed, number),
                 max_readings=max_readings,
             )
             if writer is not None and (entry is None or entry.belief is None):
-                writer.belief(_belief(info, state.next_pose))
+                writer.belief(_belief(info, state))
             if entry is not None:
                 info = dataclasses.replace(info, replayed=True)
                 # The journal decides, also where another machine's arithmetic would choose another place.
@@ -280,43 +290,7 @@ def _rng_of(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 
-def _inquire(experiment: Experiment, theta: FloatArray, reachable: BoolArray, *, time_s: float) -> EntropyMap:
-    return entropy_map(
-        experiment.model,
-        theta,
-        experiment.grid,
-        experiment.grid.plan(PATTERN, time_s=time_s),
-        reachable=reachable,
-        noise_sd=experiment.noise_sd,
-        utility=experiment.utility,
-    )
-
-
-def _moments(experiment: Experiment, posterior: NestedResult) -> tuple[FloatArray, FloatArray, dict[str, float]]:
-    """Posterior mean and sd, (n_params,) both, and shape probabilities; of a set: given its most probable shape."""
-    if not isinstance(experiment.shape, AnyOf):
-        return posterior.mean(), posterior.sd(), {}
-    which, weight = experiment.shape.which(posterior.theta), posterior.weight
-    share = np.bincount(which, weights=weight, minlength=len(experiment.shape.labels))
-    likely = int(share.argmax())
-    columns = experiment.shape.prior.columns[likely]
-    theta = posterior.theta[np.ix_(which == likely, columns)]
-    given = weight[which == likely] / share[likely]
-    mean, sd = np.full((2, len(experiment.names)), np.nan)
-    mean[columns] = given @ theta
-    sd[columns] = np.sqrt(given @ (theta - mean[columns]) ** 2)
-    return mean, sd, dict(zip(experiment.shape.labels, (float(p) for p in share / share.sum()), strict=True))
-
-
-def _fit(experiment: Experiment, posterior: NestedResult, problem: SensorProblem) -> tuple[float, int]:
-    """How well the best hypothesis fits: upper tail of chi-square, and the reading it explains worst."""
-    recording = problem.recording
-    best = posterior.best()[None, :]
-    z = (recording.readings - problem.model.predict(best, recording.plan)[0]) / experiment.noise_sd
-    z = np.where(recording.usable, z, 0.0)
-    return float(chi2.sf(float(z @ z), max(int(recording.usable.sum()), 1))), int(np.argmax(np.abs(z)))
-
-
-def _belief(info: Step, next_pose: Pose) -> Belief:
+def _belief(info: Step, state: State) -> Belief:
     known = [(n, float(m), float(s)) for n, m, s in zip(info.names, info.mean, info.sd, strict=True) if np.isfinite(m)]
-    return Belief({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, next_pose)
+    known += [(name, mean, sd) for name, (mean, sd) in info.sensor.items()]
+    return Belief({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, state.next_pose)

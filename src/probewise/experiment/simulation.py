@@ -10,13 +10,14 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm import Pose, Reach, Reading, SimulatedArm
+from probewise.arm import LegoScale, Pose, Reach, Reading, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.effects import Known
 from probewise.errors import ParameterError
-from probewise.experiment.values import Experiment
-from probewise.inference import GaussianKnown, Naive
-from probewise.inquiry import Grid
+from probewise.experiment.learning import AdjustedMixture, sensor_prior
+from probewise.experiment.setting import Experiment
+from probewise.inference import Naive, Rounded
+from probewise.inquiry import Finishing, Grid, Utility
 from probewise.recordings import Disc, Polygon
 from probewise.scene import (
     AnyOf,
@@ -31,7 +32,7 @@ from probewise.scene import (
     Shape,
     outlines,
 )
-from probewise.sensor import FAST_NODES, Chain, FixedLevels, NaiveSensor, Stage, footprint_of, mean_mixture
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage, footprint_of, mean_mixture
 from probewise.world import Oval, Spot, Surface, World
 
 __all__ = ["SHAPES", "Model", "arm_over", "experiment_for", "shape_named", "surface_of", "world_like"]
@@ -54,9 +55,17 @@ def shape_named(names: Sequence[str], field: Field) -> Shape:
 
 
 def experiment_for(
-    sensor: FittedSensor, shape: Shape, field: Field, *, model: Model = "ssf", n_live: int = 200
+    sensor: FittedSensor,
+    shape: Shape,
+    field: Field,
+    *,
+    model: Model = "ssf",
+    n_live: int = 200,
+    utility: Utility | None = None,
+    learn_sensor: bool = False,
+    batch: int = 1,
 ) -> Experiment:
-    """Pose the experiment: a known sensor over a shape that is not known.
+    """Pose the experiment: a fitted sensor over a shape that is not known, read in whole LEGO units.
 
     Parameters
     ----------
@@ -71,16 +80,41 @@ def experiment_for(
     model
         "ssf" or "naive".
     n_live
-        Live points of nested sampling at every reading.
+        Live points of nested sampling, where a reading surprises.
+    utility
+        What a reading is worth; by default its expected information and, near the end, whether it ends the run.
+    learn_sensor
+        Infer the SSF's size and place and the two levels along with the shape, from a prior about the
+        calibration (see `sensor_prior`); for the SSF model.
+    batch
+        Readings that are chosen together.
     """
     means = sensor.mean()
     levels = FixedLevels(means["I_min"], means["I_max"])
     scene = HypothesisScene(shape)
-    noise_sd = _lego_noise_sd(sensor)
+    noise_sd = float(sensor.noise_sd.mean())
     grid = Grid(field.width_mm, field.height_mm)
+    worth = Finishing() if utility is None else utility
+    lego = LegoScale()
+    ends = (lego.low, lego.high)
     if model == "naive":
-        likelihood = Naive(levels.i_min, noise_sd, levels.i_max, noise_sd)
-        return Experiment(shape, NaiveSensor(levels, scene), likelihood, noise_sd, grid, n_live=n_live)
+        if learn_sensor:
+            raise ParameterError("learn_sensor", learn_sensor, 'False with the model "naive", which has no SSF')
+        sd = math.hypot(noise_sd, 1 / math.sqrt(12))
+        likelihood = Naive(levels.i_min, sd, levels.i_max, sd)
+        return Experiment(
+            shape,
+            NaiveSensor(levels, scene),
+            likelihood,
+            noise_sd,
+            grid,
+            worth,
+            step=lego.step,
+            reading_range=ends,
+            batch=batch,
+            doubt_p=0.0,  # a reading on the edge never fits two levels, and the naive model knows no edge
+            n_live=n_live,
+        )
     n = sensor.n_gaussians
     mixture = mean_mixture(footprint_of(sensor.samples[:, : 6 * n], n), n_gaussians=n)
     effects = tuple(
@@ -88,13 +122,23 @@ def experiment_for(
         for effect in sensor.carried_effects
         if effect.stage is not Stage.NOISE  # readings far apart in place and time share no noise
     )
-    chain = Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES)
-    return Experiment(shape, chain, GaussianKnown(noise_sd), noise_sd, grid, n_live=n_live)
-
-
-def _lego_noise_sd(sensor: FittedSensor) -> float:
-    """Sd of one reading in whole LEGO units: the calibrated noise, and that of rounding to one unit."""
-    return math.hypot(float(sensor.noise_sd.mean()), 1 / math.sqrt(12))
+    if learn_sensor:
+        chain = Chain(AdjustedMixture(mixture), FreeLevels(), scene, effects, n_nodes=FAST_NODES)
+    else:
+        chain = Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES)
+    return Experiment(
+        shape,
+        chain,
+        Rounded(noise_sd, lego.step or 1.0, *ends),
+        noise_sd,
+        grid,
+        worth,
+        sensor_prior=sensor_prior(sensor) if learn_sensor else None,
+        step=lego.step,
+        reading_range=ends,
+        batch=batch,
+        n_live=n_live,
+    )
 
 
 def world_like(sensor: FittedSensor) -> World:
@@ -119,7 +163,15 @@ def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
     raise ParameterError("shape", name, "one whose outline is an ellipse or a polygon")
 
 
-def arm_over(world: World, surface: Surface, field: Field, *, seed: int, taken: Sequence[Reading] = ()) -> SimulatedArm:
+def arm_over(
+    world: World,
+    surface: Surface,
+    field: Field,
+    *,
+    seed: int,
+    taken: Sequence[Reading] = (),
+    workspace: Workspace | None = None,
+) -> SimulatedArm:
     """Stand the simulated arm over a surface.
 
     Parameters
@@ -131,6 +183,8 @@ def arm_over(world: World, surface: Surface, field: Field, *, seed: int, taken: 
         with the noise it would have had.
     taken
         Readings taken before.
+    workspace
+        Where the arm can go and how its sensor then stands; by default nearly everywhere, and never turned.
     """
     number = itertools.count(len(taken))
 
@@ -138,5 +192,5 @@ def arm_over(world: World, surface: Surface, field: Field, *, seed: int, taken: 
         rng = np.random.default_rng([seed, next(number)])
         return world.read(surface, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng)
 
-    reach = Reach((field.width_mm, field.height_mm))
+    reach = Reach((field.width_mm, field.height_mm)) if workspace is None else workspace
     return SimulatedArm(light, reach=reach, start_s=taken[-1].time_s if taken else 0.0)

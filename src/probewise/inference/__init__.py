@@ -8,6 +8,7 @@ from probewise.inference.gaussian import GaussianInferred, GaussianKnown
 from probewise.inference.naive import Naive
 from probewise.inference.noise_bounds import reading_span, sd_ceiling, sd_floor, student_t
 from probewise.inference.problem import Likelihood, Problem, SensorProblem
+from probewise.inference.rounded import Rounded
 from probewise.inference.student_t import PooledSigma, StudentT, log_sigma_integral
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "Naive",
     "PooledSigma",
     "Problem",
+    "Rounded",
     "SensorProblem",
     "StudentT",
     "log_sigma_integral",

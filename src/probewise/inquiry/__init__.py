@@ -1,28 +1,77 @@
-"""Choose the next measurement by the entropy map (paper, the machine learning system, figures 3 and 8).
+"""Choose the next measurement (paper, the machine learning system, figures 3 and 8).
 
-Hypotheses drawn from the posterior predict a reading at every place of a fine grid; where
-their predictions differ most, a reading tells most. The worth of a set of predictions is a
-small function behind one seam, `Utility`; the paper's is `ReadingEntropy`.
+Hypotheses that are still believed predict a reading at every place of a fine grid; where
+their predictions differ most, a reading tells most. The worth of a reading is a small function
+behind one seam, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses; `InformationGain`
+asks the whole posterior and leaves out what is only noise.
 """
 
+from probewise.inquiry.batch import choose_several
+from probewise.inquiry.bound import Bound, capacity_bits, fewest_readings, target_entropy
 from probewise.inquiry.choice import best_places, choose
-from probewise.inquiry.entropy_map import EntropyMap, entropy_map
+from probewise.inquiry.designs import Design, Designs
+from probewise.inquiry.discs import DiscTable
+from probewise.inquiry.finishing import Finishing
+from probewise.inquiry.forecast import AskedForecast, DiscForecast, Forecast, Outlook, forecast_of
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.information import bits_gained, gaussian_entropy, neighbour_entropy, prior_entropy
-from probewise.inquiry.utility import Prospect, ReadingEntropy, Utility, label_entropy
+from probewise.inquiry.labels import FunctionValue, Label, ParameterValue, WhichShape
+from probewise.inquiry.named import UTILITY_NAMES, utility_named
+from probewise.inquiry.prospect import Goal, Prospect
+from probewise.inquiry.readout import Readout, entropy_bits
+from probewise.inquiry.telling_apart import Rival, tell_apart
+from probewise.inquiry.utility import (
+    InformationAbout,
+    InformationGain,
+    PerSecond,
+    ReadingEntropy,
+    Utility,
+    label_entropy,
+)
+from probewise.inquiry.utility_map import UtilityMap, entropy_map, reachable_rows, utility_map
 
 __all__ = [
-    "EntropyMap",
+    "UTILITY_NAMES",
+    "AskedForecast",
+    "Bound",
+    "Design",
+    "Designs",
+    "DiscForecast",
+    "DiscTable",
+    "Finishing",
+    "Forecast",
+    "FunctionValue",
+    "Goal",
     "Grid",
+    "InformationAbout",
+    "InformationGain",
+    "Label",
+    "Outlook",
+    "ParameterValue",
+    "PerSecond",
     "Prospect",
     "ReadingEntropy",
+    "Readout",
+    "Rival",
     "Utility",
+    "UtilityMap",
+    "WhichShape",
     "best_places",
     "bits_gained",
+    "capacity_bits",
     "choose",
+    "choose_several",
+    "entropy_bits",
     "entropy_map",
+    "fewest_readings",
+    "forecast_of",
     "gaussian_entropy",
     "label_entropy",
     "neighbour_entropy",
     "prior_entropy",
+    "reachable_rows",
+    "target_entropy",
+    "tell_apart",
+    "utility_map",
+    "utility_named",
 ]

@@ -24,12 +24,7 @@ def best_places(utility: FloatArray, reachable: BoolArray) -> BoolArray:
     if utility.shape != reachable.shape or utility.ndim != 1:
         raise ShapeError(f"utility {utility.shape} and reachable {reachable.shape}; allowed: both (n_places,)")
     if not reachable.any():
-        raise ReachError(
-            "reachable places",
-            0,
-            f"at least one of the {reachable.size} places of the field; "
-            "is the field where the arm stands, and is its reach in millimetres?",
-        )
+        raise ReachError("reachable", 0, f"at least one of {reachable.size} that can be reached")
     require_finite("utility", utility[reachable])
     best = reachable & (utility >= utility[reachable].max() - TIE)
     return np.asarray(best)

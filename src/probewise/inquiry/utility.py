@@ -1,46 +1,31 @@
-"""How much a reading at each place would be worth: one small function a utility, behind one seam."""
+"""How much a reading at each design would be worth: one small function a utility, behind one seam."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, require_finite
-from probewise.errors import ParameterError, ShapeError
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.inquiry.labels import Label
+from probewise.inquiry.prospect import Prospect
 
-__all__ = ["Prospect", "ReadingEntropy", "Utility"]
-
-
-@dataclass(frozen=True, eq=False)
-class Prospect:
-    """What may be read at each place, by every hypothesis that is still believed.
-
-    `predicted` holds noise-free readings, shape (n_samples, n_places); `noise_sd` the sd of
-    the noise on each, broadcastable to that shape.
-    """
-
-    predicted: FloatArray
-    noise_sd: FloatArray
-
-    def __post_init__(self) -> None:
-        if self.predicted.ndim != 2 or 0 in self.predicted.shape:
-            raise ShapeError(f"predicted has shape {self.predicted.shape}; allowed: (n_samples, n_places), none empty")
-        require_finite("predicted", self.predicted)
+__all__ = ["InformationAbout", "InformationGain", "PerSecond", "ReadingEntropy", "Utility", "label_entropy"]
 
 
 class Utility(Protocol):
-    """Worth of a reading at each place; more is better. A frozen dataclass, so that a journal can name it."""
+    """Worth of a reading at each design; more is better. A frozen dataclass, so that a journal can name it."""
 
     def __call__(self, prospect: Prospect) -> FloatArray:
-        """Value every place, predictions (n_samples, n_places) -> (n_places,)."""
+        """Value every design that can be taken, (n,)."""
         ...
 
 
 @dataclass(frozen=True)
 class ReadingEntropy:
-    """Shannon entropy, in bits, of the readings that the hypotheses predict (paper, the machine learning system).
+    """Shannon entropy, in bits, of the readings that a few hypotheses predict (paper, the machine learning system).
 
     The predictions are noise-free and fall into fixed bins, `bin_width` wide and centred on
     its multiples: one LEGO unit rounds as the sensor does. For the naive model there are two
@@ -55,8 +40,57 @@ class ReadingEntropy:
             raise ParameterError("bin_width", self.bin_width, "finite, greater than 0")
 
     def __call__(self, prospect: Prospect) -> FloatArray:
-        """Entropy in bits at every place, (n_samples, n_places) -> (n_places,)."""
+        """Entropy in bits at every design, (n,)."""
         return label_entropy(np.rint(prospect.predicted / self.bin_width))
+
+
+@dataclass(frozen=True)
+class InformationGain:
+    """Expected information, in bits, about all parameters together (Lindley 1956).
+
+    The entropy of what may be read (uncertain parameters, noise, rounding and range together) less
+    the entropy of the noise, which is all that would be left if the parameters were known.
+    """
+
+    def __call__(self, prospect: Prospect) -> FloatArray:
+        """Bits at every design, (n,)."""
+        return prospect.information(prospect.weight)
+
+
+@dataclass(frozen=True)
+class InformationAbout:
+    """Expected information, in bits, about what a label tells apart: a function of the parameters, the kind of shape.
+
+    The entropy of what may be read, less that which is left when the label is known: what the
+    hypotheses of one label disagree on among themselves is of no interest.
+    """
+
+    label: Label
+
+    def __call__(self, prospect: Prospect) -> FloatArray:
+        """Bits at every design, (n,)."""
+        labels = self.label(prospect.names, prospect.theta, prospect.weight)
+        bits = prospect.reading_entropy(prospect.outlook.mass(prospect.weight))
+        for value in np.unique(labels):
+            weight = np.where(labels == value, prospect.weight, 0.0)
+            if weight.sum() > 0:
+                bits -= weight.sum() * prospect.reading_entropy(prospect.outlook.mass(weight))
+        return np.maximum(bits, 0.0)
+
+
+@dataclass(frozen=True)
+class PerSecond:
+    """Worth of a reading over the seconds that it takes, travel included."""
+
+    of: Utility = field(default_factory=InformationGain)
+
+    def __call__(self, prospect: Prospect) -> FloatArray:
+        """Worth a second at every design, (n,)."""
+        if not (prospect.cost_s > 0).all():
+            raise ParameterError(
+                "cost_s", float(prospect.cost_s.min()), "greater than 0: a reading takes time where the arm stands, too"
+            )
+        return self.of(prospect) / prospect.cost_s
 
 
 def label_entropy(labels: FloatArray) -> FloatArray:

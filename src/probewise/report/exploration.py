@@ -100,7 +100,7 @@ def found_shape(run: Exploration) -> str:
     shape = run.experiment.shape
     if not isinstance(shape, AnyOf):
         return "a " + type(shape).__name__.replace("RegularPolygon", "regular polygon").lower()
-    which = shape.which(run.posterior.theta)
+    which = shape.which(run.posterior.theta[:, run.experiment.shape_columns])
     share = np.bincount(which, weights=run.posterior.weight, minlength=len(shape.labels))
     best = int(np.argmax(share))
     return f"a {shape.labels[best]} (probability {number(float(share[best]), 3)})"

@@ -6,6 +6,7 @@ beside them progress towards the precision asked for, what a diagnosis found, an
 run of nested sampling.
 """
 
+from probewise.report.plots.arm import reach_map
 from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
@@ -13,6 +14,7 @@ from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
 from probewise.report.plots.scene import playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
+from probewise.report.plots.study import readings_needed, widths_of_runs
 from probewise.report.plots.verdict import hypothesis_probabilities
 from probewise.report.plots.witness import witness
 
@@ -29,11 +31,14 @@ __all__ = [
     "png",
     "posterior_widths",
     "predicted_against_recorded",
+    "reach_map",
     "readings_by_orientation",
+    "readings_needed",
     "residuals_against",
     "run_plot",
     "spatial_sensitivity",
     "ssf_by_order",
     "trace_plot",
+    "widths_of_runs",
     "witness",
 ]

@@ -1,0 +1,278 @@
+"""The arm's geometry as a value: from joint angles to a place and back, and how far each may go.
+
+A base turns about a vertical axis; an upper and a lower link move in the vertical plane that
+turns with it. Parallelograms carry the sensor's attitude from the base to the wrist, so that it
+looks straight down whatever the links do (paper: the trapezoidal linkage keeps it at nadir), and
+turns about the vertical with the base alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["JOINTS", "ROOM_COUNTS", "Geometry", "Joint", "wrapped"]
+
+JOINTS = ("base", "shoulder", "elbow")
+"""The joints in the order of the columns of all arrays of angles."""
+
+ROOM_COUNTS = 110
+"""How far a motor may have to go beyond a place, to come back to it from the right side."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint and the motor that turns it.
+
+    Parameters
+    ----------
+    port
+        The motor's, 0 to 2 for A to C.
+    gear_ratio
+        Turns of the motor for one of the joint; negative where they turn against each other.
+    home_rad
+        Where it stands when the motor's counter is 0.
+    low_rad, high_rad
+        As far as it may ever go.
+    play_rad
+        How far it can be moved while the motor holds; 0 where its weight keeps it on one side.
+    """
+
+    port: int
+    gear_ratio: float
+    home_rad: float
+    low_rad: float
+    high_rad: float
+    play_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.port not in (0, 1, 2):
+            raise ParameterError("port", self.port, "0 to 2, for A to C")
+        if not (math.isfinite(self.gear_ratio) and abs(self.gear_ratio) >= 0.1):
+            raise ParameterError("gear_ratio", self.gear_ratio, "a finite number, 0.1 or more in magnitude")
+        if not -2 * math.pi <= self.low_rad < self.high_rad <= 2 * math.pi:
+            raise ParameterError(
+                "low_deg, high_deg", _degrees(self.low_rad, self.high_rad), "-360 to 360, the low one below the high"
+            )
+        if not self.low_rad <= self.home_rad <= self.high_rad:
+            allowed = "an angle between low_deg and high_deg, {:g} to {:g}".format(
+                *_degrees(self.low_rad, self.high_rad)
+            )
+            raise ParameterError("home_deg", math.degrees(self.home_rad), allowed)
+        if not 0 <= self.play_rad < self.high_rad - self.low_rad:
+            raise ParameterError("play_deg", math.degrees(self.play_rad), "0 or more, less than the joint's range")
+
+    @property
+    def counts_per_rad(self) -> float:
+        """Counts of the motor, degrees of its shaft, for one radian of the joint."""
+        return math.degrees(self.gear_ratio)
+
+    def counts_at(self, angle_rad: float, side: int = 0) -> int:
+        """Count to which the motor must turn, arriving upwards (1) or downwards (-1), for the joint to be at an angle.
+
+        The joint lags behind by half the play; with side 0 it is in the middle of it, as at home.
+        """
+        return round((angle_rad + side * self.play_rad / 2 - self.home_rad) * self.counts_per_rad)
+
+    def angle_at(self, counts: float, side: int = 0) -> float:
+        """Angle of the joint whose motor arrived at a count; see `counts_at`."""
+        return self.home_rad + counts / self.counts_per_rad - side * self.play_rad / 2
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Every number of the arm as built; `read_geometry` takes them from a file.
+
+    Parameters
+    ----------
+    field_mm
+        Width and height of the field, whose lower left corner is the lab frame's origin.
+    axis_mm
+        Where the base's vertical axis stands.
+    shoulder_mm
+        From that axis forward to the shoulder's, and from the surface up to it.
+    links_mm
+        Shoulder to elbow, elbow to wrist.
+    elbow_is_relative
+        Whether the elbow's angle is that between the links; otherwise that of the lower link from the horizontal.
+    sensor_port
+        0 to 3, for inputs 1 to 4.
+    sensor_mm
+        From the wrist forward to the sensor's origin, and down to its face.
+    mounting_rad
+        The sensor's orientation is this plus the base's angle minus a right angle.
+    read_height_mm, travel_height_mm, lowest_mm
+        Height of the sensor's face above the surface when it reads and when the arm moves, and the least ever.
+    base, shoulder, elbow
+        The joints.
+    whole_percent
+        Whether readings are cut to whole percent, as the brick shows them.
+    """
+
+    field_mm: tuple[float, float]
+    axis_mm: tuple[float, float]
+    shoulder_mm: tuple[float, float]
+    links_mm: tuple[float, float]
+    elbow_is_relative: bool
+    sensor_port: int
+    sensor_mm: tuple[float, float]
+    mounting_rad: float
+    read_height_mm: float
+    travel_height_mm: float
+    lowest_mm: float
+    base: Joint
+    shoulder: Joint
+    elbow: Joint
+    whole_percent: bool = True
+
+    def __post_init__(self) -> None:
+        finite = (*self.field_mm, *self.axis_mm, *self.shoulder_mm, *self.links_mm, *self.sensor_mm, self.mounting_rad)
+        if not all(math.isfinite(number) for number in finite):
+            raise ParameterError("geometry", finite, "finite numbers")
+        for name, value in (("field_mm", min(self.field_mm)), ("links_mm", min(self.links_mm))):
+            if not value > 0:
+                raise ParameterError(name, value, "greater than 0")
+        if not 0 < self.lowest_mm < self.read_height_mm < self.travel_height_mm < math.inf:
+            raise ParameterError(
+                "lowest_mm, read_height_mm, travel_height_mm",
+                (self.lowest_mm, self.read_height_mm, self.travel_height_mm),
+                "heights above 0, each above the one before",
+            )
+        if self.sensor_port not in range(4):
+            raise ParameterError("sensor port", self.sensor_port, "0 to 3, for 1 to 4")
+        if len({joint.port for joint in self.joints}) < len(self.joints):
+            raise ParameterError("ports", tuple("ABC"[j.port] for j in self.joints), "a port of its own for each joint")
+
+    @property
+    def joints(self) -> tuple[Joint, Joint, Joint]:
+        """Base, shoulder and elbow."""
+        return self.base, self.shoulder, self.elbow
+
+    @property
+    def nearest_mm(self) -> float:
+        """How near to the axis the sensor can come, at the height at which it reads."""
+        return float(self._ring_mm()[0])
+
+    @property
+    def farthest_mm(self) -> float:
+        """How far from the axis the sensor can come, at the height at which it reads."""
+        return float(self._ring_mm()[1])
+
+    @property
+    def rest_mm(self) -> tuple[float, float]:
+        """Place of the sensor when all joints are at home."""
+        home = np.array([[joint.home_rad for joint in self.joints]])
+        x_mm, y_mm, _ = self.position_mm(home)[0]
+        return float(x_mm), float(y_mm)
+
+    def position_mm(self, angles_rad: FloatArray) -> FloatArray:
+        """Place the sensor's face, lab frame and height: joint angles (n, 3) to (n, 3)."""
+        base, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
+        lower = shoulder + elbow if self.elbow_is_relative else elbow
+        upper_mm, lower_mm = self.links_mm
+        away = self.shoulder_mm[0] + upper_mm * np.cos(shoulder) + lower_mm * np.cos(lower) + self.sensor_mm[0]
+        height = self.shoulder_mm[1] + upper_mm * np.sin(shoulder) + lower_mm * np.sin(lower) - self.sensor_mm[1]
+        x_mm, y_mm = self.axis_mm
+        return np.stack([x_mm + away * np.cos(base), y_mm + away * np.sin(base), height], axis=-1)
+
+    def rise_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
+        """Tell how the sensor rises with each joint's angle: joint angles (n, 3) to (n, 3), mm a radian."""
+        _, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
+        lower = shoulder + elbow if self.elbow_is_relative else elbow
+        upper_rise, lower_rise = self.links_mm[0] * np.cos(shoulder), self.links_mm[1] * np.cos(lower)
+        both = upper_rise + lower_rise if self.elbow_is_relative else upper_rise
+        return np.stack([np.zeros_like(both), both, lower_rise], axis=-1)
+
+    def angles_rad(self, places_mm: FloatArray, height_mm: float) -> FloatArray:
+        """Find the joint angles that put the sensor there, elbow up.
+
+        Parameters
+        ----------
+        places_mm
+            Places, shape (n, 2), lab frame.
+        height_mm
+            Of the sensor's face above the surface.
+
+        Returns
+        -------
+        Angles, shape (n, 3); NaN in a row whose place is too far, too near, or beyond a joint's limits.
+        """
+        places = _columns(places_mm, 2)
+        dx, dy = places[:, 0] - self.axis_mm[0], places[:, 1] - self.axis_mm[1]
+        # Any turn that lies within the base's limits will do: -190 and 170 degrees are one direction.
+        base = self.base.low_rad + np.mod(np.arctan2(dy, dx) - self.base.low_rad, 2 * math.pi)
+        out = np.hypot(dx, dy) - self.shoulder_mm[0] - self.sensor_mm[0]
+        up = height_mm + self.sensor_mm[1] - self.shoulder_mm[1]
+        upper_mm, lower_mm = self.links_mm
+        span = np.hypot(out, up)
+        rise = np.arctan2(up, out)
+        with np.errstate(invalid="ignore", divide="ignore"):  # arccos beyond 1: too far or too near
+            shoulder = rise + np.arccos((upper_mm**2 + span**2 - lower_mm**2) / (2 * upper_mm * span))
+            lower = rise - np.arccos((lower_mm**2 + span**2 - upper_mm**2) / (2 * lower_mm * span))
+        elbow = lower - shoulder if self.elbow_is_relative else lower
+        angles = np.stack([base, shoulder, elbow], axis=-1)
+        angles[~self.allows(angles)] = np.nan
+        return angles
+
+    def holds(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n, 2), are on the field and leave the motors room to arrive: shape (n,)."""
+        places = _columns(places_mm, 2)
+        room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
+        read, travel = (self.angles_rad(places, height) for height in (self.read_height_mm, self.travel_height_mm))
+        roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
+        on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
+        return np.asarray(on_field & np.all(roomy, axis=0))
+
+    def allows(self, angles_rad: FloatArray) -> BoolArray:
+        """Tell which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
+        angles = _columns(angles_rad, 3)
+        low = np.array([joint.low_rad for joint in self.joints])
+        high = np.array([joint.high_rad for joint in self.joints])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((angles >= low) & (angles <= high)).all(axis=-1))
+
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n, 2): shape (n,), -pi to pi.
+
+        It turns with the base: mounting + base - a right angle.
+        """
+        places = _columns(places_mm, 2)
+        base = np.arctan2(places[:, 1] - self.axis_mm[1], places[:, 0] - self.axis_mm[0])
+        return wrapped(self.mounting_rad + base - math.pi / 2)
+
+    def sentence(self) -> str:
+        """Say where a place may be."""
+        (width, height), (x_mm, y_mm) = self.field_mm, self.axis_mm
+        return (
+            f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {self.nearest_mm:.0f} to "
+            f"{self.farthest_mm:.0f} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm, within its joints' limits"
+        )
+
+    def _ring_mm(self) -> tuple[float, float]:
+        """Least and greatest distance from the axis at the height of reading; NaN where there is none."""
+        middle = (self.base.low_rad + self.base.high_rad) / 2
+        away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
+        places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
+        within = away[np.isfinite(self.angles_rad(places, self.read_height_mm)).all(axis=-1)]
+        return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
+
+
+def wrapped(angle_rad: FloatArray) -> FloatArray:
+    """Bring angles, of any shape, into -pi to pi."""
+    return np.asarray(np.mod(angle_rad + math.pi, 2 * math.pi) - math.pi)
+
+
+def _columns(values: FloatArray, n: int) -> FloatArray:
+    rows = np.asarray(values, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != n:
+        raise ShapeError(f"the rows have shape {rows.shape}; allowed: (n, {n})")
+    return rows
+
+
+def _degrees(*angles_rad: float) -> tuple[float, ...]:
+    return tuple(round(math.degrees(angle), 6) for angle in angles_rad)

@@ -1,0 +1,127 @@
+"""An arm's geometry on file: TOML that a person can measure and write, every number checked."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from probewise.arm.geometry import JOINTS, Geometry, Joint
+from probewise.errors import FileError, ParameterError
+
+__all__ = ["FORMAT", "read_geometry", "shipped_geometry"]
+
+FORMAT = "arm/1"
+ELBOWS = ("absolute", "relative")
+LARGEST = 1e6
+
+
+def shipped_geometry() -> Path:
+    """Find the file that comes with the package: a LEGO arm over the paper's field, numbers plausible, not measured."""
+    return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
+
+
+def read_geometry(path: str | Path) -> Geometry:
+    """Read an arm's geometry, format "arm/1".
+
+    Raises
+    ------
+    FileError
+        If the file is missing or no TOML, a number is missing or not allowed, or a name is not known:
+        it names the file and the entry, what stood there and what is allowed.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error.strerror})", "an arm's geometry, TOML") from error
+    except UnicodeDecodeError as error:
+        raise FileError(path, "not UTF-8", "an arm's geometry, TOML in UTF-8") from error
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(path, f"not TOML ({error})", "an arm's geometry, TOML") from error
+    top = _Table(path, "", content)
+    if top.take("format") != FORMAT:
+        raise top.fail("format", f'"{FORMAT}"')
+    field, base, links, sensor = (top.table(name) for name in ("field", "base", "links", "sensor"))
+    joints = top.table("joints")
+    elbow = links.take("elbow")
+    if elbow not in ELBOWS:
+        raise links.fail("elbow", " or ".join(f'"{name}"' for name in ELBOWS))
+    port = sensor.take("port")
+    if port not in (1, 2, 3, 4) or isinstance(port, bool | float):
+        raise sensor.fail("port", "1, 2, 3 or 4")
+    whole = sensor.take("whole_percent")
+    if not isinstance(whole, bool):
+        raise sensor.fail("whole_percent", "true or false")
+    tables = {name: joints.table(name) for name in JOINTS}
+    try:
+        geometry = Geometry(
+            field_mm=(field.number("width_mm"), field.number("height_mm")),
+            axis_mm=(base.number("x_mm"), base.number("y_mm")),
+            shoulder_mm=(base.number("shoulder_forward_mm"), base.number("shoulder_height_mm")),
+            links_mm=(links.number("upper_mm"), links.number("lower_mm")),
+            elbow_is_relative=elbow == "relative",
+            sensor_port=port - 1,
+            sensor_mm=(sensor.number("forward_mm"), sensor.number("drop_mm")),
+            mounting_rad=math.radians(sensor.number("mounting_deg")),
+            read_height_mm=sensor.number("read_height_mm"),
+            travel_height_mm=sensor.number("travel_height_mm"),
+            lowest_mm=sensor.number("lowest_mm"),
+            base=_joint(tables["base"]),
+            shoulder=_joint(tables["shoulder"]),
+            elbow=_joint(tables["elbow"]),
+            whole_percent=whole,
+        )
+    except ParameterError as error:
+        raise FileError(path, f"{error.name} is {error.value!r}", error.allowed) from error
+    for table in (top, field, base, links, sensor, joints, *tables.values()):
+        table.finish()
+    return geometry
+
+
+class _Table:
+    """One table of the file; entries are taken one by one, and none may be left."""
+
+    def __init__(self, path: Path, where: str, content: dict[str, Any]) -> None:
+        self.path, self.where, self.content = path, where, content
+        self._left = set(content)
+
+    def fail(self, name: str, allowed: str) -> FileError:
+        return FileError(self.path, f"{self.where}{name} is {self.content[name]!r}", allowed)
+
+    def take(self, name: str) -> Any:
+        if name not in self.content:
+            raise FileError(self.path, f"{self.where}{name} is missing", "every entry of the shipped lego_arm.toml")
+        self._left.discard(name)
+        return self.content[name]
+
+    def table(self, name: str) -> _Table:
+        content = self.take(name)
+        if not isinstance(content, dict):
+            raise self.fail(name, f"a table [{self.where}{name}]")
+        return _Table(self.path, f"{self.where}{name}.", content)
+
+    def number(self, name: str) -> float:
+        value = self.take(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            raise self.fail(name, f"a number of magnitude up to {LARGEST:g}")
+        return float(value)
+
+    def finish(self) -> None:
+        if self._left:
+            name = min(self._left)
+            known = ", ".join(sorted(set(self.content) - self._left))
+            raise FileError(self.path, f"{self.where}{name} is not known", f"the entries {known}")
+
+
+def _joint(table: _Table) -> Joint:
+    port = table.take("port")
+    if port not in ("A", "B", "C"):
+        raise table.fail("port", '"A", "B" or "C"')
+    ratio, *degrees = (table.number(f) for f in ("gear_ratio", "home_deg", "low_deg", "high_deg", "play_deg"))
+    try:
+        return Joint("ABC".index(port), ratio, *(math.radians(angle) for angle in degrees))
+    except ParameterError as error:
+        raise FileError(table.path, f"{table.where}{error.name} is {error.value!r}", error.allowed) from error

@@ -1,0 +1,305 @@
+"""The LEGO arm as an instrument: over the field at travel height, down to read, up again (paper, test bed)."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.arm.basics import Clock, Side
+from probewise.arm.geometry import Geometry, wrapped
+from probewise.arm.instrument import Pose, Reading
+from probewise.arm.machine import Machine
+from probewise.arm.scale import LegoScale
+from probewise.errors import LinkError, ReachError
+
+__all__ = ["LegoArm"]
+
+BASE, SHOULDER, ELBOW = range(3)
+N_RISES = 3  # rough moves, of which the first one or two may stop short
+NEAR_TRAVEL_MM = 10.0  # a sensor not farther below the height of travel is raised
+CLEAR_MM = 1.0  # a way may lead so much lower than its end
+N_TRIED = 361  # angles looked at for the way up
+SAME_TURN_RAD = math.radians(1.0)
+# A measurement takes about so long, on the emulator: joints move one after another, and each takes time to stop.
+COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.0
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Where a joint is to go: the count of its motor, and the side from which its angle arrives (1 upwards)."""
+
+    counts: int
+    side: Side
+
+
+class LegoArm:
+    """An arm of two links on a turning base, its sensor straight down: an Instrument.
+
+    Parameters
+    ----------
+    machine
+        What moves it; entered and left with the arm.
+    geometry
+        The arm as built.
+    clock
+        What readings are stamped with.
+    start_s
+        What the stamps start at, to go on where an earlier run ended.
+
+    Attributes
+    ----------
+    turned_rad
+        How far the sensor has been turned on its mount, by hand, from where the geometry has it.
+    """
+
+    def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
+        self._machine, self.geometry, self._clock = machine, geometry, clock
+        self._zero_s = clock.monotonic() - start_s
+        self._scale = LegoScale(step=1.0 if geometry.whole_percent else None)
+        self._is_down = False
+        self._arrived: list[int] = [0, 0, 0]  # from which side each joint came to where it stands
+        self.turned_rad = 0.0
+
+    def __enter__(self) -> Self:
+        self._machine.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Raise the sensor where it is down, then let the machine release the motors; after an exception only that."""
+        try:
+            if error is None and self._is_down:
+                self.rise()
+        except BaseException as failure:
+            self._machine.__exit__(type(failure), failure, failure.__traceback__)
+            raise
+        self._machine.__exit__(kind, error, trace)
+
+    @property
+    def angles_rad(self) -> FloatArray:
+        """Where the joints stand by their motors' counters, shape (3,)."""
+        joints, counts = self.geometry.joints, self._machine.limits.counts
+        return np.array([joints[k].angle_at(counts[k], self._arrived[k]) for k in (BASE, SHOULDER, ELBOW)])
+
+    @property
+    def position_mm(self) -> FloatArray:
+        """Where the sensor's face is, lab frame and height, shape (3,)."""
+        return np.asarray(self.geometry.position_mm(self.angles_rad[None, :])[0])
+
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n_places, 2): shape (n_places,)."""
+        return wrapped(self.geometry.orientation_rad(places_mm) + self.turned_rad)
+
+    def reachable(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n_places, 2), the arm can take: shape (n_places,)."""
+        return self.geometry.holds(places_mm)
+
+    def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
+        """Seconds, about, to move from `start` to each place and read there, shape (n_places,); NaN out of reach."""
+        there = self.geometry.angles_rad(places_mm, self.geometry.travel_height_mm)
+        here = self.geometry.angles_rad(np.array([[start.x_mm, start.y_mm]]), self.geometry.travel_height_mm)
+        counts = np.abs(there - here) * [abs(joint.counts_per_rad) for joint in self.geometry.joints]
+        moves = np.where(counts < 1, 0.0, counts / COUNTS_S + STOP_S)
+        return np.asarray(moves.sum(axis=-1) + READ_S)
+
+    def measure(self, pose: Pose) -> Reading:
+        """Move there, lower, read, raise.
+
+        Returns
+        -------
+        The reading, with the pose that the motors' counters show (counts are whole, and an arm stops where it can),
+        and the covariates `height_mm`, `battery_mv`.
+
+        Raises
+        ------
+        ReachError
+            If the arm cannot take the pose; nothing moves.
+        LinkError
+            If the brick does not answer, or a motor does not move.
+        """
+        place = np.array([[pose.x_mm, pose.y_mm]])
+        if not self.geometry.holds(place)[0]:
+            raise ReachError("pose", pose, self.geometry.sentence())
+        stands = float(self.orientation_rad(place)[0])
+        if not abs(float(wrapped(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
+            raise ReachError(
+                "pose",
+                pose,
+                f"orientation_rad {stands:.4f} there: this arm has no wrist, its sensor turns with the base",
+            )
+        self.go_down(pose.x_mm, pose.y_mm)
+        value = self._machine.read_percent()
+        if self.geometry.whole_percent and math.isfinite(value):
+            value = math.floor(value)  # the brick cuts fractions off
+        time_s = self._clock.monotonic() - self._zero_s
+        covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": self._machine.battery_mv()}
+        there = self._pose()
+        # The reading is here. A line that dies now shows at the next move, which starts with raising.
+        with contextlib.suppress(LinkError):
+            self.rise()
+        return Reading(value=self._scale.convert(value), pose=there, time_s=time_s, covariates=covariates)
+
+    def go_over(self, x_mm: float, y_mm: float) -> None:
+        """Bring the sensor over a place, at about the height of travel.
+
+        Raises
+        ------
+        ReachError
+            If the arm cannot take the place.
+        """
+        goals = self._goals(x_mm, y_mm, self.geometry.travel_height_mm)
+        self.rise()
+        self._arrive(BASE, goals[BASE])
+        for joint in self._order(goals):
+            self._near(joint, goals[joint].counts)
+
+    def go_down(self, x_mm: float, y_mm: float) -> None:
+        """Bring the sensor over a place and down to the height of reading.
+
+        Raises
+        ------
+        ReachError
+            If the arm cannot take the place.
+        """
+        goals = self._goals(x_mm, y_mm, self.geometry.read_height_mm)
+        self.rise()
+        self._arrive(BASE, goals[BASE])
+        self._is_down = True
+        for joint in self._order(goals):
+            self._arrive(joint, goals[joint])
+
+    def rise(self) -> None:
+        """Raise the sensor to about the height of travel where it is lower, by the link that turns least for it.
+
+        Raises
+        ------
+        ReachError
+            If neither link alone can raise it.
+        """
+        for _ in range(N_RISES):
+            if self.position_mm[2] >= self.geometry.travel_height_mm - NEAR_TRAVEL_MM:
+                break
+            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._way_up(joint)) is not None]
+            if not ways:
+                stand = np.degrees(self.angles_rad).round(1).tolist()
+                raise ReachError("joints", stand, "angles from which the sensor can rise; bring the arm home by hand")
+            _, joint, goal = min(ways)
+            self._near(joint, goal)
+        self._is_down = False
+
+    def home(self) -> None:
+        """Bring all joints to where their counters are 0."""
+        self.rise()
+        goals = [Goal(0, side) for side in self._sides(np.array([joint.home_rad for joint in self.geometry.joints]))]
+        self._arrive(BASE, goals[BASE])
+        for joint in self._order(goals):
+            self._arrive(joint, goals[joint])
+
+    def set_home(self) -> None:
+        """Take where the arm stands for home: a person has brought it there."""
+        self._machine.reset()
+
+    def release(self) -> None:
+        """Let all joints move freely."""
+        self._machine.release()
+
+    def read_here(self) -> float:
+        """Read the sensor where it stands: 0 to 100 in all steps that it has."""
+        return self._machine.read_percent()
+
+    def battery_mv(self) -> float:
+        """Read the battery's voltage."""
+        return self._machine.battery_mv()
+
+    def keep_awake(self) -> None:
+        """Keep the brick from falling asleep: to be called now and then while nothing else happens for minutes."""
+        self._machine.keep_awake()
+
+    def turn(self, joint: int, by_rad: float) -> None:
+        """Turn one joint by an angle from where it stands, behind the guard."""
+        angles = self.angles_rad
+        angles[joint] += by_rad
+        self._arrive(joint, self._goals_at(angles)[joint])
+
+    def _pose(self) -> Pose:
+        """Where the sensor is by the motors' counters."""
+        angles = self.angles_rad
+        x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0]
+        standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
+        return Pose(float(x_mm), float(y_mm), float(wrapped(standing)))
+
+    def _goals(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
+        angles = self.geometry.angles_rad(np.array([[x_mm, y_mm]]), height_mm)[0]
+        if not np.isfinite(angles).all():
+            raise ReachError("place", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())
+        return self._goals_at(angles)
+
+    def _goals_at(self, angles_rad: FloatArray) -> list[Goal]:
+        return [
+            Goal(joint.counts_at(float(angle), side), side)
+            for joint, angle, side in zip(self.geometry.joints, angles_rad, self._sides(angles_rad), strict=True)
+        ]
+
+    def _sides(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
+        """Choose the side from which each joint arrives at these angles, (3,).
+
+        The links come down on a place, so that nothing ever comes up from below it, and their weight and their
+        motors lay the play on the same flank; the base could come from either side.
+        """
+        _, shoulder, elbow = self.geometry.rise_mm_rad(angles_rad[None, :])[0]
+        return 1, (-1 if shoulder > 0 else 1), (-1 if elbow > 0 else 1)
+
+    def _order(self, goals: Sequence[Goal]) -> tuple[int, int]:
+        """Order the two links so that the sensor stays highest while one moves after the other.
+
+        While the lower link swings through the vertical the sensor is far down. Where neither order leaves
+        it room, the upper link goes up first and comes down last.
+        """
+        orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
+        ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
+        lowest_mm = [self._heights_mm(way).min() for way in ways]
+        end_mm = self._heights_mm(ways[0])[-1]
+        if max(lowest_mm) > end_mm - CLEAR_MM:
+            return orders[int(np.argmax(lowest_mm))]
+        self._near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
+        return ELBOW, SHOULDER
+
+    def _heights_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
+        """Heights of the sensor along a way, from where the motors stand to one count after another."""
+        counts = list(self._machine.limits.counts)
+        heights = []
+        for joint, goal in way:
+            heights.append(self._machine.limits.heights_mm(counts, joint, goal))
+            counts[joint] = goal
+        return np.concatenate(heights)
+
+    def _way_up(self, joint: int) -> tuple[int, int, int] | None:
+        """Find how one link alone can raise the sensor: counts to turn, joint, count to turn to."""
+        mechanics, stand = self.geometry.joints[joint], self.angles_rad
+        up = mechanics.low_rad if self._sides(stand)[joint] > 0 else mechanics.high_rad
+        angles = np.tile(stand, (N_TRIED, 1))
+        angles[:, joint] = np.linspace(stand[joint], up, N_TRIED)
+        high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)
+        if not high_enough.size:
+            return None
+        goal = mechanics.counts_at(float(angles[high_enough[0], joint]), self._arrived[joint])
+        return abs(goal - self._machine.limits.counts[joint]), joint, goal
+
+    def _arrive(self, joint: int, goal: Goal) -> None:
+        with_gears = self.geometry.joints[joint].gear_ratio > 0
+        side: Side = 1 if (goal.side > 0) == with_gears else -1
+        self._machine.move_to(joint, goal.counts, side)
+        self._arrived[joint] = goal.side
+
+    def _near(self, joint: int, counts: int) -> None:
+        self._machine.move_near(joint, counts)
+        self._arrived[joint] = 0

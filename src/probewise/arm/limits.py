@@ -1,0 +1,87 @@
+"""The guard: no motor goes where a joint or the sensor must not be, whoever asks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm.geometry import JOINTS, Geometry
+from probewise.errors import ReachError
+
+__all__ = ["SoftLimits"]
+
+N_STOPS = 33  # places looked at along a move
+
+
+class SoftLimits:
+    """Know where the motors stand, and refuse every move that leaves what the geometry allows.
+
+    Parameters
+    ----------
+    geometry
+        The joints' limits, and how low the sensor may come.
+    """
+
+    def __init__(self, geometry: Geometry) -> None:
+        self._geometry = geometry
+        self._counts = [0, 0, 0]
+
+    def stands(self, joint: int, counts: int) -> None:
+        """Take note of where a joint's motor stands."""
+        self._counts[joint] = counts
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Where the motors stand."""
+        base, shoulder, elbow = self._counts
+        return base, shoulder, elbow
+
+    def heights_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
+        """Tell how high the sensor is while one joint moves from where all motors stand: shape (n_stops,).
+
+        Parameters
+        ----------
+        counts
+            Where the motors stand.
+        joint, to
+            The joint that moves, and to which count.
+        here
+            Where it starts, if not at its count.
+        """
+        joints = self._geometry.joints
+        way = np.empty((N_STOPS, 3))
+        way[:] = [mechanics.angle_at(count) for mechanics, count in zip(joints, counts, strict=True)]
+        start = joints[joint].angle_at(counts[joint] if here is None else here)
+        way[:, joint] = np.linspace(start, joints[joint].angle_at(to), N_STOPS)
+        return np.asarray(self._geometry.position_mm(way)[:, 2])
+
+    def check(self, joint: int, here: int, to: int) -> None:
+        """Refuse a move of one joint, all others standing still, that ends or passes where it must not.
+
+        A joint that is outside already may move back.
+
+        Raises
+        ------
+        ReachError
+            If the move is refused.
+        """
+        geometry, mechanics = self._geometry, self._geometry.joints[joint]
+        angle, start = mechanics.angle_at(to), mechanics.angle_at(here)
+        low, high = min(mechanics.low_rad, start), max(mechanics.high_rad, start)
+        if not low <= angle <= high:
+            raise ReachError(
+                JOINTS[joint],
+                f"{math.degrees(angle):.1f} degrees",
+                f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees",
+            )
+        heights = self.heights_mm(self.counts, joint, to, here)
+        floor = min(geometry.lowest_mm, float(heights[0]))
+        if heights.min() < floor:
+            raise ReachError(
+                f"the sensor's height while the {JOINTS[joint]} moves",
+                f"{heights.min():.0f} mm",
+                f"{geometry.lowest_mm:g} mm or more; is the arm where its counters say? home it",
+            )

@@ -1,0 +1,42 @@
+"""The LEGO NXT brick over Bluetooth: telegrams, their line, motors and light sensor (paper, "Robotic Arm Test Bed").
+
+Telegrams are pure values and bytes; the link asks and hears; motor, light sensor and brick say
+what a person means. Each can be used and tested without those above it.
+"""
+
+from probewise.arm.nxt.brick import Brick
+from probewise.arm.nxt.light import Light, LightReading, SensorError, normalized_of
+from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, Timing
+from probewise.arm.nxt.machine import BrickMachine
+from probewise.arm.nxt.motor import Drive, Guard, Motor, MotorError
+from probewise.arm.nxt.serial_port import SerialPort
+from probewise.arm.nxt.status import BrickError, NotYetError
+from probewise.arm.nxt.telegram import Reply, Request, Sent, decode, encode, framed
+from probewise.arm.nxt.wire import TelegramError
+
+__all__ = [
+    "Brick",
+    "BrickError",
+    "BrickMachine",
+    "ByteStream",
+    "Drive",
+    "Guard",
+    "Light",
+    "LightReading",
+    "Link",
+    "Motor",
+    "MotorError",
+    "NoAnswerError",
+    "NotYetError",
+    "Reply",
+    "Request",
+    "SensorError",
+    "Sent",
+    "SerialPort",
+    "TelegramError",
+    "Timing",
+    "decode",
+    "encode",
+    "framed",
+    "normalized_of",
+]

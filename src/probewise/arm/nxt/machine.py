@@ -1,0 +1,96 @@
+"""The machine that is a brick: the arm's three motors behind the guard, and its light sensor."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from functools import partial
+from types import TracebackType
+from typing import Self
+
+from probewise.arm.basics import Side
+from probewise.arm.geometry import Geometry
+from probewise.arm.limits import SoftLimits
+from probewise.arm.nxt.brick import Brick
+from probewise.arm.nxt.motor import Motor
+
+__all__ = ["BrickMachine"]
+
+
+class BrickMachine:
+    """A brick as the arm's geometry says it is wired.
+
+    Parameters
+    ----------
+    brick
+        The brick.
+    geometry
+        Which motor and sensor is where, and what the guard refuses.
+    """
+
+    def __init__(self, brick: Brick, geometry: Geometry) -> None:
+        self.brick = brick
+        self.limits = SoftLimits(geometry)
+        self._motors = [
+            brick.motor(joint.port, guard=partial(self.limits.check, k)) for k, joint in enumerate(geometry.joints)
+        ]
+        self._light = brick.light(geometry.sensor_port)
+
+    def __enter__(self) -> Self:
+        self.brick.__enter__()
+        try:
+            for joint, motor in enumerate(self._motors):
+                self.limits.stands(joint, motor.counts())
+            self._light.light_up()
+        except BaseException as error:
+            self.brick.__exit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop and release the motors."""
+        self.brick.__exit__(kind, error, trace)
+
+    def move_to(self, joint: int, goal: int, side: Side) -> None:
+        """Turn a joint's motor to a count, arriving in direction `side`, and hold it; see `Motor.move_to`."""
+        with self._watched(joint) as motor:
+            motor.move_to(goal, side)
+
+    def move_near(self, joint: int, goal: int) -> None:
+        """Turn a joint's motor to about a count, and hold it; see `Motor.move_near`."""
+        with self._watched(joint) as motor:
+            motor.move_near(goal)
+
+    def release(self) -> None:
+        """Let all motors turn freely; where they are turned to by hand shows at the next move."""
+        for motor in self._motors:
+            motor.release()
+
+    def reset(self) -> None:
+        """Take where all motors stand for 0."""
+        for joint, motor in enumerate(self._motors):
+            motor.reset()
+            self.limits.stands(joint, 0)
+
+    def read_percent(self) -> float:
+        """Read the light sensor, LED on."""
+        return self._light.read().fine_percent
+
+    def battery_mv(self) -> float:
+        """Read the battery's voltage."""
+        return self.brick.battery_mv()
+
+    def keep_awake(self) -> None:
+        """Keep the brick from falling asleep."""
+        self.brick.link.keep_awake()
+
+    @contextlib.contextmanager
+    def _watched(self, joint: int) -> Iterator[Motor]:
+        """Yield a motor, and tell the guard where it stands in the end, also where the move failed half way."""
+        motor = self._motors[joint]
+        try:
+            yield motor
+        finally:
+            self.limits.stands(joint, motor.last_counts)

@@ -1,0 +1,316 @@
+"""Turn a motor to a count and keep it there, given what the brick's firmware does with a limit.
+
+The firmware counts a limited move from its own running *target*, not from where the motor
+stands; at the target it lets go, and the motor runs on, *coasts*, by some counts. So the
+target is kept track of here, the coast is learned by direction and power, and every move is
+worked out from the count that was read last: a fast move that stops short, slow ones for the
+rest, always arriving from the same side, so that the play in the gears always lies on the same flank.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from probewise.arm.basics import Clock, Side
+from probewise.arm.nxt.link import Link, NoAnswerError
+from probewise.arm.nxt.telegram import (
+    GetOutputState,
+    OutputMode,
+    OutputState,
+    Regulation,
+    ResetMotorPosition,
+    RunState,
+    SetOutputState,
+)
+from probewise.arm.nxt.wire import TelegramError
+from probewise.errors import LinkError, ParameterError
+
+__all__ = ["Drive", "Guard", "Motor", "MotorError"]
+
+Guard: TypeAlias = Callable[[int, int], None]
+"""Raises ReachError where the motor may not go from one rotation count to another."""
+
+COUNTS_S = 10.0  # that one unit of power stands for
+START_S = 0.2  # two turns of the firmware's regulation: until a motor surely turns
+N_TRIES = 4  # to find the firmware's target
+MOVED_COUNTS = 5  # a motor that moved less did not turn
+DRIVEN = OutputMode.ON | OutputMode.BRAKE | OutputMode.REGULATED
+
+
+class MotorError(LinkError):
+    """Report a motor that does not get where it is sent: stuck, slipping, or not plugged in."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How a motor is driven; counts are degrees of its shaft.
+
+    Parameters
+    ----------
+    fast_power, slow_power
+        Power of the way, and of the last counts, 1 to 100: about 10 counts/s each.
+    coast_counts
+        First guess of how far it runs on after a fast move; slow ones in proportion.
+    tolerance_counts
+        A count so near to the goal is there.
+    lead_counts
+        How far to go back, at least, to arrive from the right side: more than the play.
+    runaway_counts
+        A motor that goes so much farther than it should is stopped.
+    settle_s
+        Wait before a count is taken for that of a motor at rest.
+    stuck_s
+        A running motor whose count does not change for so long is stuck.
+    n_moves
+        So many moves must do for one goal.
+    """
+
+    fast_power: int = 60
+    slow_power: int = 15
+    coast_counts: int = 60
+    tolerance_counts: int = 1
+    lead_counts: int = 30
+    runaway_counts: int = 100
+    settle_s: float = 0.2
+    stuck_s: float = 1.5
+    n_moves: int = 12
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.slow_power <= self.fast_power <= 100:
+            raise ParameterError(
+                "slow_power, fast_power",
+                (self.slow_power, self.fast_power),
+                "1 to 100, the fast one not below the slow",
+            )
+        for name in ("coast_counts", "tolerance_counts", "lead_counts", "runaway_counts", "settle_s"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(name, getattr(self, name), "0 or more")
+        for name in ("stuck_s", "n_moves"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "greater than 0")
+
+
+class Motor:
+    """One motor of a brick.
+
+    Parameters
+    ----------
+    link
+        The line to the brick.
+    port
+        0 to 2, for A to C.
+    guard
+        Asked before every move that a command could cause; None: anything goes.
+    drive
+        How it is driven; None: as a motor under a light load is.
+    clock
+        What is waited with.
+
+    Attributes
+    ----------
+    last_counts
+        The rotation counter as it was last read.
+    """
+
+    def __init__(
+        self, link: Link, port: int, *, guard: Guard | None = None, drive: Drive | None = None, clock: Clock = time
+    ) -> None:
+        self._link, self.port, self._guard, self._clock = link, port, guard, clock
+        self.drive = Drive() if drive is None else drive
+        self.last_counts = 0
+        self._target: int | None = None  # the firmware's, in rotation counts; None: not known
+        self._datum: int | None = None  # tacho counter minus rotation counter
+        self._arrived: Side | None = None  # from which side it came to where it stands
+        self._coast: dict[tuple[int, Side], float] = {}
+
+    @property
+    def letter(self) -> str:
+        """The port as it is written on the brick."""
+        return "ABC"[self.port]
+
+    def counts(self) -> int:
+        """Read the rotation counter."""
+        return self._state().rotation_counts
+
+    def reset(self) -> None:
+        """Take where it stands for 0."""
+        state = self._state()
+        self._link.ask(ResetMotorPosition(self.port, 0))
+        if self._target is not None:
+            self._target -= state.rotation_counts
+        self._datum = state.tacho_counts
+
+    def hold(self) -> None:
+        """Keep it where it is, against a load."""
+        self._link.ask(self._command(0, 0))
+
+    def release(self) -> None:
+        """Let it turn freely."""
+        self._link.ask(SetOutputState(self.port, 0, OutputMode.IDLE, Regulation.IDLE, 0, RunState.IDLE, 0))
+        self._arrived = None
+
+    def move_to(self, goal: int, side: Side) -> int:
+        """Turn to a count, arriving in direction `side`, and hold it there.
+
+        Returns
+        -------
+        The count at rest, within the tolerance of the goal.
+
+        Raises
+        ------
+        ReachError
+            If the guard refuses a move; nothing moves then.
+        MotorError
+            If it does not get there.
+        """
+        here = self.counts()
+        if self._target is None:
+            here = self._synchronise(side, here)
+        for _ in range(self.drive.n_moves):
+            ahead = side * (goal - here)
+            if abs(ahead) <= self.drive.tolerance_counts and self._arrived == side:
+                return here
+            here = (
+                self._approach(goal, side, here)
+                if ahead >= self.drive.lead_counts
+                else self._back_off(goal, side, here)
+            )
+        raise MotorError(
+            f"motor {self.letter} stands at {here} counts, not within {self.drive.tolerance_counts} of {goal}, after "
+            f"{self.drive.n_moves} moves; is something in its way, or a gear slipping?"
+        )
+
+    def move_near(self, goal: int) -> int:
+        """Turn to the neighbourhood of a count, by one fast move if it is not there, and hold; see `move_to`."""
+        here = self.counts()
+        side: Side = 1 if goal >= here else -1
+        if self._target is None:
+            here = self._synchronise(side, here)
+        target = goal - side * self._coasts(self.drive.fast_power, side)
+        if min(side * (target - here), side * (target - self._known_target)) > 0:
+            here = self._go(target, side, self.drive.fast_power, here)
+        return here
+
+    @property
+    def _known_target(self) -> int:
+        if self._target is None:
+            raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
+        return self._target
+
+    def _approach(self, goal: int, side: Side, here: int) -> int:
+        """Go on towards the goal: fast to a place well short of it, or slowly all the way."""
+        fast, slow = self.drive.fast_power, self.drive.slow_power
+        least = max(side * here, side * self._known_target) + 1  # a target behind this moves nothing
+        short = goal - side * (2 * self.drive.lead_counts + self._coasts(fast, side))
+        if side * short > least + self.drive.lead_counts:
+            return self._go(short, side, fast, here)
+        target = goal - side * self._coasts(slow, side)
+        return self._go(side * max(side * target, least), side, slow, here)
+
+    def _back_off(self, goal: int, side: Side, here: int) -> int:
+        """Go back behind the goal, far enough for a slow move to get going and take up the play."""
+        back: Side = 1 if side == -1 else -1
+        fast, slow = self.drive.fast_power, self.drive.slow_power
+        behind = goal - side * (self._coasts(slow, side) + 2 * self.drive.lead_counts)
+        least = max(back * here, back * self._known_target) + 1
+        short = behind + side * self._coasts(fast, back)
+        if back * short > least + self.drive.lead_counts:
+            return self._go(short, back, fast, here)
+        return self._go(back * max(back * behind, least), back, slow, here)
+
+    def _coasts(self, power: int, side: Side) -> int:
+        share = power / self.drive.fast_power
+        return round(self._coast.get((power, side), share * self.drive.coast_counts))
+
+    def _go(self, target: int, side: Side, power: int, here: int) -> int:
+        """Make one limited move to a target of the firmware's, and read where it led."""
+        stop = target + side * self._coasts(power, side)
+        if self._guard is not None:
+            self._guard(here, stop)
+        limit = side * (target - self._known_target)
+        try:
+            self._link.ask(self._command(side * power, limit))
+        except (NoAnswerError, TelegramError):
+            # Sent once and no more: the brick itself says whether it took it.
+            if self._state().limit_counts != limit:
+                return self._rest()
+        self._target = target
+        self._arrived = side
+        self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
+        trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, power)
+        here = self._rest()
+        if trouble:
+            self._target = None
+            raise MotorError(f"motor {self.letter} {trouble}; is it plugged in, and its way free?")
+        ran_on = side * (here - target)
+        learned = self._coast.get((power, side), ran_on)
+        self._coast[power, side] = (learned + ran_on) / 2
+        return here
+
+    def _synchronise(self, side: Side, here: int) -> int:
+        """Learn the firmware's target: it follows the motor while that turns without a limit.
+
+        A limit soon puts an end to that. It is sent twice and without waiting for answers, so that a
+        telegram that gets lost does not leave the motor running; what then happened tells which were lost.
+        """
+        slow, lead = self.drive.slow_power, self.drive.lead_counts
+        room = round(COUNTS_S * slow * START_S) + 2 * lead + self._coasts(slow, side)
+        for _ in range(N_TRIES):
+            side, start = self._free_side(here, room, side), here
+            self._link.tell(self._command(side * slow, 0))
+            self._clock.sleep(START_S)
+            self._link.tell(self._command(side * slow, lead))
+            self._link.tell(self._command(side * slow, lead))
+            trouble = self._await_idle(here, side * room, slow)
+            here = self._rest()
+            if not trouble and side * (here - start) >= MOVED_COUNTS:  # it stopped at its target
+                self._target = here - side * self._coasts(slow, side)
+                self._arrived = side
+                return here
+        raise MotorError(f"motor {self.letter} does not turn as it is told; is it plugged in, and its way free?")
+
+    def _free_side(self, here: int, room: int, side: Side) -> Side:
+        """Choose the side with room to turn a little; the guard's refusal where neither has."""
+        if self._guard is None:
+            return side
+        other: Side = 1 if side == -1 else -1
+        try:
+            self._guard(here, here + side * room)
+        except ParameterError:
+            self._guard(here, here + other * room)
+            return other
+        return side
+
+    def _await_idle(self, start: int, farthest: int, power: int) -> str:
+        """Wait for a limited move to end; say what is wrong where it sticks, or goes farther than it may."""
+        here, changed_at = start, self._clock.monotonic()
+        while (state := self._state()).run_state != RunState.IDLE:
+            now = self._clock.monotonic()
+            if state.rotation_counts != here:
+                here, changed_at = state.rotation_counts, now
+            if abs(here - start) > abs(farthest):
+                return f"runs on beyond {start + farthest} counts at power {power}"
+            if now - changed_at > self.drive.stuck_s:
+                return f"is stuck at {here} counts at power {power}"
+        return ""
+
+    def _rest(self) -> int:
+        """Hold, and read the count once it has settled."""
+        self.hold()
+        self._clock.sleep(self.drive.settle_s)
+        return self.counts()
+
+    def _state(self) -> OutputState:
+        state = self._link.ask(GetOutputState(self.port))
+        self.last_counts = state.rotation_counts
+        datum = state.tacho_counts - state.rotation_counts
+        if datum != self._datum:
+            # Somebody else set a counter back: what was known of the target is void.
+            self._target, self._datum = None, datum
+        return state
+
+    def _command(self, power: int, limit: int) -> SetOutputState:
+        return SetOutputState(self.port, power, DRIVEN, Regulation.SPEED, 0, RunState.RUNNING, limit)

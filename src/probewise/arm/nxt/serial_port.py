@@ -1,0 +1,79 @@
+"""The line itself: a serial port by pyserial, which only this file knows."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Self
+
+from probewise.errors import LinkError
+
+if TYPE_CHECKING:
+    import serial
+
+__all__ = ["SerialPort"]
+
+WRITE_S = 2.0
+
+
+class SerialPort:
+    """A serial port in raw mode: /dev/rfcomm0, COM5, /dev/tty.NXT-DevB, a pseudo-terminal."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        self._port = port
+
+    @classmethod
+    def open(cls, path: str) -> Self:
+        """Open a port, for this program alone.
+
+        Raises
+        ------
+        LinkError
+            If pyserial is not installed, or the port cannot be opened.
+        """
+        try:
+            import serial
+        except ImportError as error:
+            raise LinkError(
+                "the NXT needs pyserial, which is not installed; pip install 'probewise[nxt]' brings it"
+            ) from error
+        # A radio serial port has no baud rate; a pseudo-terminal on some systems refuses exclusive locks.
+        try:
+            return cls(serial.Serial(path, timeout=0, write_timeout=WRITE_S, exclusive=True))
+        except (OSError, ValueError) as error:
+            raise LinkError(
+                f"{path} cannot be opened ({_reason(error)}); is the brick on, paired and bound to that port, "
+                "and does no other program use it?"
+            ) from error
+
+    @property
+    def name(self) -> str:
+        """The port's path."""
+        return str(self._port.name)
+
+    def read(self, size: int, timeout_s: float) -> bytes:
+        """Return up to `size` bytes, fewer where no more come within `timeout_s`."""
+        try:
+            self._port.timeout = timeout_s
+            return bytes(self._port.read(size))
+        except OSError as error:
+            raise self._cut(error) from error
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes."""
+        try:
+            self._port.write(data)
+        except OSError as error:
+            raise self._cut(error) from error
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._port.close()
+
+    def _cut(self, error: OSError) -> LinkError:
+        return LinkError(f"the line to the NXT on {self.name} is cut ({_reason(error)}); is the brick on and near?")
+
+
+def _reason(error: Exception) -> str:
+    """Say what the system says, without what pyserial puts around it."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else str(error)

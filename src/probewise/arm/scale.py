@@ -1,0 +1,35 @@
+"""The scale that both arms read in: LEGO units, whole numbers from 1 to 100 (paper, "Robotic Arm Test Bed")."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from probewise.errors import ParameterError
+
+__all__ = ["LegoScale"]
+
+
+@dataclass(frozen=True)
+class LegoScale:
+    """The brick's conversion: whole steps from `low` to `high`; `step` None leaves fractions."""
+
+    low: float = 1.0
+    high: float = 100.0
+    step: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ParameterError("low", self.low, f"less than high, {self.high:g}")
+        if self.step is not None and not self.step > 0:
+            raise ParameterError("step", self.step, "greater than 0, or None")
+
+    def convert(self, value: float) -> float:
+        """Round to a step, then keep within the scale; NaN, a reading that did not come, stays NaN."""
+        if math.isnan(value):
+            return value
+        value = min(max(value, self.low), self.high)
+        if self.step is not None:
+            value = round(value / self.step) * self.step
+        # A step that does not divide the range may have rounded past its end.
+        return min(max(value, self.low), self.high)

@@ -1,0 +1,184 @@
+"""Many independent tasks on any executor, one line of a file each: stopped at any moment, it goes on.
+
+Format "campaign/1". The first line says what the campaign is: whatever decides its results. Every
+further line is a finished task, its key and its result. Lines come in the order in which the tasks
+end; what is made of them is made in the order of the keys, so that it does not depend on the executor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self, TypeVar
+
+from probewise.errors import FileError, NotConvergedError, ParameterError
+from probewise.recordings import write_text_atomically
+
+__all__ = ["FORMAT", "Finished", "read_campaign", "run_campaign"]
+
+FORMAT = "campaign/1"
+T = TypeVar("T")
+Result = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a campaign's file holds: its settings, and the results by key, in the order of ending."""
+
+    settings: Mapping[str, Any]
+    results: Mapping[str, Result]
+
+
+def run_campaign(
+    work: Callable[[T], Result],
+    tasks: Mapping[str, T],
+    *,
+    path: str | os.PathLike[str],
+    settings: Mapping[str, Any],
+    executor: Executor | None = None,
+    progress: Callable[[str, Result], None] | None = None,
+) -> dict[str, Result]:
+    """Do every task that the file does not hold yet.
+
+    Parameters
+    ----------
+    work
+        Turns a task into a JSON object; a function at the top level of a module where workers are processes.
+    tasks
+        Task by key. Each must bring its own seed: which worker does it, and when, must not matter.
+    path
+        The campaign's file; made if missing, continued if there.
+    settings
+        What decides the results, a JSON object; a file with other settings is refused.
+    executor
+        Any `concurrent.futures.Executor`, also one of other machines; None: here, one after another.
+    progress
+        Called with key and result of every task that ends.
+
+    Returns
+    -------
+    Results by key, in the order of `tasks`.
+
+    Raises
+    ------
+    FileError
+        If the file belongs to another campaign, or is damaged before its last line.
+    NotConvergedError
+        If the executor's workers die; all that ended before is kept.
+    """
+    path = Path(path)
+    before = read_campaign(path) if path.exists() else None
+    wanted = json.loads(json.dumps(dict(settings)))
+    if before is not None and before.settings != wanted:
+        raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
+    done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
+    left = {key: task for key, task in tasks.items() if key not in done}
+    with _Lines(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
+        for key, result in ended:
+            line = json.loads(lines.add(key, result))  # as a later reader will see it
+            done[key] = line["result"]
+            if progress is not None:
+                progress(key, done[key])
+    return {key: done[key] for key in tasks}
+
+
+def read_campaign(path: str | os.PathLike[str]) -> Finished:
+    """Read a campaign's file; a last line that was torn in writing is left out.
+
+    Raises
+    ------
+    FileError
+        If it is missing, no campaign's, or damaged before its last line.
+    """
+    try:
+        lines = Path(path).read_bytes().splitlines(keepends=True)
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error.strerror})", "a campaign's file") from error
+    if lines and not lines[-1].endswith(b"\n"):
+        lines.pop()
+    rows = [_parsed(path, number, line) for number, line in enumerate(lines, start=1)]
+    if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
+        raise FileError(path, "no campaign begins here", f'a first line with "format": "{FORMAT}" and its settings')
+    results: dict[str, Result] = {}
+    for number, row in enumerate(rows[1:], start=2):
+        key, result = row.get("key"), row.get("result")
+        if not (isinstance(key, str) and isinstance(result, dict)):
+            raise FileError(path, "not a finished task", '"key" and "result"', row=number)
+        if key in results:
+            raise FileError(path, f"task {key!r} a second time", "every task once", row=number)
+        results[key] = result
+    return Finished(rows[0]["settings"], results)
+
+
+def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str, Any]:
+    try:
+        row = json.loads(line)
+    except ValueError as error:
+        raise FileError(path, f"not JSON ({error})", "one JSON object a line", row=number) from error
+    if not isinstance(row, dict):
+        raise FileError(path, "not an object", "one JSON object a line", row=number)
+    return row
+
+
+class _Lines:
+    """Append lines, each on disk before the next; a torn end is cut off first."""
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:
+        if fresh:
+            write_text_atomically(path, json.dumps({"format": FORMAT, "settings": settings}, allow_nan=False) + "\n")
+        self._path = path
+
+    def __enter__(self) -> Self:
+        self._file: BinaryIO = self._path.open("r+b")
+        content = self._file.read()
+        self._file.truncate(self._file.seek(content.rfind(b"\n") + 1))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def add(self, key: str, result: Result) -> str:
+        """Write one finished task and return its line."""
+        try:
+            line = json.dumps({"key": key, "result": result}, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ParameterError(
+                f"the result of {key}", result, f"a JSON object of finite numbers ({error})"
+            ) from error
+        self._file.write(line.encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return line
+
+
+@contextlib.contextmanager
+def _ended(
+    work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
+) -> Iterator[Iterator[tuple[str, Result]]]:
+    """Yield (key, result) as tasks end; on leaving, tasks that have not begun are called off."""
+    if executor is None:
+        yield ((key, work(task)) for key, task in tasks.items())
+        return
+    futures: dict[Future[Result], str] = {executor.submit(work, task): key for key, task in tasks.items()}
+    try:
+        yield ((futures[future], _result_of(future)) for future in as_completed(futures))
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _result_of(future: Future[Result]) -> Result:
+    try:
+        return future.result()
+    except BrokenExecutor as error:
+        raise NotConvergedError(
+            f"a worker died ({error}); what had ended is kept, and the same command goes on from there"
+        ) from error

@@ -1,0 +1,98 @@
+"""What the verbs that use a real arm share: which arm, its geometry, a person to ask."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.errors import LinkError, ParameterError
+
+if TYPE_CHECKING:
+    from probewise.arm import Geometry, LegoArm
+
+__all__ = ["add_geometry", "asker", "geometry_of", "open_nxt", "parse_arm", "parse_place", "telling_what_is_kept"]
+
+AWAKE_S = 20.0  # how often a waiting program thinks of the brick's sleep timer
+
+
+def add_geometry(parser: argparse.ArgumentParser) -> None:
+    """Add --geometry."""
+    parser.add_argument(
+        "--geometry",
+        type=Path,
+        metavar="ARM.toml",
+        help="the arm as built: lengths, gears, ports, limits (default: the file that ships)",
+    )
+
+
+def geometry_of(arguments: argparse.Namespace) -> Geometry:
+    """Read the geometry that was asked for, or the shipped one."""
+    from probewise.arm import read_geometry, shipped_geometry
+
+    return read_geometry(arguments.geometry or shipped_geometry())
+
+
+def parse_arm(text: str) -> str | None:
+    """Read "simulated" (None) or "nxt:PORT" (the port)."""
+    kind, _, port = text.partition(":")
+    if text == "simulated":
+        return None
+    if kind != "nxt" or not port:
+        raise ParameterError("--arm", text, "simulated, or nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5")
+    return port
+
+
+def parse_place(name: str, text: str) -> tuple[float, float]:
+    """Read "X,Y" in mm."""
+    try:
+        x_mm, y_mm = (float(cell) for cell in text.split(","))
+    except ValueError as error:
+        raise ParameterError(name, text, "X,Y in mm, such as 524,260") from error
+    return x_mm, y_mm
+
+
+def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    """Open the line to a brick, with the arm that hangs on it."""
+    from probewise.arm import LegoArm
+    from probewise.arm.nxt import Brick, BrickMachine
+
+    return LegoArm(BrickMachine(Brick.open(port), geometry), geometry, start_s=start_s)
+
+
+def asker(arm: LegoArm) -> Callable[[str], None]:
+    """Make what asks a person and waits for Enter, while the arm is kept awake."""
+
+    def ask(text: str) -> None:
+        sys.stderr.write(f"{text[0].upper()}{text[1:]}, then press Enter: ")
+        sys.stderr.flush()
+        answers: queue.Queue[str] = queue.Queue()
+        # Reading a line cannot be cut short, so that it waits in a thread that the program need not wait for.
+        threading.Thread(target=lambda: answers.put(sys.stdin.readline()), daemon=True).start()
+        while True:
+            try:
+                answer = answers.get(timeout=AWAKE_S)
+            except queue.Empty:
+                arm.keep_awake()
+            else:
+                break
+        if not answer:
+            raise ParameterError("standard input", "its end", "a person who presses Enter")
+
+    return ask
+
+
+@contextlib.contextmanager
+def telling_what_is_kept(kept: Callable[[], str]) -> Iterator[None]:
+    """Add to the last words of a run that Ctrl-C or a dead line ends what of it is on the disk."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(kept()) from stop
+    except LinkError as error:
+        raise LinkError(f"{error}; {kept()}") from error

@@ -1,0 +1,290 @@
+"""`probewise arm`: the arm at the bench, one task at a time."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._arm import add_geometry, asker, geometry_of, open_nxt, parse_arm, parse_place, telling_what_is_kept
+from probewise.cli._common import OneLineParser, Verb, add_quiet, check_out_file, positive_int, say
+from probewise.errors import FileError, ParameterError
+
+if TYPE_CHECKING:
+    from probewise.arm import Geometry, LegoArm, Reading
+    from probewise.recordings import Plan
+
+__all__ = ["TASKS", "VERB"]
+
+PAPER = "paper"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
+
+    check = _task(tasks, "check", "Check a geometry file; say and draw how far the arm reaches.")
+    check.add_argument("--out", type=Path, metavar="REACH.png", help="where the drawing goes (default: none is made)")
+
+    jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
+    jog.add_argument(
+        "where", nargs="+", metavar="WHERE", help="base, shoulder or elbow and degrees; or a place X,Y in mm"
+    )
+    jog.add_argument("--down", action="store_true", help="at a place: lower the sensor to the height of reading")
+
+    home = _task(tasks, "home", "Bring all joints to where their counters are 0.", moves=True)
+    home.add_argument(
+        "--here", action="store_true", help="let a person bring the arm home by hand, and set the counters to 0 there"
+    )
+
+    _task(tasks, "read", "Read the sensor where it stands.", moves=True)
+
+    scan = _task(tasks, "scan", "Read along a line; the readings go to standard output as CSV.", moves=True)
+    scan.add_argument("start", metavar="X,Y", help="from here, mm")
+    scan.add_argument("end", metavar="X,Y", help="to here, mm")
+    scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="how many (default 21)")
+
+    record = _task(
+        tasks, "record", "Carry out a plan and write the recording; asks when there is something to do.", moves=True
+    )
+    record.add_argument(
+        "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER}, the paper's"
+    )
+    record.add_argument("--out", type=Path, required=True, metavar="REC.csv", help="where the recording goes")
+    record.add_argument(
+        "--origin-mm", metavar="X,Y", help="where on the field the plan's origin lies (default: the field's middle)"
+    )
+    record.add_argument("--resume", action="store_true", help="go on behind the readings that REC.csv holds")
+
+
+def _task(
+    tasks: argparse._SubParsersAction[OneLineParser], name: str, summary: str, *, moves: bool = False
+) -> OneLineParser:
+    parser = tasks.add_parser(name, help=summary, description=summary)
+    if moves:
+        parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
+        parser.add_argument("--dry-run", action="store_true", help="print the moves, from home, and make none")
+    add_geometry(parser)
+    add_quiet(parser)
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Do one task."""
+    TASKS[arguments.task](arguments, geometry_of(arguments))
+    return 0
+
+
+def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    import math
+
+    import numpy as np
+
+    from probewise.arm.geometry import JOINTS
+    from probewise.recordings import write_bytes_atomically
+    from probewise.report.plots import png, reach_map
+
+    out = None if arguments.out is None else check_out_file(arguments.out)
+    x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
+    places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
+    held = geometry.holds(places)
+    say(f"reach        {geometry.sentence()}", quiet=arguments.quiet)
+    say(f"field        {held.mean():.1%} of it within reach", quiet=arguments.quiet)
+    for name, joint in zip(JOINTS, geometry.joints, strict=True):
+        count_mm = geometry.farthest_mm / abs(joint.counts_per_rad)
+        low, high = math.degrees(joint.low_rad), math.degrees(joint.high_rad)
+        say(
+            f"{name:<12} motor {'ABC'[joint.port]}, {low:g} to {high:g} degrees; "
+            f"at {geometry.farthest_mm:.0f} mm one count is {count_mm:.2f} mm, "
+            f"its play {joint.play_rad * geometry.farthest_mm:.1f} mm",
+            quiet=arguments.quiet,
+        )
+    if not held.any():
+        raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
+    if out is not None:
+        standing = np.where(held, geometry.orientation_rad(places), np.nan).reshape(y_mm.size, x_mm.size)
+        write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))
+        say(f"drawn        {out}", quiet=arguments.quiet)
+
+
+def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    import math
+
+    from probewise.arm.geometry import JOINTS
+
+    match arguments.where:
+        case [place]:
+            x_mm, y_mm = parse_place("WHERE", place)
+            with _arm(arguments, geometry) as arm:
+                (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
+                _say_position(arm, quiet=arguments.quiet)
+                if arguments.down:
+                    _asker(arguments, arm)("look how the sensor stands; it is raised again")
+        case [joint, text] if joint in JOINTS:
+            try:
+                by_rad = math.radians(float(text))
+            except ValueError as error:
+                raise ParameterError("WHERE", text, "a number of degrees") from error
+            with _arm(arguments, geometry) as arm:
+                arm.turn(JOINTS.index(joint), by_rad)
+                _say_position(arm, quiet=arguments.quiet)
+        case _:
+            raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")
+
+
+def _home(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    import math
+
+    from probewise.arm.geometry import JOINTS
+
+    with _arm(arguments, geometry) as arm:
+        if arguments.here:
+            angles = [f"{name} {math.degrees(j.home_rad):g}" for name, j in zip(JOINTS, geometry.joints, strict=True)]
+            arm.release()
+            _asker(arguments, arm)(f"bring the arm home by hand, {', '.join(angles)} degrees")
+            arm.set_home()
+        else:
+            arm.home()
+        _say_position(arm, quiet=arguments.quiet)
+
+
+def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    with _arm(arguments, geometry) as arm:
+        say(f"{arm.read_here():.2f} %, battery {arm.battery_mv():.0f} mV")
+
+
+def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    import numpy as np
+
+    from probewise.arm import Pose
+
+    start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
+    places = np.linspace(start, end, arguments.readings)
+    with _arm(arguments, geometry) as arm:
+        say("x_mm,y_mm,orientation_deg,time_s,reading,battery_mv")
+        for (x_mm, y_mm), standing in zip(places, arm.orientation_rad(places), strict=True):
+            reading = arm.measure(Pose(float(x_mm), float(y_mm), float(standing)))
+            turned = np.degrees(reading.pose.orientation_rad)
+            battery = reading.covariates["battery_mv"]
+            say(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:g},{battery:g}")
+
+
+def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    from tqdm import tqdm
+
+    from probewise.arm import carry_out, recorded
+    from probewise.recordings import paper_plan, read_plan, write_recording
+
+    named = arguments.plan == PAPER
+    out = check_out_file(arguments.out, *([] if named else [Path(arguments.plan)]))
+    plan = _as_read(paper_plan() if named else read_plan(arguments.plan), geometry)
+    width, height = geometry.field_mm
+    origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
+    taken = _taken_before(out, plan, resume=arguments.resume, dry=arguments.dry_run)
+    start_s = taken[-1].time_s if taken else 0.0
+
+    def kept() -> str:
+        some = f"{out} keeps {len(taken)} of {len(plan)} readings; go on with --resume"
+        return some if taken else "nothing was read"
+
+    with _arm(arguments, geometry, start_s=start_s) as arm:
+        readings = carry_out(arm, plan, origin_mm=origin, ask=_asker(arguments, arm), first=len(taken))
+        bar = tqdm(
+            readings, desc="readings", total=len(plan), initial=len(taken), disable=True if arguments.quiet else None
+        )
+        with telling_what_is_kept(kept):
+            for reading in bar:
+                taken.append(reading)
+                if not arguments.dry_run:
+                    write_recording(recorded(plan, taken), out)
+    if not arguments.dry_run:
+        say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
+
+
+def _as_read(plan: Plan, geometry: Geometry) -> Plan:
+    """Take the plan for what this arm reads: percent, at its height."""
+    import dataclasses
+
+    step = 1.0 if geometry.whole_percent else None
+    instrumentation = dataclasses.replace(
+        plan.instrumentation,
+        unit="LEGO",
+        min=0.0,
+        max=100.0,
+        step=step,
+        sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
+        height_mm=geometry.read_height_mm,
+    )
+    return dataclasses.replace(plan, instrumentation=instrumentation)
+
+
+def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
+    """Read back the readings of an earlier go, which must be those of the plan's first rows."""
+    import numpy as np
+
+    from probewise.arm import Pose, Reading
+    from probewise.recordings import read_recording
+
+    if dry:
+        return []
+    if not resume:
+        if out.exists():
+            raise FileError(out, "a file stands there", "--resume to go on with it, or another --out")
+        return []
+    before = read_recording(out)
+    rows, first = before.plan, plan.take(np.arange(min(len(before), len(plan))))
+    same = len(first) == len(before) and np.array_equal(rows.x_mm, first.x_mm) and np.array_equal(rows.y_mm, first.y_mm)
+    if not same or [rows.pattern_names[k] for k in rows.pattern] != [first.pattern_names[k] for k in first.pattern]:
+        raise FileError(out, "readings of another plan", "the first rows of this plan, as an earlier go left them")
+    return [
+        Reading(
+            float(before.readings[k]),
+            Pose(float(rows.x_mm[k]), float(rows.y_mm[k]), float(rows.orientation_rad[k])),
+            float(rows.time_s[k]),
+            {name: float(values[k]) for name, values in rows.covariates.items()},
+        )
+        for k in range(len(before))
+    ]
+
+
+def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    from probewise.arm import LegoArm, Rehearsal
+
+    if arguments.dry_run:
+        return LegoArm(Rehearsal(geometry, say), geometry, start_s=start_s)
+    if arguments.arm is None:
+        raise ParameterError("--arm", None, "nxt:PORT such as nxt:/dev/rfcomm0; or --dry-run, to print the moves only")
+    port = parse_arm(arguments.arm)
+    if port is None:
+        raise ParameterError(
+            "--arm", arguments.arm, "nxt:PORT; a simulated arm has no bench, --dry-run prints the moves"
+        )
+    return open_nxt(port, geometry, start_s=start_s)
+
+
+def _asker(arguments: argparse.Namespace, arm: LegoArm) -> Callable[[str], None]:
+    return (lambda text: say(f"ask: {text}")) if arguments.dry_run else asker(arm)
+
+
+def _say_position(arm: LegoArm, *, quiet: bool) -> None:
+    import math
+
+    (x_mm, y_mm, height_mm), angles = arm.position_mm, [math.degrees(angle) for angle in arm.angles_rad]
+    say(
+        f"sensor at ({x_mm:.1f}, {y_mm:.1f}) mm, {height_mm:.1f} mm above the surface; base {angles[0]:.1f}, "
+        f"shoulder {angles[1]:.1f}, elbow {angles[2]:.1f} degrees",
+        quiet=quiet,
+    )
+
+
+TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
+    "check": _check,
+    "jog": _jog,
+    "home": _home,
+    "read": _read,
+    "scan": _scan,
+    "record": _record,
+}
+
+VERB = Verb("arm", "Check, move and read the LEGO arm; record a plan with it.", add_arguments, run)

@@ -1,0 +1,161 @@
+"""`probewise emulate-nxt`: a LEGO brick with the arm on it, behind a serial device, for those who own none."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import select
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import Verb, add_common, check_out_file, say
+from probewise.errors import LinkError, ParameterError
+
+if TYPE_CHECKING:
+    from probewise.emulator import Table, Trace
+    from probewise.world import World
+
+__all__ = ["VERB"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument(
+        "--scene",
+        default="600,250,80",
+        metavar="X,Y,R",
+        help="the circle on the field, in mm (default 600,250,80), or ellipse:X,Y,A,B,ANGLE, "
+        "polygon:X,Y,X,Y,..., edge:ANGLE,OFFSET, corner:X,Y,DX,DY, uniform:ALBEDO",
+    )
+    parser.add_argument(
+        "--sensor",
+        type=Path,
+        metavar="S.json",
+        help="the light sensor, as calibrate writes it (default: that of the shipped recordings)",
+    )
+    parser.add_argument(
+        "--geometry", type=Path, metavar="ARM.toml", help="the arm's numbers (default: those of the arm that ships)"
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME[=RATE]",
+        help="fragment, late, drop, silence, deaf, unasked, disconnect: how often of 1; late=RATE,SECONDS; "
+        "sag: mV a minute; may be given several times",
+    )
+    parser.add_argument("--name", default="NXT", help="the brick's name, up to 14 characters (default NXT)")
+    parser.add_argument(
+        "--sleep",
+        type=int,
+        default=10,
+        metavar="MIN",
+        help="minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)",
+    )
+    parser.add_argument(
+        "--link", type=Path, metavar="PATH", help="a symbolic link to keep on the device, also after a disconnection"
+    )
+    parser.add_argument("--log", type=Path, metavar="FILE", help="write every telegram and mishap to a file")
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until Ctrl-C, or until the brick goes to sleep."""
+    if not hasattr(os, "openpty"):
+        raise LinkError("emulate-nxt needs pseudo-terminals, which this system has not; Linux, macOS and WSL do")
+
+    from probewise.emulator import Faults, parse_scene, read_geometry, set_up, shipped_geometry
+    from probewise.emulator.pty import Terminal, serve
+
+    geometry = read_geometry(shipped_geometry() if arguments.geometry is None else arguments.geometry)
+    surface = parse_scene(arguments.scene)
+    faults = Faults.parse(arguments.fault)
+    world = _world(arguments.sensor)
+    with _trace(arguments.log) as trace, Terminal(arguments.link) as terminal:
+        bench = set_up(
+            geometry,
+            world,
+            surface,
+            time.monotonic,
+            seed=arguments.seed,
+            name=arguments.name,
+            faults=faults,
+            sleep_min=arguments.sleep,
+            trace=trace,
+        )
+        say(terminal.path)
+        say(
+            f"seed {arguments.seed}, scene {arguments.scene}; type another, or `turn DEGREES`; end with Ctrl-C",
+            quiet=arguments.quiet,
+        )
+        try:
+            serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench.table).listen)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt("the device is gone") from stop
+    say(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
+    return 0
+
+
+def _world(sensor: Path | None) -> World:
+    if sensor is None:
+        from probewise.world.shipped import truth
+
+        return truth("paper")
+    from probewise.calibration import read_sensor
+    from probewise.experiment import world_like
+
+    return world_like(read_sensor(sensor))
+
+
+class _Listener:
+    """Do what a person types: another scene, or `turn DEGREES`."""
+
+    def __init__(self, table: Table) -> None:
+        self._table, self._typed, self._is_heard = table, b"", sys.stdin is not None
+
+    def listen(self) -> None:
+        """Take what has been typed, without waiting; from a terminal only in its foreground, as shells want it."""
+        while self._is_heard and select.select([0], [], [], 0)[0] and _is_foreground():
+            typed = os.read(0, 4096)
+            self._is_heard = bool(typed)
+            *lines, self._typed = (self._typed + typed).split(b"\n")
+            for line in lines:
+                self._obey(line.decode(errors="replace"))
+
+    def _obey(self, line: str) -> None:
+        try:
+            self._table.obey(line)
+            say(f"done: {line}")
+        except ParameterError as error:
+            say(str(error))
+
+
+def _is_foreground() -> bool:
+    try:
+        return not os.isatty(0) or os.tcgetpgrp(0) == os.getpgrp()
+    except OSError:
+        return True  # a terminal that controls nobody
+
+
+@contextlib.contextmanager
+def _trace(path: Path | None) -> Iterator[Trace]:
+    """Yield what writes a line a telegram, with the seconds since the start."""
+    from probewise.emulator.radio import no_trace
+
+    if path is None:
+        yield no_trace
+        return
+    began_s = time.monotonic()
+    with check_out_file(path).open("w", encoding="utf-8", buffering=1) as file:
+
+        def note(now_s: float, event: str, text: str) -> None:
+            file.write(f"{now_s - began_s:10.3f} {event} {text}\n")
+
+        yield note
+
+
+VERB = Verb("emulate-nxt", "Stand in for a LEGO brick with the arm, behind a serial device.", add_arguments, run)

@@ -1,0 +1,145 @@
+"""`probewise study`: how many measurements the robot needs, over many circles and ways of looking."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, Any
+
+from probewise.cli._common import Verb, add_out_directory, add_quiet, check_out_directory, positive_int, say, staged
+from probewise.errors import LinkError, ParameterError
+
+if TYPE_CHECKING:
+    from probewise.study import Row
+
+__all__ = ["VERB"]
+
+_FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    add_out_directory(parser)
+    parser.add_argument(
+        "--circles", type=positive_int, default=200, metavar="N", help="circles a row, always the first (default 200)"
+    )
+    parser.add_argument(
+        "--quoted", type=positive_int, metavar="N", help="circles of the first row (default as --circles)"
+    )
+    one = parser.add_argument_group("one row instead of the table's", "what is not given is as in the reference row")
+    one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, wholly in the field) or anywhere")
+    one.add_argument("--model", metavar="NAME", help="what the robot takes its sensor for: ssf or naive")
+    one.add_argument(
+        "--utility", metavar="NAME", help="worth of a reading: information, entropy, per-second, about:..."
+    )
+    one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
+    one.add_argument("--width", type=float, metavar="F", help="believed width of the SSF over the true one")
+    one.add_argument("--batch", type=positive_int, metavar="N", help="readings that are chosen together")
+    one.add_argument("--learn-sensor", action="store_true", default=None, help="learn the sensor along with the shape")
+    parser.add_argument(
+        "--max-readings", type=positive_int, default=100, metavar="N", help="a run ends here as a miss (default 100)"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=positive_int, default=1, metavar="N", help="processes here (default 1)")
+    where.add_argument(
+        "--scheduler", metavar="HOST:PORT", help="a dask scheduler whose workers do it (extra `cluster`)"
+    )
+    add_quiet(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run what is left of the study and write its table."""
+    from tqdm import tqdm
+
+    from probewise.report import study as report
+    from probewise.study import run_study
+
+    out = check_out_directory(arguments.out)
+    rows = _rows(arguments)
+    numbers = dict.fromkeys(rows, arguments.circles)
+    numbers[rows[0]] = arguments.quoted or arguments.circles
+    if max(numbers.values()) < 2:
+        raise ParameterError("--circles", arguments.circles, "2 or more, so that there is an error to tell")
+    out.mkdir(parents=True, exist_ok=True)
+    trials = out / "trials.jsonl"
+    ended = 0
+    with (
+        _executor(arguments) as executor,
+        tqdm(total=sum(numbers.values()), desc="runs", unit="", disable=True if arguments.quiet else None) as bar,
+    ):
+
+        def advance(key: str, result: Any) -> None:
+            nonlocal ended
+            ended += 1
+            bar.set_postfix_str(key)
+            bar.update()
+
+        try:
+            study = run_study(
+                numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=advance
+            )
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(f"{trials} keeps {ended} more runs; the same command goes on") from stop
+    with staged(out) as stage:
+        (stage / "table.csv").write_text(report.table_csv(study), encoding="utf-8")
+        page = report.write_page(study, command=_command(arguments))
+        (stage / "report.html").write_text(page, encoding="utf-8")
+    say(report.answer(study), quiet=arguments.quiet)
+    say(f"written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
+    from probewise.study import Row, standard_rows
+
+    given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
+    if not given:
+        return standard_rows()
+    if "noise" in given:
+        given["noise_sd"] = given.pop("noise")
+    return (Row(**given),)
+
+
+@contextlib.contextmanager
+def _executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
+    """Yield what does the runs: this process, some of its own, or a cluster's workers."""
+    if arguments.scheduler is not None:
+        with _cluster(arguments.scheduler) as executor:
+            yield executor
+    elif arguments.workers > 1:
+        from probewise.cli._workers import workers
+
+        with workers(arguments.workers) as pool:
+            yield pool
+    else:
+        yield None
+
+
+@contextlib.contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ParameterError("--scheduler", address, 'the extra: pip install "probewise[cluster]"') from error
+    try:
+        client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise LinkError(f"no scheduler answers at {address}; start one with `dask scheduler`") from error
+    with client:
+        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    words = ["probewise", "study", "--circles", str(arguments.circles)]
+    words += [] if arguments.quoted is None else ["--quoted", str(arguments.quoted)]
+    for name in _FACTORS:
+        value = getattr(arguments, name)
+        if value is not None:
+            words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
+    return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
+
+
+VERB = Verb("study", "Measure how many readings the robot needs, over many circles.", add_arguments, run)

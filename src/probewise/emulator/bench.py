@@ -1,0 +1,90 @@
+"""The whole bench in one call: arm, light sensor, brick and radio link over a surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.emulator.arm import EmulatedArm
+from probewise.emulator.brick import Battery, Brick
+from probewise.emulator.clock import Clock
+from probewise.emulator.faults import Faults
+from probewise.emulator.geometry import Geometry
+from probewise.emulator.inputs import Sensor
+from probewise.emulator.radio import Radio, Trace, no_trace
+from probewise.emulator.sensors import Light, NothingAnalog, sonar
+from probewise.emulator.sight import Sight
+from probewise.emulator.table import Table
+from probewise.world import Surface, World
+
+__all__ = ["Bench", "set_up"]
+
+_WALL_CM = 42
+
+
+@dataclass(frozen=True)
+class Bench:
+    """An arm over a table and the link to its brick; `arm` and `radio.brick` show what goes on."""
+
+    table: Table
+    arm: EmulatedArm
+    radio: Radio
+
+
+def set_up(
+    geometry: Geometry,
+    world: World,
+    surface: Surface,
+    clock: Clock,
+    *,
+    seed: int,
+    name: str = "NXT",
+    faults: Faults | None = None,
+    sleep_min: int = 10,
+    trace: Trace = no_trace,
+) -> Bench:
+    """Build a bench, the arm at home.
+
+    Parameters
+    ----------
+    geometry
+        The arm's numbers.
+    world
+        How the sensor reads at the height that geometry gives.
+    surface
+        What lies there at first.
+    clock
+        Seconds: `time.monotonic`, or a VirtualClock.
+    seed
+        Of the sensor's noise and of the link's mishaps.
+    name, sleep_min
+        The brick's.
+    faults
+        What goes wrong; None: nothing.
+    trace
+        Where a record of all telegrams goes.
+
+    Raises
+    ------
+    ParameterError
+        If the name or the time to sleep is none.
+    """
+    faults = Faults() if faults is None else faults
+    arm = EmulatedArm(geometry)
+    table = Table(surface)
+    sight = Sight(world, table, arm.stand, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
+    sensors: list[Sensor] = [NothingAnalog() for _ in range(4)]
+    at = geometry.sensor_port - 1
+    sensors[at] = Light(sight, clock)
+    sensors[0 if at == 3 else 3] = sonar(_WALL_CM)
+    brick = Brick(
+        clock,
+        motors=arm.motors(),
+        sensors=sensors,
+        name=name,
+        battery=Battery(sag_mv_min=faults.sag),
+        sleep_min=sleep_min,
+    )
+    rng = np.random.default_rng([seed, 1])
+    return Bench(table, arm, Radio(brick, clock, rng=rng, faults=faults, trace=trace))

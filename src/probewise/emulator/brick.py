@@ -1,0 +1,183 @@
+"""The brick: what it holds, its battery and its sleep, and an answer to every telegram."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from probewise.emulator.clock import Clock
+from probewise.emulator.files import Files
+from probewise.emulator.inputs import Inputs, Sensor
+from probewise.emulator.motor import Motor
+from probewise.emulator.outputs import Outputs
+from probewise.emulator.programs import Programs
+from probewise.emulator.protocol import Refused, Request, Status, parse, reply
+from probewise.emulator.sensors import NothingAnalog
+from probewise.errors import ParameterError
+
+__all__ = ["ADDRESS", "SLEEP_MIN", "Battery", "Brick"]
+
+ADDRESS = bytes.fromhex("0016530A0B0C")
+SLEEP_MIN = (0, 2, 5, 10, 30, 60)
+"""What the brick's menu offers; 0 is never."""
+
+_FLASH_BYTES = 61440
+_VERSIONS = bytes((124, 1, 31, 1))  # protocol 1.124, firmware 1.31, the smaller number first
+_LONGEST_NAME = 14
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Voltage at the start, and what it loses a minute."""
+
+    full_mv: float = 7412.0
+    sag_mv_min: float = 0.0
+
+    def at(self, seconds: float) -> float:
+        """Return the voltage in mV after some time; a brick ends at 5.5 V."""
+        return max(self.full_mv - self.sag_mv_min * seconds / 60, 5500.0)
+
+
+class Brick:
+    """A brick that is switched on now.
+
+    Parameters
+    ----------
+    clock
+        Seconds; motors turn and timers run by it.
+    motors
+        At ports A, B, C.
+    sensors
+        At ports 1 to 4.
+    name
+        Up to 14 characters of Latin-1.
+    battery
+        What drives it.
+    sleep_min
+        After so many minutes without KEEPALIVE it switches itself off.
+    files
+        What lies in flash. Any of them runs as a program that sends messages back.
+
+    Raises
+    ------
+    ParameterError
+        If the name or the time to sleep is none that a brick can have.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        motors: Sequence[Motor] | None = None,
+        sensors: Sequence[Sensor] | None = None,
+        name: str = "NXT",
+        battery: Battery | None = None,
+        sleep_min: int = 10,
+        files: Mapping[str, bytes] | None = None,
+    ) -> None:
+        if not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable() or any(ord(c) > 255 for c in name):
+            raise ParameterError("name", name, f"1 to {_LONGEST_NAME} printable characters of Latin-1")
+        if sleep_min not in SLEEP_MIN:
+            raise ParameterError("sleep_min", sleep_min, f"one of {', '.join(map(str, SLEEP_MIN))}")
+        self._clock, self._sleep_s = clock, 60.0 * sleep_min
+        self._began_s = self._awake_s = clock()
+        self._battery = Battery() if battery is None else battery
+        self._name = name.encode("latin-1")
+        self.outputs = Outputs([Motor() for _ in range(3)] if motors is None else motors, now_s=self._began_s)
+        self.inputs = Inputs([NothingAnalog()] * 4 if sensors is None else sensors, clock)
+        self._files = Files({"echo.rxe": b""} if files is None else files, capacity=_FLASH_BYTES)
+        self._programs = Programs(self._files.exists, self._release)
+        self._commands: Mapping[int, Callable[..., bytes]] = {
+            **self.outputs.commands,
+            **self.inputs.commands,
+            **self._files.commands,
+            **self._programs.commands,
+            0x02: self._play_file,
+            0x03: lambda hertz, ms: b"",
+            0x0B: lambda: struct.pack("<H", int(self.battery_mv)),
+            0x0C: lambda: b"",
+            0x0D: self._keep_alive,
+            0x88: lambda: _VERSIONS,
+            0x90: self._no_module,
+            0x91: self._no_module,
+            0x92: lambda handle: b"\0",
+            0x94: self._read_map,
+            0x95: self._write_map,
+            0x97: self._usb_only,
+            0x98: self._rename,
+            0x9B: self._device_info,
+            0xA1: lambda buffer: bytes((buffer, 0)),
+            0xA2: lambda buffer, wanted: bytes((buffer, 0)) + bytes(wanted),
+            0xA4: self._usb_only,
+        }
+
+    @property
+    def battery_mv(self) -> float:
+        """The battery's voltage now."""
+        return self._battery.at(self._clock() - self._began_s)
+
+    @property
+    def is_off(self) -> bool:
+        """Whether it has gone to sleep; only its orange button would wake it."""
+        return self._sleep_s > 0 and self._clock() - self._awake_s >= self._sleep_s
+
+    def advance(self) -> None:
+        """Bring everything that moves up to the clock's time."""
+        if self.is_off:
+            self.outputs.advance(self._awake_s + self._sleep_s, self.battery_mv)
+            self.outputs.release()
+        self.outputs.advance(self._clock(), self.battery_mv)
+
+    def answer(self, telegram: bytes) -> bytes | None:
+        """Carry out a telegram and return the reply, None where none is due.
+
+        A command that was sent with the bit for no reply gets none, not even for an error.
+        """
+        self.advance()
+        request = None if self.is_off else parse(telegram)
+        if request is None:
+            return None
+        status, payload = self._carried_out(request)
+        return reply(request.opcode, status, payload) if request.wants_reply else None
+
+    def _carried_out(self, request: Request) -> tuple[Status, bytes]:
+        if request.command is None:
+            return Status.UNKNOWN_COMMAND, b""
+        try:
+            return Status.OK, self._commands[request.opcode](*request.command.fields(request.body))
+        except Refused as refused:
+            zeros = bytes(request.command.error_bytes)
+            return refused.status, zeros if refused.payload is None else refused.payload
+
+    def _release(self) -> None:
+        self.outputs.release()
+        self.inputs.release()
+
+    def _play_file(self, loop: int, name: bytes) -> bytes:
+        if not self._files.exists(name.split(b"\0")[0].decode("latin-1")):
+            raise Refused(Status.OUT_OF_RANGE)
+        return b""
+
+    def _keep_alive(self) -> bytes:
+        self._awake_s = self._clock()
+        return struct.pack("<I", int(1000 * self._sleep_s))
+
+    def _rename(self, name: bytes) -> bytes:
+        self._name = name.split(b"\0")[0][:15]
+        return b""
+
+    def _device_info(self) -> bytes:
+        return struct.pack("<15s7s4xI", self._name, ADDRESS, self._files.free)
+
+    def _no_module(self, wanted: bytes | int) -> bytes:
+        raise Refused(Status.MODULE_NOT_FOUND)
+
+    def _read_map(self, module: int, offset: int, wanted: int) -> bytes:
+        raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0) + bytes(min(wanted, 119)))
+
+    def _write_map(self, module: int, offset: int, wanted: int, data: bytes) -> bytes:
+        raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0))
+
+    def _usb_only(self, *fields: bytes) -> bytes:
+        raise Refused(Status.UNDEFINED_ERROR)

@@ -1,0 +1,94 @@
+"""What may go wrong on the radio link, each with its rate; read from texts such as `late=0.1,3`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+from probewise.errors import ParameterError
+
+__all__ = ["Faults"]
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Rates of mishaps; all 0 is a link without any.
+
+    Parameters
+    ----------
+    fragment
+        Probability that a reply comes in pieces, up to 30 ms apart.
+    late, late_s
+        Probability that a reply comes so many seconds late.
+    drop
+        Probability that a byte of a reply is lost, for each byte.
+    silence
+        Probability that a request is carried out and never answered.
+    deaf
+        Probability that a request is lost on the way to the brick.
+    unasked
+        Probability that the brick sends a message of its own before a reply.
+    disconnect
+        Probability that the link ends as a request arrives, which is carried out; motors go on.
+    sag
+        Millivolts that the battery loses a minute.
+    """
+
+    fragment: float = 0.0
+    late: float = 0.0
+    late_s: float = 3.0
+    drop: float = 0.0
+    silence: float = 0.0
+    deaf: float = 0.0
+    unasked: float = 0.0
+    disconnect: float = 0.0
+    sag: float = 0.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name in ("late_s", "sag"):
+                if not 0 <= value < float("inf"):
+                    raise ParameterError(item.name, value, "0 or more")
+            elif not 0 <= value <= 1:
+                raise ParameterError(item.name, value, "a probability, 0 to 1")
+
+    @classmethod
+    def parse(cls, texts: Iterable[str]) -> Self:
+        """Read NAME, NAME=RATE or late=RATE,SECONDS, each of which adds one fault.
+
+        Without a rate, fragments come always, a byte in 200 is dropped, other mishaps befall one request
+        in 20, a disconnection one in 500, and the battery loses 60 mV a minute.
+
+        Raises
+        ------
+        ParameterError
+            If there is no fault of a name, or its rate is none.
+        """
+        faults = cls()
+        for text in texts:
+            name, equals, value = text.partition("=")
+            if name not in _USUAL:
+                raise ParameterError("--fault", text, f"one of {', '.join(_USUAL)}, =RATE behind it if you like")
+            names = ("late", "late_s") if name == "late" else (name,)
+            try:
+                numbers = [float(part) for part in value.split(",")] if equals else [_USUAL[name]]
+                faults = replace(faults, **dict(zip(names[: len(numbers)], numbers, strict=True)))
+            except ParameterError as error:
+                raise ParameterError("--fault", text, f"{error.name} {error.allowed}") from error
+            except ValueError as error:
+                raise ParameterError("--fault", text, f"{name}=RATE, such as {name}={_USUAL[name]:g}") from error
+        return faults
+
+
+_USUAL = {
+    "fragment": 1.0,
+    "late": 0.05,
+    "drop": 0.005,
+    "silence": 0.05,
+    "deaf": 0.05,
+    "unasked": 0.05,
+    "disconnect": 0.002,
+    "sag": 60.0,
+}

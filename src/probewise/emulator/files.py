@@ -1,0 +1,175 @@
+"""The brick's flash: files by handle, and the commands that reach them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from probewise.emulator.protocol import Refused, Status
+
+__all__ = ["Files"]
+
+_N_HANDLES = 16
+_NAME = 20
+_LONGEST_READ = 122  # what fits a Bluetooth message of 128 bytes
+
+
+@dataclass
+class _Open:
+    name: str
+    at: int = 0
+    size: int | None = None  # what a writer has asked for; None: it reads
+    matches: tuple[str, ...] = ()  # what a search has still to tell
+
+
+class Files:
+    """Files in flash.
+
+    Parameters
+    ----------
+    contents
+        What lies there at first, by name.
+    capacity
+        Bytes of flash.
+    """
+
+    def __init__(self, contents: Mapping[str, bytes], *, capacity: int) -> None:
+        self._files = {name: bytearray(content) for name, content in contents.items()}
+        self._capacity = capacity
+        self._open: dict[int, _Open] = {}
+        self.commands: Mapping[int, Callable[..., bytes]] = {
+            0x80: self._open_read,
+            0x81: self._open_write,
+            0x82: self._read,
+            0x83: self._write,
+            0x84: self._close,
+            0x85: self._delete,
+            0x86: self._find_first,
+            0x87: self._find_next,
+            0x89: self._open_write,
+            0x8B: self._open_write,
+            0x8C: self._open_append,
+            0xA0: self._delete_all,
+        }
+
+    @property
+    def free(self) -> int:
+        """Bytes of flash that are left, promised ones counted as taken."""
+        promised = sum(opened.size - opened.at for opened in self._open.values() if opened.size is not None)
+        return self._capacity - promised - sum(len(content) for content in self._files.values())
+
+    def exists(self, name: str) -> bool:
+        """Tell whether there is a file of a name; the brick does not mind case."""
+        return self._found(name) is not None
+
+    def _open_read(self, name: bytes) -> bytes:
+        found = self._needed(name)
+        return bytes((self._take(_Open(found)),)) + struct.pack("<I", len(self._files[found]))
+
+    def _open_write(self, name: bytes, size: int) -> bytes:
+        text = _text(name)
+        if self.exists(text):
+            raise Refused(Status.FILE_EXISTS)
+        if size > self.free:
+            raise Refused(Status.NO_SPACE)
+        handle = self._take(_Open(text, size=size))
+        self._files[text] = bytearray()
+        return bytes((handle,))
+
+    def _open_append(self, name: bytes) -> bytes:
+        found = self._needed(name)
+        length = len(self._files[found])
+        room = self.free
+        handle = self._take(_Open(found, at=length, size=length + room))
+        return bytes((handle,)) + struct.pack("<I", room)
+
+    def _read(self, handle: int, wanted: int) -> bytes:
+        reader = self._held(handle)
+        n_read = min(wanted, _LONGEST_READ)
+        part = bytes(self._files[reader.name][reader.at : reader.at + n_read])
+        reader.at += len(part)
+        payload = struct.pack("<BH", handle, n_read) + part.ljust(n_read, b"\0")
+        if len(part) < n_read:
+            raise Refused(Status.END_OF_FILE, payload)
+        return payload
+
+    def _write(self, handle: int, data: bytes) -> bytes:
+        writer = self._held(handle)
+        if writer.size is None:
+            raise Refused(Status.ILLEGAL_HANDLE, struct.pack("<BH", handle, 0))
+        part = data[: writer.size - writer.at]
+        self._files[writer.name] += part
+        writer.at += len(part)
+        payload = struct.pack("<BH", handle, len(part))
+        if len(part) < len(data):
+            raise Refused(Status.FILE_FULL, payload)
+        return payload
+
+    def _close(self, handle: int) -> bytes:
+        self._held(handle)
+        del self._open[handle]
+        return bytes((handle,))
+
+    def _delete(self, name: bytes) -> bytes:
+        found = self._found(_text(name))
+        if found is None:
+            raise Refused(Status.FILE_NOT_FOUND, name)
+        if any(opened.name == found for opened in self._open.values()):
+            raise Refused(Status.FILE_BUSY, name)
+        del self._files[found]
+        return name
+
+    def _delete_all(self) -> bytes:
+        self._files.clear()
+        self._open.clear()
+        return b""
+
+    def _find_first(self, pattern: bytes) -> bytes:
+        wanted = _text(pattern).lower()
+        matches = tuple(name for name in sorted(self._files) if fnmatchcase(name.lower(), wanted))
+        if not matches:
+            raise Refused(Status.FILE_NOT_FOUND)
+        return self._tell(self._take(_Open("", matches=matches)))
+
+    def _find_next(self, handle: int) -> bytes:
+        return self._tell(handle)
+
+    def _tell(self, handle: int) -> bytes:
+        search = self._held(handle)
+        matches = tuple(name for name in search.matches if name in self._files)
+        if not matches:
+            raise Refused(Status.FILE_NOT_FOUND, bytes((handle,)) + bytes(24))
+        name, search.matches = matches[0], matches[1:]
+        return bytes((handle,)) + struct.pack("<20sI", name.encode("latin-1"), len(self._files[name]))
+
+    def _take(self, opened: _Open) -> int:
+        for handle in range(_N_HANDLES):
+            if handle not in self._open:
+                self._open[handle] = opened
+                return handle
+        raise Refused(Status.NO_MORE_HANDLES)
+
+    def _held(self, handle: int) -> _Open:
+        if handle >= _N_HANDLES:
+            raise Refused(Status.ILLEGAL_HANDLE)
+        if handle not in self._open:
+            raise Refused(Status.HANDLE_CLOSED)
+        return self._open[handle]
+
+    def _needed(self, name: bytes) -> str:
+        found = self._found(_text(name))
+        if found is None:
+            raise Refused(Status.FILE_NOT_FOUND)
+        return found
+
+    def _found(self, name: str) -> str | None:
+        return next((known for known in self._files if known.lower() == name.lower()), None)
+
+
+def _text(name: bytes) -> str:
+    text = name.split(b"\0")[0].decode("latin-1")
+    if not 1 <= len(text) < _NAME or "." not in text:
+        raise Refused(Status.ILLEGAL_FILE_NAME)
+    return text

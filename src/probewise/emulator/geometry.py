@@ -1,0 +1,111 @@
+"""The arm's numbers, read from its TOML file.
+
+The reader is the emulator's own, so that driver and emulator cannot share a mistake.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from probewise.errors import FileError
+
+__all__ = ["Geometry", "JointNumbers", "read_geometry", "shipped_geometry"]
+
+
+@dataclass(frozen=True)
+class JointNumbers:
+    """One joint: its motor's port, turns of the motor for one of the joint, where it stands at count 0, its play."""
+
+    port: str
+    gear_ratio: float
+    home_deg: float
+    low_deg: float
+    high_deg: float
+    play_deg: float
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Lengths in mm, angles in degrees; the TOML file of format "arm/1" says what each is."""
+
+    base_mm: tuple[float, float]
+    shoulder_mm: tuple[float, float]  # forward of the base's axis, above the surface
+    links_mm: tuple[float, float]
+    elbow_is_absolute: bool
+    sensor_port: int
+    sensor_mm: tuple[float, float]  # forward of the wrist, below it
+    mounting_deg: float
+    read_height_mm: float
+    joints: tuple[JointNumbers, JointNumbers, JointNumbers]  # base, shoulder, elbow
+
+
+def shipped_geometry() -> Path:
+    """Find the file of the arm that ships with the package."""
+    return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
+
+
+def read_geometry(path: Path) -> Geometry:
+    """Read an arm's file.
+
+    Raises
+    ------
+    FileError
+        If it is no TOML file or lacks a number.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise FileError(path, f"not TOML: {error}", "an arm's file of format arm/1") from error
+
+    def number(*keys: str) -> float:
+        value = _value(path, table, keys)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise FileError(path, f"{'.'.join(keys)} is {value!r}", "a number")
+        return float(value)
+
+    def joint(name: str) -> JointNumbers:
+        port = _value(path, table, ("joints", name, "port"))
+        if port not in ("A", "B", "C"):
+            raise FileError(path, f"joints.{name}.port is {port!r}", "A, B or C")
+        ratio = number("joints", name, "gear_ratio")
+        if ratio == 0:
+            raise FileError(path, f"joints.{name}.gear_ratio is 0", "any other number")
+        home, low, high, play = (number("joints", name, f"{key}_deg") for key in ("home", "low", "high", "play"))
+        if not low <= home <= high:
+            raise FileError(path, f"joints.{name}.home_deg is {home:g}", f"within its limits, {low:g} to {high:g}")
+        return JointNumbers(port, ratio, home, low, high, play)
+
+    elbow = _value(path, table, ("links", "elbow"))
+    if elbow not in ("absolute", "relative"):
+        raise FileError(path, f"links.elbow is {elbow!r}", '"absolute" or "relative"')
+    joints = (joint("base"), joint("shoulder"), joint("elbow"))
+    if len({j.port for j in joints}) < len(joints):
+        raise FileError(path, f"the joints' ports are {', '.join(j.port for j in joints)}", "three different ports")
+    sensor_port = number("sensor", "port")
+    if sensor_port not in (1, 2, 3, 4):
+        raise FileError(path, f"sensor.port is {sensor_port:g}", "1, 2, 3 or 4")
+    return Geometry(
+        base_mm=(number("base", "x_mm"), number("base", "y_mm")),
+        shoulder_mm=(number("base", "shoulder_forward_mm"), number("base", "shoulder_height_mm")),
+        links_mm=(number("links", "upper_mm"), number("links", "lower_mm")),
+        elbow_is_absolute=elbow == "absolute",
+        sensor_port=int(sensor_port),
+        sensor_mm=(number("sensor", "forward_mm"), number("sensor", "drop_mm")),
+        mounting_deg=number("sensor", "mounting_deg"),
+        read_height_mm=number("sensor", "read_height_mm"),
+        joints=joints,
+    )
+
+
+def _value(path: Path, table: Mapping[str, Any], keys: tuple[str, ...]) -> object:
+    found: Any = table
+    for key in keys:
+        if not isinstance(found, Mapping) or key not in found:
+            raise FileError(path, f"{'.'.join(keys)} is missing", "every number of format arm/1")
+        found = found[key]
+    return found

@@ -1,0 +1,187 @@
+"""The four input ports as the firmware runs them: types, modes, what is valid when, I2C."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from probewise.emulator.clock import Clock
+from probewise.emulator.protocol import Refused, Status
+from probewise.emulator.sensors import AD_MAX, Analog, Digital, NothingAnalog
+
+__all__ = ["Inputs", "Sensor"]
+
+Sensor: TypeAlias = Analog | Digital
+
+_NONE, _LIGHT_ON, _LIGHT_OFF, _SOUND, _DIGITAL = 0x00, 0x05, 0x06, (0x07, 0x08), (0x0A, 0x0B)
+_COLOUR = range(0x0D, 0x12)
+_RAW = 0x00
+_LIGHT_SCALE, _SOUND_SCALE = (200, 68), (162, 83)  # counts at full scale, percent of the converter's range
+_I2C_BIT_S = 1 / 9600
+
+
+@dataclass
+class _Port:
+    sensor: Sensor
+    kind: int = _NONE
+    mode: int = _RAW
+    valid_s: float = 0.0  # from when on readings count
+    shown: tuple[int, int, int] = (0, 0, 0)  # raw, normalized, scaled: what was converted last
+    boolean: int = 0
+    answer: bytes = b""
+    answered_s: float = 0.0
+    failed: bool = False
+
+
+@dataclass
+class Inputs:
+    """Ports 1 to 4.
+
+    Parameters
+    ----------
+    sensors
+        What is plugged in, in this order.
+    clock
+        Seconds.
+    """
+
+    sensors: Sequence[Sensor]
+    clock: Clock
+    commands: Mapping[int, Callable[..., bytes]] = field(init=False)
+    _ports: tuple[_Port, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._ports = tuple(_Port(sensor) for sensor in self.sensors)
+        self.commands = {
+            0x05: self._set_mode,
+            0x07: self._get_values,
+            0x08: self._reset_scaled,
+            0x0E: self._bus_status,
+            0x0F: self._bus_write,
+            0x10: self._bus_read,
+        }
+
+    def release(self) -> None:
+        """Forget all types, as the start or the end of a program does."""
+        for port in self._ports:
+            self._configure(port, _NONE, _RAW)
+
+    def _set_mode(self, number: int, kind: int, mode: int) -> bytes:
+        self._configure(self._port(number), kind, mode)
+        return b""
+
+    def _configure(self, port: _Port, kind: int, mode: int) -> None:
+        """Set type and mode; readings are invalid for a while, and the old ones stay on show."""
+        self._convert(port)
+        now_s = self.clock()
+        if kind != port.kind:
+            port.valid_s = now_s + (0.301 if kind in _SOUND else 0.401 if kind in _COLOUR else 0.021)
+        else:
+            port.valid_s = max(port.valid_s, now_s + 0.001)
+        port.kind, port.mode = kind, mode
+
+    def _get_values(self, number: int) -> bytes:
+        port = self._port(number)
+        valid = self._convert(port)
+        raw, normalized, scaled = port.shown
+        return struct.pack(
+            "<BBBBBHHhh", number, valid, False, port.kind, port.mode, raw, normalized, scaled, normalized
+        )
+
+    def _reset_scaled(self, number: int) -> bytes:
+        port = self._port(number)
+        port.shown = (*port.shown[:2], 0)  # until the next conversion
+        return b""
+
+    def _convert(self, port: _Port) -> bool:
+        """Bring what the port shows up to date, if it is valid at all."""
+        if self.clock() < port.valid_s:
+            return False
+        if port.kind not in (_NONE, *_DIGITAL):
+            sensor = NothingAnalog() if isinstance(port.sensor, Digital) else port.sensor
+            raw = sensor.counts(lit=port.kind == _LIGHT_ON)
+            normalized = _normalized(raw, port.kind)
+            port.boolean = _switched(normalized, port.boolean)
+            port.shown = (raw, normalized, _scaled(normalized, port.mode, port.boolean))
+        return True
+
+    def _bus_status(self, number: int) -> bytes:
+        port = self._port(number)
+        status, ready = self._bus(port)
+        return _told(status, bytes((len(ready),)))
+
+    def _bus_write(self, number: int, n_written: int, n_wanted: int, written: bytes) -> bytes:
+        port = self._port(number)
+        status, _ = self._bus(port)
+        if status in (Status.CHANNEL_NOT_READY, Status.BUS_PENDING):
+            raise Refused(Status.CHANNEL_NOT_READY)
+        if n_written > 16 or n_wanted > 16 or len(written) < n_written:
+            raise Refused(Status.ILLEGAL_SIZE)
+        device = port.sensor
+        answer = device.transfer(written[:n_written], n_wanted) if isinstance(device, Digital) else None
+        port.failed, port.answer = answer is None, answer or b""
+        port.answered_s = self.clock() + 10 * (n_written + n_wanted) * _I2C_BIT_S
+        return b""
+
+    def _bus_read(self, number: int) -> bytes:
+        port = self._port(number)
+        status, ready = self._bus(port)
+        if status == Status.OK:
+            port.answer = b""
+        return _told(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
+
+    def _bus(self, port: _Port) -> tuple[Status, bytes]:
+        """Say how the bus stands, and what there is to read."""
+        if port.kind not in _DIGITAL or self.clock() < port.valid_s:
+            return Status.CHANNEL_NOT_READY, b""
+        if self.clock() < port.answered_s:
+            return Status.BUS_PENDING, b""
+        return (Status.BUS_ERROR, b"") if port.failed else (Status.OK, port.answer)
+
+    def _port(self, number: int) -> _Port:
+        if number >= len(self._ports):
+            raise Refused(Status.OUT_OF_RANGE)
+        return self._ports[number]
+
+
+def _told(status: Status, payload: bytes) -> bytes:
+    if status != Status.OK:
+        raise Refused(status, payload)
+    return payload
+
+
+def _normalized(raw: int, kind: int) -> int:
+    """Scale to 0..1023 as the firmware does, in whole numbers, more light or sound giving more."""
+    if kind in (_LIGHT_ON, _LIGHT_OFF):
+        zero, percent = _LIGHT_SCALE
+    elif kind in _SOUND:
+        zero, percent = _SOUND_SCALE
+    else:
+        return raw
+    return AD_MAX - min(max(raw - zero, 0) * 100 // percent, AD_MAX)
+
+
+def _switched(normalized: int, before: int) -> int:
+    """Decide with hysteresis, at 45 % and 55 %; low is on, as a pressed touch sensor is."""
+    if normalized < AD_MAX * 45 // 100:
+        return 1
+    return 0 if normalized > AD_MAX * 55 // 100 else before
+
+
+def _scaled(normalized: int, mode: int, boolean: int) -> int:
+    """Convert by mode; the counting modes stay at 0, for no sensor here makes edges to count."""
+    match mode & 0xE0:
+        case 0x00:
+            return normalized
+        case 0x20:
+            return boolean
+        case 0x80:
+            return normalized * 100 // AD_MAX
+        case 0xA0:
+            return normalized * 900 // AD_MAX - 200
+        case 0xC0:
+            return 180 * (normalized * 900 // AD_MAX - 200) // 100 + 320
+        case _:
+            return 0

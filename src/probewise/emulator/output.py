@@ -1,0 +1,258 @@
+"""An output port as the firmware runs it, a millisecond at a time: limits, ramps, regulation, counters.
+
+Written after the behaviour of LEGO's firmware 1.28 to 1.31. What a host has to know of it:
+
+- The tacho limit moves a running *goal*, which is where the last limited run should have ended, not where
+  it did. So the overshoot of one run is taken off the next one. A run without a limit draws the goal along.
+- At the limit the port falls idle: power fades by 1 a millisecond and the motor coasts past the limit.
+- Speed regulation acts every 101 ms; one unit of power stands for one count in 100 ms, 10 degrees a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from probewise.emulator.motor import Motor
+from probewise.emulator.protocol import Field
+
+__all__ = ["Output", "RunState", "Setting", "bounded", "quotient"]
+
+_ON, _BRAKE, _REGULATED = 0x01, 0x02, 0x04  # bits of the mode byte
+_SPEED, _SYNC = 0x01, 0x02  # bits of the regulation byte
+_REGULATION_MS = 100
+_LEAST_RAMP_POWER = 10
+_GAIN_P, _GAIN_I, _GAIN_D = 3, 1, 1
+
+
+class RunState(IntEnum):
+    """What a port is doing."""
+
+    IDLE = 0x00
+    RAMP_UP = 0x10
+    RUNNING = 0x20
+    RAMP_DOWN = 0x40
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What SETOUTPUTSTATE says, in the order of its bytes; a GETOUTPUTSTATE reply begins with it."""
+
+    power: int = 0
+    mode: int = 0
+    regulation: int = 0
+    turn_ratio: int = 0
+    run_state: int = 0
+    tacho_limit: int = 0
+
+
+@dataclass
+class Output:
+    """One port, its motor and the firmware's numbers for it."""
+
+    motor: Motor = field(default_factory=Motor)
+    setting: Setting = field(default_factory=Setting)
+    run_state: int = RunState.IDLE
+    tacho_count: int = 0
+    block_count: int = 0
+    rotation_count: int = 0
+
+    set_power: int = 0  # where a ramp leads
+    target_power: int = 0  # what it has come to; the speed that is regulated
+    power: int = 0  # what the motor gets
+    _brake: bool = False
+    _regulation: int = 0
+    _goal: int = 0
+    _endless: bool = True
+    _clock_ms: int = 0
+    _moved: int = 0  # counts since the last regulation
+    _error: int = 0
+    _error_sum: int = 0
+    _ramp_counts: int = 0  # between two steps of a ramp; 0: not worked out yet
+    _ramp_from: int = 0
+    _ramp_last: int = 0
+    _seen_deg: int = 0
+    _settled: bool = False
+
+    def __post_init__(self) -> None:
+        self._seen_deg = self._shown_deg
+
+    def apply(self, setting: Setting) -> None:
+        """Take an order, in the firmware's sequence: speed, then regulation, then limit."""
+        self.setting, self._settled = setting, False
+        self._brake = bool(setting.mode & _BRAKE)
+        if setting.mode & _ON:
+            self._order(setting.run_state, setting.power)
+            self._regulation = setting.regulation if setting.mode & _REGULATED else 0
+            if self._regulation & _SPEED and not self.set_power and self.run_state != RunState.RAMP_DOWN:
+                self._error = self._error_sum = 0
+        else:
+            self._order(RunState.IDLE, 0)
+            self._regulation = 0
+        self._endless = not setting.tacho_limit
+        forward = (self.set_power or self.target_power) > 0
+        self._goal += setting.tacho_limit if forward else -setting.tacho_limit
+
+    def reset(self, *, block: bool) -> None:
+        """Set the block or the rotation counter to 0; neither touches the goal."""
+        if block:
+            self.block_count = 0
+        else:
+            self.rotation_count = 0
+
+    def report(self) -> tuple[Field, ...]:
+        """Return what GETOUTPUTSTATE says after the port's number."""
+        s = self.setting
+        asked = (s.power, s.mode, s.regulation, s.turn_ratio, self.run_state, s.tacho_limit)
+        return (*asked, self.tacho_count, self.block_count, self.rotation_count)
+
+    def tick(self, battery_mv: float) -> None:
+        """Let a millisecond pass: the motor turns, the firmware looks and acts."""
+        self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
+        seen = self._shown_deg
+        turned, self._seen_deg = seen - self._seen_deg, seen
+        self.tacho_count += turned
+        self.block_count += turned
+        self.rotation_count += turned
+        self._moved += turned
+        self._clock_ms += 1
+        if self.run_state == RunState.RAMP_UP:
+            self._ramp_up()
+        if self.run_state == RunState.RAMP_DOWN:
+            self._ramp_down()
+        if self.run_state == RunState.RUNNING:
+            self._run()
+        if self.run_state == RunState.IDLE:
+            self._fade()
+
+    def regulate(self) -> bool:
+        """Regulate the speed, if the time for it has come, and tell whether it had."""
+        if self._clock_ms <= _REGULATION_MS:
+            return False
+        if self._regulation & _SPEED:
+            before = (self.power, self._error, self._error_sum)
+            self.power = self._regulated(self._error - self._moved + self.target_power)
+            # Held off its place by less than friction lets it move: so it stays.
+            self._settled = not self._moved and before == (self.power, self._error, self._error_sum)
+        self._clock_ms = self._moved = 0
+        return True
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether nothing will happen without an order, or a hand that turns the motor."""
+        if self.motor.speed_deg_s or self.target_power or self.set_power or self._seen_deg != self._shown_deg:
+            return False
+        return self._settled and not self._moved if self._regulation else not self.power
+
+    @property
+    def is_at_limit(self) -> bool:
+        """Whether a limited run has come to its end."""
+        return not self._endless and self.set_power != 0 and (self.tacho_count - self._goal) * self.set_power >= 0
+
+    @property
+    def is_synchronised(self) -> bool:
+        """Whether it is to turn in step with another port."""
+        return self._regulation & (_SYNC | _SPEED) == _SYNC
+
+    @property
+    def _shown_deg(self) -> int:
+        """What the motor's encoder shows: whole degrees."""
+        return int(self.motor.angle_deg // 1)
+
+    def _order(self, run_state: int, power: int) -> None:
+        if run_state == self.run_state != RunState.IDLE and power == self.set_power:
+            return
+        if not self.target_power:
+            self._error = self._error_sum = self._clock_ms = self._moved = 0
+        if run_state == RunState.IDLE:
+            self._regulation = 0
+        elif run_state == RunState.RUNNING:
+            self.set_power = self.target_power = power
+            if not power:  # hold: from now on, and from here
+                self.power = self._clock_ms = self._moved = 0
+        elif self._is_past(run_state, power):
+            run_state = RunState.RUNNING
+        else:
+            self.set_power, self._ramp_counts, self._ramp_from = power, 0, self.tacho_count
+        self.run_state = run_state
+
+    def _is_past(self, ramp: int, power: int) -> bool:
+        """Tell whether a ramp to this power, up or down, has nothing left to do."""
+        if ramp == RunState.RAMP_UP:
+            return self.set_power != 0 and (self.set_power >= power if power > 0 else self.set_power <= power)
+        return self.set_power <= power if self.target_power >= 0 else self.set_power >= power
+
+    def _ramp_up(self) -> None:
+        """Raise the power by 1 each so many counts, so as to be there at the limit."""
+        sign = 1 if self.set_power > 0 else -1
+        if not self.target_power:
+            self.target_power = sign * _LEAST_RAMP_POWER
+        elif self.target_power != self.set_power:
+            if not self._ramp_counts:
+                to_go = sign * (self._goal - self._ramp_from)
+                self._ramp_counts = max(to_go // abs(self.set_power - self.target_power), 1)
+                self._ramp_last = self.tacho_count
+            if sign * (self.tacho_count - self._ramp_last) > self._ramp_counts:
+                self.target_power += sign
+                self._ramp_last = self.tacho_count
+        if sign * (self.tacho_count - self._goal) >= 0:
+            self.target_power = self.set_power
+            self.run_state = RunState.IDLE
+        self._drive_unregulated()
+
+    def _ramp_down(self) -> None:
+        """Lower the power by 1 each so many counts, to 10 and no less, until the limit."""
+        sign = 1 if self.target_power > 0 else -1
+        if not self._ramp_counts:
+            steps = abs(self.target_power - self.set_power) - (0 if self.set_power else _LEAST_RAMP_POWER)
+            self._ramp_counts = max(sign * (self._goal - self.tacho_count) // max(steps, 1), 1)
+            self._ramp_last = self.tacho_count
+        if sign * (self.tacho_count - self._ramp_last) > self._ramp_counts:
+            self.target_power = sign * max(abs(self.target_power) - 1, _LEAST_RAMP_POWER)
+            self._ramp_last = self.tacho_count
+        if sign * (self.tacho_count - self._goal) >= 0:
+            if not self.set_power:
+                self.target_power = self.power = 0
+            self.run_state, self._regulation = RunState.IDLE, 0
+        self._drive_unregulated()
+
+    def _run(self) -> None:
+        """Look for the limit, or draw the goal along where there is none."""
+        if self._endless:
+            if self.target_power:
+                self._goal = self.tacho_count
+        elif self.is_at_limit and not self.is_synchronised:
+            self.run_state, self._regulation = RunState.IDLE, 0
+        self._drive_unregulated()
+
+    def _drive_unregulated(self) -> None:
+        if not self._regulation:
+            self.power = bounded(self.target_power, 100)
+
+    def _fade(self) -> None:
+        """Coast: power goes by 1 a millisecond, so that a host sees IDLE well before the motor rests."""
+        self._brake = False
+        self.power -= _sign(self.power)
+        self.target_power -= _sign(self.target_power)
+        self.set_power -= _sign(self.set_power)
+
+    def _regulated(self, error: int) -> int:
+        """Return the power that the firmware's regulator gives for a distance behind its plan, in counts."""
+        steepness, self._error = error - self._error, error
+        self._error_sum = bounded(quotient(3 * self._error_sum + error, 4), 800)
+        wanted = bounded(_GAIN_P * error, 100) + bounded(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness
+        return bounded(quotient(wanted, 2), 100)
+
+
+def bounded(value: int, limit: int) -> int:
+    """Keep a value within +-limit."""
+    return min(max(value, -limit), limit)
+
+
+def quotient(value: int, by: int) -> int:
+    """Divide as C does, towards 0."""
+    return value // by if value >= 0 else -(-value // by)
+
+
+def _sign(value: int) -> int:
+    return (value > 0) - (value < 0)

@@ -1,0 +1,106 @@
+"""The three output ports: time for all of them, synchronised pairs, and the commands that reach them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from probewise.emulator.motor import Motor
+from probewise.emulator.output import Output, RunState, Setting, bounded, quotient
+from probewise.emulator.protocol import Refused, Status
+
+__all__ = ["Outputs"]
+
+_ALL = 0xFF
+_TICK_S = 1e-3
+
+
+@dataclass
+class _Step:
+    """What the firmware remembers of a pair that turns in step."""
+
+    lead: int = 0  # by how many counts the first is ahead of where the turn ratio wants it
+    lead_sum: int = 0
+    turn: int = 0  # counts by which the turn ratio has parted them so far
+
+    def correct(self, one: Output, two: Output) -> None:
+        """Slow the one that leads and drive the one that lags (P 3, I 1, D 1, over 4)."""
+        inner = two if (one.setting.turn_ratio > 0) == (one.target_power >= 0) else one
+        self.turn += 2 * quotient(inner.setting.turn_ratio * abs(inner.target_power), 100)
+        lead = bounded(one.block_count - two.block_count + self.turn, 500)
+        self.lead_sum = bounded(self.lead_sum + lead, 900)
+        wanted = quotient(3 * lead + self.lead_sum + (lead - self.lead), 4)
+        self.lead = lead
+        for port, target in ((one, one.target_power - wanted), (two, two.target_power + wanted)):
+            port.power = bounded(target, abs(port.target_power) if one.setting.turn_ratio else 100)
+
+
+class Outputs:
+    """Ports A, B and C.
+
+    Parameters
+    ----------
+    motors
+        What is plugged in, in this order.
+    now_s
+        The clock's time.
+    """
+
+    def __init__(self, motors: Sequence[Motor], *, now_s: float) -> None:
+        self.ports = tuple(Output(motor) for motor in motors)
+        self._ticked_s = now_s
+        self._step = _Step()
+        self.commands: Mapping[int, Callable[..., bytes]] = {
+            0x04: self._set_state,
+            0x06: self._get_state,
+            0x0A: self._reset,
+        }
+
+    def advance(self, now_s: float, battery_mv: float) -> None:
+        """Let all milliseconds up to now pass."""
+        n_ticks = int((now_s - self._ticked_s) / _TICK_S + 1e-6)
+        self._ticked_s += n_ticks * _TICK_S
+        for _ in range(n_ticks):
+            moving = [port for port in self.ports if not port.is_at_rest]
+            if not moving:
+                return
+            self._tick(moving, battery_mv)
+
+    def release(self) -> None:
+        """Let all motors coast, as the start or the end of a program does."""
+        for port in self.ports:
+            port.apply(Setting())
+
+    def _tick(self, moving: Sequence[Output], battery_mv: float) -> None:
+        for port in moving:
+            port.tick(battery_mv)
+        pair = [port for port in moving if port.is_synchronised][:2]
+        if len(pair) == 2 and any(port.is_at_limit for port in pair):
+            for port in pair:
+                port.run_state = RunState.IDLE
+        regulated = [port for port in moving if port.regulate()]
+        if len(pair) == 2 and pair[0] in regulated:
+            self._step.correct(*pair)
+
+    def _set_state(
+        self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
+    ) -> bytes:
+        setting = Setting(power, mode, regulation, turn_ratio, run_state, tacho_limit)
+        for output in self.ports if port == _ALL else (self._port(port),):
+            output.apply(setting)
+            if output.is_synchronised:
+                self._step = _Step()
+        return b""
+
+    def _get_state(self, port: int) -> bytes:
+        return struct.pack("<BbBBbBIiii", port, *self._port(port).report())
+
+    def _reset(self, port: int, relative: int) -> bytes:
+        self._port(port).reset(block=bool(relative))
+        return b""
+
+    def _port(self, port: int) -> Output:
+        if port >= len(self.ports):
+            raise Refused(Status.OUT_OF_RANGE)
+        return self.ports[port]

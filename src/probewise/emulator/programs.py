@@ -1,0 +1,85 @@
+"""A program that runs on the brick, as far as a host can tell: its name and its mailboxes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+
+from probewise.emulator.protocol import Refused, Status
+
+__all__ = ["Programs"]
+
+_N_BOXES = 20
+_ANSWERS = 10  # a program's outbox n is the host's box n + 10
+_DEPTH = 5
+_SIZE = 59
+
+
+class Programs:
+    """Start, stop, and swap messages. Every program here does the same: it sends each message back.
+
+    Parameters
+    ----------
+    exists
+        Whether there is a program of a name.
+    on_change
+        What starting or stopping one does to motors and sensors.
+    """
+
+    def __init__(self, exists: Callable[[str], bool], on_change: Callable[[], None]) -> None:
+        self._exists, self._on_change = exists, on_change
+        self.running: bytes | None = None
+        self._boxes: tuple[deque[bytes], ...] = ()
+        self.commands: Mapping[int, Callable[..., bytes]] = {
+            0x00: self._start,
+            0x01: self._stop,
+            0x09: self._write,
+            0x11: self._name,
+            0x13: self._read,
+        }
+
+    def _start(self, name: bytes) -> bytes:
+        if not self._exists(name.split(b"\0")[0].decode("latin-1")):
+            raise Refused(Status.OUT_OF_RANGE)
+        self._switch(name)
+        return b""
+
+    def _stop(self) -> bytes:
+        self._needed()
+        self._switch(None)
+        return b""
+
+    def _switch(self, name: bytes | None) -> None:
+        self.running = name
+        self._boxes = tuple(deque(maxlen=_DEPTH) for _ in range(_N_BOXES))
+        self._on_change()
+
+    def _write(self, box: int, size: int, rest: bytes) -> bytes:
+        message = rest[:size]
+        if not 1 <= size <= _SIZE or len(message) < size or message[-1]:
+            raise Refused(Status.OUT_OF_RANGE)
+        if box >= _N_BOXES:
+            raise Refused(Status.ILLEGAL_MAILBOX)
+        self._needed()
+        self._boxes[box + _ANSWERS if box < _ANSWERS else box].append(message)
+        return b""
+
+    def _read(self, box: int, local_box: int, remove: int) -> bytes:
+        def told(message: bytes) -> bytes:
+            return bytes((local_box, len(message))) + message.ljust(_SIZE, b"\0")
+
+        if self.running is None:
+            raise Refused(Status.NO_PROGRAM, told(b""))
+        if box >= _N_BOXES:
+            raise Refused(Status.ILLEGAL_MAILBOX, told(b""))
+        if not self._boxes[box]:
+            raise Refused(Status.MAILBOX_EMPTY, told(b""))
+        return told(self._boxes[box].popleft() if remove else self._boxes[box][0])
+
+    def _name(self) -> bytes:
+        return self._needed()
+
+    def _needed(self) -> bytes:
+        if self.running is None:
+            raise Refused(Status.NO_PROGRAM)
+        return self.running

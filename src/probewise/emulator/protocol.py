@@ -1,0 +1,188 @@
+"""The brick's side of LEGO's Bluetooth protocol: requests taken apart, replies put together.
+
+Layouts follow LEGO's direct and system commands; all numbers are little-endian. A frame on the wire
+is the length of a telegram in two bytes, then the telegram.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TypeAlias
+
+__all__ = ["COMMANDS", "Command", "Field", "Frames", "Refused", "Request", "Status", "framed", "parse", "reply"]
+
+Field: TypeAlias = int | bytes
+
+_REPLY, _NO_REPLY = 0x02, 0x80
+_DIRECT, _SYSTEM = 0x00, 0x01
+
+
+class Status(IntEnum):
+    """The status bytes that this brick answers with."""
+
+    OK = 0x00
+    BUS_PENDING = 0x20
+    MAILBOX_EMPTY = 0x40
+    NO_MORE_HANDLES = 0x81
+    NO_SPACE = 0x82
+    END_OF_FILE = 0x85
+    FILE_NOT_FOUND = 0x87
+    HANDLE_CLOSED = 0x88
+    UNDEFINED_ERROR = 0x8A
+    FILE_BUSY = 0x8B
+    FILE_FULL = 0x8E
+    FILE_EXISTS = 0x8F
+    MODULE_NOT_FOUND = 0x90
+    ILLEGAL_FILE_NAME = 0x92
+    ILLEGAL_HANDLE = 0x93
+    UNKNOWN_COMMAND = 0xBE
+    MALFORMED = 0xBF
+    OUT_OF_RANGE = 0xC0
+    BUS_ERROR = 0xDD
+    CHANNEL_NOT_READY = 0xE0
+    NO_PROGRAM = 0xEC
+    ILLEGAL_SIZE = 0xED
+    ILLEGAL_MAILBOX = 0xEE
+
+
+class Refused(Exception):
+    """Carry a status other than OK; `payload` None stands for zeros at the command's full length."""
+
+    def __init__(self, status: Status, payload: bytes | None = None) -> None:
+        self.status, self.payload = status, payload
+        super().__init__(status.name)
+
+
+@dataclass(frozen=True)
+class Command:
+    """How one command's telegram goes on after the opcode, and its error reply after the status.
+
+    `layout` is that of `struct`; with `more` any bytes follow and come as the last field. `error_bytes`
+    zeros follow the status of an error, as the firmware sends them.
+    """
+
+    name: str
+    layout: str = ""
+    error_bytes: int = 0
+    more: bool = False
+
+    def fields(self, body: bytes) -> tuple[Field, ...]:
+        """Take the bytes after the opcode apart.
+
+        Raises
+        ------
+        Refused
+            If there are too few of them.
+        """
+        size = struct.calcsize("<" + self.layout)
+        if len(body) < size:
+            raise Refused(Status.MALFORMED)
+        found: tuple[Field, ...] = struct.unpack("<" + self.layout, body[:size])
+        return (*found, body[size:]) if self.more else found
+
+
+COMMANDS: dict[int, Command] = {
+    0x00: Command("STARTPROGRAM", "20s"),
+    0x01: Command("STOPPROGRAM"),
+    0x02: Command("PLAYSOUNDFILE", "B20s"),
+    0x03: Command("PLAYTONE", "HH"),
+    0x04: Command("SETOUTPUTSTATE", "BbBBbBI"),
+    0x05: Command("SETINPUTMODE", "BBB"),
+    0x06: Command("GETOUTPUTSTATE", "B", 22),
+    0x07: Command("GETINPUTVALUES", "B", 13),
+    0x08: Command("RESETINPUTSCALEDVALUE", "B"),
+    0x09: Command("MESSAGEWRITE", "BB", more=True),
+    0x0A: Command("RESETMOTORPOSITION", "BB"),
+    0x0B: Command("GETBATTERYLEVEL"),
+    0x0C: Command("STOPSOUNDPLAYBACK"),
+    0x0D: Command("KEEPALIVE"),
+    0x0E: Command("LSGETSTATUS", "B"),
+    0x0F: Command("LSWRITE", "BBB", more=True),
+    0x10: Command("LSREAD", "B"),
+    0x11: Command("GETCURRENTPROGRAMNAME", "", 20),
+    0x13: Command("MESSAGEREAD", "BBB", 61),
+    0x80: Command("OPENREAD", "20s", 5),
+    0x81: Command("OPENWRITE", "20sI", 1),
+    0x82: Command("READ", "BH", 3),
+    0x83: Command("WRITE", "B", 3, more=True),
+    0x84: Command("CLOSE", "B", 1),
+    0x85: Command("DELETE", "20s", 20),
+    0x86: Command("FINDFIRST", "20s", 25),
+    0x87: Command("FINDNEXT", "B", 25),
+    0x88: Command("GETFIRMWAREVERSION"),
+    0x89: Command("OPENWRITELINEAR", "20sI", 1),
+    0x8B: Command("OPENWRITEDATA", "20sI", 1),
+    0x8C: Command("OPENAPPENDDATA", "20s", 5),
+    0x90: Command("FINDFIRSTMODULE", "20s", 31),
+    0x91: Command("FINDNEXTMODULE", "B", 31),
+    0x92: Command("CLOSEMODULE", "B", 1),
+    0x94: Command("READIOMAP", "IHH", 6),
+    0x95: Command("WRITEIOMAP", "IHH", 6, more=True),
+    0x97: Command("BOOT", "19s", 4),
+    0x98: Command("SETBRICKNAME", "", more=True),
+    0x9B: Command("GETDEVICEINFO"),
+    0xA0: Command("DELETEUSERFLASH"),
+    0xA1: Command("POLLLENGTH", "B"),
+    0xA2: Command("POLL", "BB"),
+    0xA4: Command("BLUETOOTHFACTORYRESET"),
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """One telegram from the host; `command` is None where the opcode is unknown."""
+
+    opcode: int
+    wants_reply: bool
+    command: Command | None
+    body: bytes
+
+
+def parse(telegram: bytes) -> Request | None:
+    """Take a telegram apart; None for what the firmware passes over: replies, unknown types, stumps."""
+    if len(telegram) < 2:
+        return None
+    kind, opcode = telegram[0] & ~_NO_REPLY, telegram[1]
+    if kind not in (_DIRECT, _SYSTEM):
+        return None
+    # Direct opcodes are below 0x80, system opcodes are not: one asked for as the other is unknown.
+    command = COMMANDS.get(opcode) if (kind == _SYSTEM) == (opcode >= 0x80) else None
+    return Request(opcode, not telegram[0] & _NO_REPLY, command, telegram[2:])
+
+
+def reply(opcode: int, status: int, payload: bytes = b"") -> bytes:
+    """Put a reply telegram together."""
+    return bytes((_REPLY, opcode, status)) + payload
+
+
+def framed(telegram: bytes) -> bytes:
+    """Put the length in front, as Bluetooth has it and USB has not."""
+    return struct.pack("<H", len(telegram)) + telegram
+
+
+_PATIENCE_S = 0.61  # after so long a silence the firmware gives a half frame up
+
+
+@dataclass
+class Frames:
+    """Collect bytes as they come, in any pieces, and give back whole telegrams."""
+
+    _held: bytearray = field(default_factory=bytearray)
+    _last_s: float = 0.0
+
+    def feed(self, received: bytes, now_s: float) -> Iterator[bytes]:
+        """Yield every telegram that is complete now."""
+        if now_s - self._last_s > _PATIENCE_S:
+            self._held.clear()
+        self._last_s = now_s
+        self._held += received
+        while len(self._held) >= 2:
+            end = 2 + int.from_bytes(self._held[:2], "little")
+            if len(self._held) < end:
+                return
+            telegram = bytes(self._held[2:end])
+            del self._held[:end]
+            yield telegram

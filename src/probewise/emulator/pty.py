@@ -1,0 +1,121 @@
+"""The link as a serial device: a pseudo-terminal that behaves like /dev/rfcomm0."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+from probewise.emulator.clock import Clock
+from probewise.emulator.radio import Radio
+from probewise.errors import FileError
+
+__all__ = ["Terminal", "serve"]
+
+_LONGEST_WAIT_S = 0.05
+
+
+class Terminal:
+    """A raw pseudo-terminal; clients may come and go.
+
+    Parameters
+    ----------
+    link
+        A symbolic link to keep on it, which outlives disconnections as /dev/rfcomm0 does; None: none.
+
+    Raises
+    ------
+    FileError
+        If something other than a symbolic link is in the way.
+    """
+
+    def __init__(self, link: Path | None = None) -> None:
+        if link is not None and link.exists() and not link.is_symlink():
+            raise FileError(link, "something stands there", "a new name, or a symbolic link to replace")
+        self._link = link
+        self._open()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+
+    @property
+    def path(self) -> str:
+        """Where clients open it."""
+        return self._slave_path if self._link is None else str(self._link)
+
+    def hang_up(self) -> None:
+        """End the connection, so that clients find the device gone, and come back as a new one."""
+        self._close()
+        self._open()
+
+    def read(self, wait_s: float) -> bytes:
+        """Return what a client has written, waiting for it no longer than this."""
+        ready, _, _ = select.select([self._master], [], [], wait_s)
+        return os.read(self._master, 4096) if ready else b""
+
+    def write(self, data: bytes) -> None:
+        """Hand bytes over in one piece, for a client may take each read for a frame; lost if it never reads."""
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, data)
+
+    def _open(self) -> None:
+        # The slave stays open here too: without it the master fails as soon as the last client leaves.
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._slave_path = os.ttyname(self._slave)
+        if self._link is not None:
+            fresh = self._link.with_name(f".{self._link.name}.{os.getpid()}")
+            fresh.symlink_to(self._slave_path)
+            fresh.replace(self._link)
+
+    def _close(self) -> None:
+        os.close(self._slave)
+        os.close(self._master)
+
+
+def serve(
+    terminal: Terminal,
+    radio: Radio,
+    clock: Clock,
+    *,
+    on_move: Callable[[str], None],
+    meanwhile: Callable[[], None],
+) -> None:
+    """Carry bytes between client and brick until the brick goes to sleep.
+
+    Parameters
+    ----------
+    terminal, radio
+        What is joined.
+    clock
+        The brick's clock, which must be the wall's.
+    on_move
+        Told the device's new path where a disconnection has changed it.
+    meanwhile
+        Called again and again, at least every 50 ms.
+    """
+    while not radio.brick.is_off:
+        due_s = radio.next_s
+        wait_s = _LONGEST_WAIT_S if due_s is None else min(max(due_s - clock(), 0.0), _LONGEST_WAIT_S)
+        radio.send(terminal.read(wait_s))
+        radio.brick.advance()
+        meanwhile()
+        received = radio.receive()
+        if received:
+            terminal.write(received)
+        if not radio.is_open and not radio.brick.is_off:
+            before = terminal.path
+            terminal.hang_up()
+            radio.reconnect()
+            if terminal.path != before:
+                on_move(terminal.path)

@@ -1,0 +1,90 @@
+"""What lies on the field, read from a text such as `circle:524,300,100`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from probewise.errors import ParameterError
+from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Uniform
+from probewise.world import Oval, Surface
+
+__all__ = ["FORMS", "parse_scene"]
+
+FORMS = (
+    "[circle:]X,Y,RADIUS",
+    "ellipse:X,Y,A,B,ANGLE",
+    "polygon:X,Y,X,Y,X,Y,...",
+    "edge:ANGLE,OFFSET",
+    "corner:X,Y,DX,DY",
+    "uniform:ALBEDO",
+)
+"""How a scene is written; mm and degrees. White is inside, at the edge's far side, or towards DX, DY = +1 or -1."""
+
+
+def parse_scene(text: str) -> Surface:
+    """Read a scene in one of its forms.
+
+    Raises
+    ------
+    ParameterError
+        If it has none of the forms.
+    """
+    name, _, listed = text.rpartition(":")
+    try:
+        return _MAKERS[name or "circle"](*(_finite(cell) for cell in listed.split(",")))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError("--scene", text, f"{'; '.join(FORMS)}; in mm and degrees") from error
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+def _circle(x_mm: float, y_mm: float, radius_mm: float) -> Disc:
+    return Disc((x_mm, y_mm), _positive(radius_mm))
+
+
+def _ellipse(x_mm: float, y_mm: float, a_mm: float, b_mm: float, angle_deg: float) -> Oval:
+    return Oval((x_mm, y_mm), (_positive(a_mm), _positive(b_mm)), math.radians(angle_deg))
+
+
+def _polygon(*numbers: float) -> Polygon:
+    if len(numbers) < 6:
+        raise ValueError(numbers)
+    return Polygon(tuple(zip(numbers[::2], numbers[1::2], strict=True)))
+
+
+def _edge(angle_deg: float, offset_mm: float) -> HalfPlane:
+    return HalfPlane(math.radians(angle_deg), offset_mm)
+
+
+def _corner(x_mm: float, y_mm: float, dx: float, dy: float) -> Quadrant:
+    if {abs(dx), abs(dy)} != {1.0}:
+        raise ValueError(dx, dy)
+    return Quadrant((x_mm, y_mm), (int(dx), int(dy)))
+
+
+def _uniform(albedo: float) -> Uniform:
+    if not 0 <= albedo <= 1:
+        raise ValueError(albedo)
+    return Uniform(albedo)
+
+
+def _positive(value: float) -> float:
+    if value <= 0:
+        raise ValueError(value)
+    return value
+
+
+_MAKERS: Mapping[str, Callable[..., Surface]] = {
+    "circle": _circle,
+    "ellipse": _ellipse,
+    "polygon": _polygon,
+    "edge": _edge,
+    "corner": _corner,
+    "uniform": _uniform,
+}

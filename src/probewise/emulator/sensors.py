@@ -1,0 +1,83 @@
+"""What may be plugged into an input port: it gives a voltage, or it speaks I2C."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from probewise.emulator.clock import Clock
+
+__all__ = ["Analog", "Digital", "Light", "NothingAnalog", "sonar"]
+
+AD_MAX = 1023
+
+
+class Analog(Protocol):
+    """A sensor that makes a voltage."""
+
+    def counts(self, *, lit: bool) -> int:
+        """Return the voltage as the converter sees it, 0 to 1023 of 5 V; `lit`: the port feeds the LED."""
+        ...
+
+
+@dataclass(frozen=True)
+class NothingAnalog:
+    """An empty socket: the pull-up resistor alone."""
+
+    def counts(self, *, lit: bool) -> int:
+        """Return the full voltage."""
+        return AD_MAX
+
+
+@dataclass
+class Light:
+    """The light sensor 9844: the more light, the lower the voltage.
+
+    Parameters
+    ----------
+    seen
+        What the firmware's scale 0 to 100 would show if it had no steps, LED on or off.
+    clock
+        The converter takes a new sample every 3 ms of it.
+    """
+
+    seen: Callable[[bool], float]
+    clock: Clock
+    _sample: tuple[int, bool, int] = field(default=(-1, False, AD_MAX))
+
+    def counts(self, *, lit: bool) -> int:
+        """Return the sample that stands in the converter."""
+        number = int(self.clock() / 0.003)
+        if self._sample[:2] != (number, lit):
+            self._sample = (number, lit, _counts_of(self.seen(lit)))
+        return self._sample[2]
+
+
+def _counts_of(percent: float) -> int:
+    """Turn the firmware's conversion round: 0 % lies at 896 counts, 100 % at 200, and it runs on to both sides."""
+    return min(max(round(200 + 68 / 100 * (AD_MAX - percent * AD_MAX / 100)), 0), AD_MAX)
+
+
+@dataclass
+class Digital:
+    """A sensor with registers at one I2C address."""
+
+    address: int
+    registers: dict[int, bytes]
+
+    def transfer(self, written: bytes, wanted: int) -> bytes | None:
+        """Answer a write of address, register and data; None where nobody acknowledges."""
+        if len(written) < 2 or written[0] & 0xFE != self.address:
+            return None
+        begin = written[1]
+        if len(written) > 2:
+            self.registers[begin] = written[2:]
+        return self.registers.get(begin, b"")[:wanted].ljust(wanted, b"\0")
+
+
+def sonar(distance_cm: int) -> Digital:
+    """Make an ultrasonic sensor that stands before a wall."""
+    version, maker, kind = b"V1.0".ljust(8, b"\0"), b"LEGO".ljust(8, b"\0"), b"Sonar".ljust(8, b"\0")
+    heads = {0x00: version, 0x08: maker, 0x10: kind, 0x14: b"10E-2m\0", 0x41: b"\x02", 0x42: bytes((distance_cm,))}
+    return Digital(0x02, heads)

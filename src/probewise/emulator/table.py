@@ -1,0 +1,40 @@
+"""What a person at the bench changes by hand: what lies on the field, and how the sensor is turned in its mount."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from probewise.emulator.scenes import FORMS, parse_scene
+from probewise.errors import ParameterError
+from probewise.world import Surface
+
+__all__ = ["Table"]
+
+
+@dataclass
+class Table:
+    """The surface under the sensor, and by how much somebody has turned the sensor from where the geometry has it."""
+
+    surface: Surface
+    turned_rad: float = 0.0
+
+    def obey(self, wish: str) -> None:
+        """Do what a line says: a scene in one of its forms, or `turn DEGREES` for the sensor.
+
+        Raises
+        ------
+        ParameterError
+            If it says neither; nothing changes then.
+        """
+        verb, _, angle = wish.strip().partition(" ")
+        try:
+            if verb == "turn":
+                angle_deg = float(angle)
+                if not math.isfinite(angle_deg):
+                    raise ValueError(angle)
+                self.turned_rad = math.radians(angle_deg)
+            else:
+                self.surface = parse_scene(wish.strip())
+        except ValueError as error:
+            raise ParameterError("line", wish, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error

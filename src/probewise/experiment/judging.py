@@ -1,0 +1,103 @@
+"""Judge a posterior: what it says of the shape, whether any hypothesis explains the readings, whether to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from probewise._arrays import FloatArray
+from probewise.arm.instrument import Reading
+from probewise.experiment.setting import Experiment, widest_mm
+from probewise.inference.problem import SensorProblem
+from probewise.inquiry import UtilityMap
+from probewise.nested.importance import Weighted
+from probewise.scene.shapes import AnyOf
+
+__all__ = ["doubt", "fit", "information", "learnt", "moments", "stop_reason"]
+
+
+def information(posterior: Weighted) -> float:
+    """Relative entropy of posterior to prior, nats: the mean log likelihood less the log evidence."""
+    some = posterior.weight > 0  # what has been ruled out has a log likelihood of minus infinity
+    return float(posterior.weight[some] @ posterior.log_likelihood[some]) - posterior.log_z
+
+
+def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+    """Mean and sd of the shape's parameters, (n_params,) both, and shape probabilities.
+
+    Of a set of shapes: given its most probable shape, and NaN for parameters that it does not have.
+    """
+    theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
+    if not isinstance(experiment.shape, AnyOf):
+        mean = weight @ theta
+        return mean, np.sqrt(weight @ (theta - mean) ** 2), {}
+    which = experiment.shape.which(theta)
+    share = np.bincount(which, weights=weight, minlength=len(experiment.shape.labels))
+    likely = int(share.argmax())
+    columns = experiment.shape.prior.columns[likely]
+    own = theta[np.ix_(which == likely, columns)]
+    given = weight[which == likely] / share[likely]
+    mean, sd = np.full((2, theta.shape[1]), np.nan)
+    mean[columns] = given @ own
+    sd[columns] = np.sqrt(given @ (own - mean[columns]) ** 2)
+    return mean, sd, dict(zip(experiment.shape.labels, (float(p) for p in share / share.sum()), strict=True))
+
+
+def learnt(experiment: Experiment, posterior: Weighted) -> dict[str, tuple[float, float]]:
+    """Posterior mean and sd of the sensor's parameters by name; empty where the sensor is known."""
+    n_sensor = int(experiment.shape_columns[0])
+    mean, sd = posterior.mean(), posterior.sd()
+    return {name: (float(mean[k]), float(sd[k])) for k, name in enumerate(experiment.names[:n_sensor])}
+
+
+def fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
+    """How well the best hypothesis fits: upper tail of chi-square, and the reading it explains worst.
+
+    One degree of freedom a reading, whatever was fitted, so that it errs towards fitting.
+    """
+    recording = problem.recording
+    best = posterior.theta[[int(posterior.log_likelihood.argmax())]]
+    sd = np.hypot(experiment.noise_sd, (experiment.step or 0.0) / np.sqrt(12.0))
+    z = (recording.readings - problem.model.predict(best, recording.plan)[0]) / sd
+    z = np.where(recording.usable, z, 0.0)
+    return float(chi2.sf(float(z @ z), max(int(recording.usable.sum()), 1))), int(np.argmax(np.abs(z)))
+
+
+def doubt(p_value: float, worst: int, readings: Sequence[Reading]) -> str:
+    """Say that no hypothesis explains the readings, and where it shows most."""
+    return (
+        f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
+        f"({readings[worst].value:g}); the hypothesis space excludes what lies there, or the sensor model "
+        "leaves something out"
+    )
+
+
+def stop_reason(
+    experiment: Experiment,
+    sd: FloatArray,
+    shapes: Mapping[str, float],
+    p_value: float,
+    outlook: UtilityMap,
+    n_readings: int,
+    max_readings: int | None,
+) -> str | None:
+    """Say why a run ends, or None where it goes on."""
+    known = experiment.is_known(sd, shapes)
+    widest = widest_mm(experiment.shape.prior.names, sd)
+    if known and p_value < experiment.doubt_p:
+        return (
+            f"no hypothesis explains the readings (p = {p_value:.1g}), so the posterior, narrow as it is "
+            f"({widest:.1f} mm), is not to be trusted; a diagnosis of the readings asks what the model leaves out"
+        )
+    if known:
+        return f"every length is known to better than {experiment.stop_sd_mm:g} mm"
+    if outlook.flat:
+        return (
+            f"every reading within reach promises the same, {outlook.highest:.2g}: none would tell the hypotheses "
+            f"apart that are left; the widest length is known to {widest:.1f} mm"
+        )
+    if max_readings is not None and n_readings >= max_readings:
+        return f"max_readings = {max_readings} is reached; the widest length is known to {widest:.1f} mm"
+    return None

@@ -1,0 +1,83 @@
+"""Propose from Gaussians about posterior samples, each as wide and as turned as the samples around it.
+
+A posterior after a few readings is a thin bent shell (all circles whose edge passes under one grey
+reading); one covariance for all of it proposes nothing that fits. The neighbours of a sample show
+which way the shell runs there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from probewise._arrays import FloatArray
+
+__all__ = ["LocalKernels"]
+
+_MOST_KERNELS = 250
+_NEIGHBOURS = 10  # for each parameter, so that their covariance is known
+_RIDGE = 1e-6  # of the overall covariance, so that none is singular
+_BLOCK = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class LocalKernels:
+    """Mix Gaussians of equal share: `centre` (n_kernels, n_params), `root` of each covariance, and what weighs a point.
+
+    `form` (n_features, n_kernels) gives the log density of each kernel as a product with a point's
+    features: one, the coordinates about `origin`, and their products.
+    """
+
+    origin: FloatArray
+    centre: FloatArray
+    root: FloatArray
+    form: FloatArray
+
+    @classmethod
+    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> Self:
+        """Fit to equally weighted samples, (n_samples, n_params)."""
+        n_samples, n_params = points.shape
+        origin = points.mean(axis=0)
+        away = points - origin
+        scale = np.maximum(points.std(axis=0), 1e-300)
+        rows = rng.permutation(n_samples)[:_MOST_KERNELS]
+        n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
+        near = cKDTree(away / scale).query(away[rows] / scale, k=n_near)[1].reshape(len(rows), n_near)
+        centre = away[rows]
+        spread = away[near] - away[near].mean(axis=1, keepdims=True)
+        overall = np.atleast_2d(np.cov(points, rowvar=False))
+        covariance = np.einsum("kni,knj->kij", spread, spread) / n_near
+        covariance += _RIDGE * (overall + np.diag(scale**2))
+        root = np.linalg.cholesky(covariance)
+        precision = np.linalg.inv(covariance)
+        log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        pull = np.einsum("kij,kj->ki", precision, centre)
+        constant = -0.5 * (np.einsum("ki,ki->k", pull, centre) + log_det + n_params * math.log(2 * math.pi))
+        upper = np.triu_indices(n_params)
+        product = -np.where(upper[0] == upper[1], 0.5, 1.0) * precision[:, upper[0], upper[1]]
+        form = np.concatenate([constant[:, None], pull, product], axis=1).T
+        return cls(origin, centre, root, form)
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, n_params)."""
+        which = rng.integers(len(self.centre), size=n)
+        white = rng.standard_normal((n, self.centre.shape[1]))
+        return np.asarray(self.origin + self.centre[which] + np.einsum("nij,nj->ni", self.root[which], white))
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Natural log of the density, (n, n_params) -> (n,)."""
+        upper = np.triu_indices(points.shape[1])
+        out = np.empty(len(points))
+        for start in range(0, len(points), _BLOCK):
+            away = points[start : start + _BLOCK] - self.origin
+            features = np.concatenate([np.ones((len(away), 1)), away, away[:, upper[0]] * away[:, upper[1]]], axis=1)
+            each = features @ self.form
+            most = each.max(axis=1)
+            # Only the nearest kernels count: single precision serves a density that proposes.
+            each -= most[:, None]
+            out[start : start + _BLOCK] = most + np.log(np.exp(each.astype(np.float32)).sum(axis=1))
+        return out - math.log(len(self.centre))

@@ -1,0 +1,295 @@
+"""Keep a large weighted posterior from reading to reading: reweigh it, and renew it when few samples carry it.
+
+Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweighs the samples; where fewer
+than half of them still count, the reading is taken in by degrees, and at each the samples are drawn
+anew and moved by Metropolis-Hastings steps against everything read so far. The evidence is the
+product of the mean weights. What has been ruled out in a long search is remembered by thousands of
+samples, not by the few that a picture shows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.experiment.kernels import LocalKernels
+from probewise.inference.problem import SensorProblem
+from probewise.nested.importance import Weighted, pareto_k
+from probewise.nested.result import NestedResult
+from probewise.priors import Prior
+
+__all__ = ["Block", "prior_particles", "update"]
+
+KEEP = 0.5  # share of the samples that must count for them to be kept
+SURPRISED = 12.5  # nats by which every sample misses the last reading, five sds of Gaussian noise: none expected it
+STIFF = 0.5  # accepted steps a sample, below which the moves cannot be trusted
+ENOUGH = 1.5  # accepted steps a sample that will do
+MOST_ROUNDS = 6
+FEWEST = 8  # samples a parameter, below which a kind is left where it is: it is dying out
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Hypotheses of one kind: their `rows` among the samples, the `columns` they use; the others follow the prior."""
+
+    rows: IntArray
+    columns: IntArray
+
+
+def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Weighted:
+    """Draw equally weighted samples of the prior: the posterior of no readings, whose evidence is one."""
+    theta = prior.from_unit_cube(rng.random((n_particles, len(prior.names))))
+    if not np.isfinite(prior.log_prob(theta)).all():
+        raise ParameterError(
+            "prior",
+            prior.names,
+            "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?",
+        )
+    even = np.full(n_particles, -math.log(n_particles))
+    return Weighted(prior.names, theta, np.zeros(n_particles), even, 0.0, 0.0, float(n_particles), 0, -math.inf)
+
+
+def update(
+    previous: Weighted,
+    problem: SensorProblem,
+    *,
+    rng: np.random.Generator,
+    fall_back: Callable[[], NestedResult],
+    blocks: Callable[[FloatArray], tuple[Block, ...]],
+) -> Weighted:
+    """Take in the last reading of a problem.
+
+    Parameters
+    ----------
+    previous
+        Posterior given the readings before.
+    problem
+        Prior, sensor model, likelihood, and all readings.
+    rng
+        Source of randomness.
+    fall_back
+        Runs the whole problem from scratch: where no sample expected the reading, or they cannot be moved.
+    blocks
+        Splits samples into kinds that use different parameters.
+
+    Returns
+    -------
+    Weighted
+        As many samples as before; `run` is the run from scratch where one was needed.
+    """
+    n = len(previous.theta)
+    bridge = _Bridge(problem)
+    if bridge.missed(previous.theta) > SURPRISED:
+        return _from_scratch(fall_back(), n, bridge, n, blocks, rng)
+    now = bridge.cloud(previous.theta)
+    log_weight, base = previous.log_weight, previous.log_likelihood
+    log_z, variance, n_calls, share = previous.log_z, previous.log_z_error**2, 2 * n, 0.0
+    while True:
+        all_at_once = _n_eff(_reweighed(log_weight, now.after, base))
+        if all_at_once == 0.0:
+            return _from_scratch(fall_back(), n, bridge, n_calls, blocks, rng)
+        share = 1.0 if all_at_once >= KEEP * n else _next_share(log_weight, base, now, share)
+        weighed = _reweighed(log_weight, now.at(share), base)
+        gained = float(logsumexp(weighed))
+        log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
+        n_eff = _n_eff(log_weight)
+        variance += max(1.0 / n_eff - 1.0 / n, 0.0)
+        if share == 1.0 and n_eff >= KEEP * n:
+            break
+        rows = _resampled(log_weight, n, rng)
+        now, moves = _move(now.take(rows), share, bridge, blocks, rng)
+        n_calls += moves.n_calls
+        if moves.accepted < STIFF:
+            return _from_scratch(fall_back(), n, bridge, n_calls, blocks, rng)
+        base, log_weight = now.at(share), np.full(n, -math.log(n))
+        if share == 1.0:
+            break
+    tail = pareto_k(log_weight) if n_eff < n else -math.inf
+    return Weighted(
+        previous.names,
+        now.theta,
+        now.after,
+        log_weight,
+        log_z,
+        math.sqrt(variance),
+        _n_eff(log_weight),
+        previous.n_calls + n_calls,
+        tail,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    """Samples with what decides about them: log prior, and log likelihood without and with the last reading."""
+
+    theta: FloatArray
+    log_prior: FloatArray
+    before: FloatArray
+    after: FloatArray
+
+    def at(self, share: float) -> FloatArray:
+        """Log likelihood with that share of the last reading's."""
+        return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
+
+    def take(self, rows: IntArray) -> _Cloud:
+        return _Cloud(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
+
+    def put(self, rows: BoolArray, other: _Cloud) -> _Cloud:
+        """Replace rows by those of another."""
+        return _Cloud(
+            np.where(rows[:, None], other.theta, self.theta),
+            np.where(rows, other.log_prior, self.log_prior),
+            np.where(rows, other.before, self.before),
+            np.where(rows, other.after, self.after),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Bridge:
+    """The problem with and without its last reading, from one prediction."""
+
+    problem: SensorProblem
+
+    def missed(self, theta: FloatArray) -> float:
+        """How much less likely the last reading is by the best of the samples than by one that predicts it, nats."""
+        recording = self.problem.recording
+        if not recording.usable[-1]:
+            return 0.0
+        reading = recording.readings[-1:]
+        best = self.problem.likelihood.log_prob(
+            reading, self.problem.model.predict(theta, recording.plan)[:, -1:]
+        ).max()
+        return float(self.problem.likelihood.log_prob(reading, reading[None])[0] - best)
+
+    def cloud(self, theta: FloatArray) -> _Cloud:
+        """Evaluate samples; the model is not asked where the prior has none."""
+        problem = self.problem
+        log_prior = problem.prior.log_prob(theta)
+        before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
+        possible = np.isfinite(log_prior)
+        if possible.any():
+            recording = problem.recording
+            predicted = problem.model.predict(theta[possible], recording.plan)
+            usable = recording.usable
+            earlier = usable.copy()
+            earlier[-1] = False
+            if earlier.any():
+                before[possible] = problem.likelihood.log_prob(recording.readings[earlier], predicted[:, earlier])
+            if usable.any():
+                after[possible] = problem.likelihood.log_prob(recording.readings[usable], predicted[:, usable])
+            else:
+                after[possible] = 0.0
+        return _Cloud(theta, log_prior, before, after)
+
+
+@dataclass(frozen=True)
+class _Moves:
+    accepted: float
+    n_calls: int
+
+
+def _move(
+    start: _Cloud,
+    share: float,
+    bridge: _Bridge,
+    blocks: Callable[[FloatArray], tuple[Block, ...]],
+    rng: np.random.Generator,
+) -> tuple[_Cloud, _Moves]:
+    """Move equally weighted samples by Metropolis-Hastings steps that leave their density as it is.
+
+    A round is a proposal from kernels fitted to all samples, then one along the difference of two of
+    them (ter Braak 2006): the first follows bent shells of few parameters, the second needs no
+    density and so goes on working for many.
+    """
+    n = len(start.theta)
+    parts = [
+        (np.ix_(block.rows, block.columns), block.rows, LocalKernels.about(own, rng=rng))
+        for block in blocks(start.theta)
+        if len(own := start.theta[np.ix_(block.rows, block.columns)]) > FEWEST * len(block.columns)
+    ]
+    now, accepted, n_calls = start, 0.0, 0
+    for _ in range(MOST_ROUNDS):
+        for propose in (_from_kernels, _along_differences):
+            theta, log_ratio = now.theta.copy(), np.full(n, -np.inf)
+            for where, rows, kernels in parts:
+                theta[where], log_ratio[rows] = propose(now.theta[where], kernels, rng)
+            proposed = bridge.cloud(theta)
+            odds = proposed.log_prior + proposed.at(share) - now.log_prior - now.at(share) + log_ratio
+            taken = np.log(rng.random(n)) < odds
+            now = now.put(taken, proposed)
+            n_calls += n
+            accepted += float(taken.mean())
+        if accepted >= ENOUGH:
+            break
+    return now, _Moves(accepted, n_calls)
+
+
+def _from_kernels(theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Propose by the kernels alone, wherever a sample stands; also the log of the ratio of densities."""
+    proposed = kernels.draw(len(theta), rng=rng)
+    return proposed, kernels.log_density(theta) - kernels.log_density(proposed)
+
+
+def _along_differences(
+    theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Step along the difference of two other samples, shortened by a factor spread over two orders of magnitude."""
+    n, n_params = theta.shape
+    one, other = rng.integers(n, size=(2, n))
+    length = 2.38 / math.sqrt(2 * n_params) * 10.0 ** rng.uniform(-2.0, 0.0, (n, 1))
+    return theta + length * (theta[one] - theta[other]), np.zeros(n)
+
+
+def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:
+    """Largest share of the last reading that leaves enough samples that count, by bisection."""
+    low, high, enough = share, 1.0, KEEP * len(base)
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _n_eff(_reweighed(log_weight, now.at(middle), base)) >= enough else (low, middle)
+    return max(low, share + 1e-6)
+
+
+def _reweighed(log_weight: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray:
+    """Weigh by what likelihoods have become; a sample that has been ruled out stays so."""
+    alive = np.isfinite(log_weight)
+    return np.asarray(np.where(alive, log_weight + after - np.where(alive, before, 0.0), -np.inf))
+
+
+def _n_eff(log_weight: FloatArray) -> float:
+    """Kish's number of effective samples, of weights that need not be normalised."""
+    most = float(np.max(log_weight))
+    if not math.isfinite(most):
+        return 0.0
+    weight = np.exp(log_weight - most)
+    return float(weight.sum() ** 2 / (weight @ weight))
+
+
+def _resampled(log_weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
+    """Rows of equally weighted samples, by systematic resampling."""
+    ladder = np.cumsum(np.exp(log_weight - log_weight.max()))
+    rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
+    return np.minimum(rows, len(log_weight) - 1)
+
+
+def _from_scratch(
+    run: NestedResult,
+    n: int,
+    bridge: _Bridge,
+    n_calls: int,
+    blocks: Callable[[FloatArray], tuple[Block, ...]],
+    rng: np.random.Generator,
+) -> Weighted:
+    """Draw as many samples as before from a run, and move them apart."""
+    found = bridge.cloud(run.samples(n, rng=rng))
+    moved, moves = _move(found, 1.0, bridge, blocks, rng)
+    even = np.full(n, -math.log(n))
+    calls = n_calls + run.n_calls + n + moves.n_calls
+    return Weighted(
+        run.names, moved.theta, moved.after, even, run.log_z, run.log_z_error, float(n), calls, -math.inf, run
+    )

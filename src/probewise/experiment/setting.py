@@ -1,0 +1,243 @@
+"""What decides a run: the hypotheses, the sensor, what may be measured, what it is worth, when to stop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise._version import __version__
+from probewise.arm.instrument import Reading
+from probewise.errors import ParameterError
+from probewise.experiment.digest import value_digest
+from probewise.experiment.journal import recording_of
+from probewise.experiment.particles import Block
+from probewise.inference.problem import Likelihood, SensorProblem
+from probewise.inference.student_t import StudentT
+from probewise.inquiry import Designs, Finishing, Forecast, Goal, Grid, InformationGain, Readout, Utility, forecast_of
+from probewise.priors import Joint, Prior
+from probewise.scene.albedo import Shape
+from probewise.scene.shapes import AnyOf
+from probewise.sensor.stages import SensorModel
+
+__all__ = ["Experiment", "OneScan", "widest_mm"]
+
+
+@dataclass(frozen=True)
+class OneScan:
+    """Score a growing number of readings that share one unknown sd: Student-t, one data set (paper, SSF likelihood).
+
+    `sd_floor` and `sd_ceiling` bound the sd, in the sensor's unit; its prior is 1/sigma between them.
+    """
+
+    sd_floor: float
+    sd_ceiling: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.sd_floor < self.sd_ceiling < math.inf:
+            raise ParameterError(
+                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < ceiling, finite"
+            )
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,); see `inference.StudentT`."""
+        one = np.zeros(readings.size, dtype=np.int64)
+        return StudentT(one, self.sd_floor, self.sd_ceiling).log_prob(readings, predicted)
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Everything that decides the course of a run but the arm and the seed.
+
+    Parameters
+    ----------
+    shape
+        What may lie on the field; its prior is what is believed before the first reading.
+    model
+        The sensor over a scene of that shape.
+    likelihood
+        How readings are weighed against predictions: any with any model.
+    noise_sd
+        Sd of the noise of one reading in the sensor's unit, for the check of fit and for utilities that weigh noise.
+    grid
+        Places that may be looked at.
+    utility
+        What a reading is worth; by default its expected information about all parameters and, near the end,
+        the probability that it ends the run.
+    sensor_prior
+        Prior of the parameters that the model has before the shape's, where the sensor is to be learnt
+        along with the shape; None: the sensor is known.
+    step, reading_range
+        What readings are whole multiples of (None: they are not rounded), and the least and greatest there are.
+    orientations_rad, repeats
+        How the sensor may be turned, and how many readings may be taken on the spot.
+    batch
+        Readings that are chosen together, for their joint information; greater than 1 only with the default
+        utility or `InformationGain`.
+    stop_sd_mm
+        The run ends when the posterior sd of every parameter of the shape in mm is below it: 4 mm, half
+        the spacing of LEGO holes, in the paper. For a set of shapes: every parameter that the
+        most probable shape has.
+    stop_probability
+        For a set of shapes, how probable that shape must be too.
+    doubt_p
+        Probability of readings as far from the best hypothesis as these, below which the run says that
+        none explains them, and trusts its own certainty no longer; 0 for a model that is known to be coarse.
+    n_particles
+        Weighted samples of the posterior that are carried from reading to reading.
+    n_samples
+        Hypotheses that are shown, and asked by the paper's utility; the paper has 50.
+    n_live
+        Live points of nested sampling, which takes over where a reading surprises.
+    """
+
+    shape: Shape
+    model: SensorModel
+    likelihood: Likelihood
+    noise_sd: float
+    grid: Grid = field(default_factory=Grid)
+    utility: Utility = field(default_factory=Finishing)
+    sensor_prior: Prior | None = None
+    step: float | None = None
+    reading_range: tuple[float, float] = (-math.inf, math.inf)
+    orientations_rad: tuple[float, ...] = (0.0,)
+    repeats: tuple[int, ...] = (1,)
+    batch: int = 1
+    stop_sd_mm: float = 4.0
+    stop_probability: float = 0.95
+    doubt_p: float = 1e-6
+    n_particles: int = 3000
+    n_samples: int = 50
+    n_live: int = 200
+
+    def __post_init__(self) -> None:
+        if not 0 < self.stop_sd_mm < math.inf:
+            raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
+        if not 0 < self.stop_probability < 1:
+            raise ParameterError("stop_probability", self.stop_probability, "between 0 and 1")
+        if not 0 <= self.doubt_p < 1:
+            raise ParameterError("doubt_p", self.doubt_p, "0 or more, below 1")
+        if self.n_samples < 2:
+            raise ParameterError("n_samples", self.n_samples, "2 or more: one hypothesis leaves nothing to ask")
+        if self.n_particles < max(self.n_samples, 100):
+            raise ParameterError("n_particles", self.n_particles, "100 or more, and no fewer than n_samples")
+        if self.batch < 1 or (self.batch > 1 and self.utility not in (Finishing(), InformationGain())):
+            raise ParameterError("batch", self.batch, "1, or more with the utility Finishing() or InformationGain()")
+        if self.model.names != self.prior.names:
+            raise ParameterError(
+                "model.names",
+                self.model.names,
+                f"{self.prior.names}: the sensor's that are not known, then the shape's",
+            )
+        if not any(name.endswith("_mm") for name in self.shape.prior.names):
+            raise ParameterError("shape", self.names, "a shape with a parameter in mm, which the run can stop on")
+        _ = self.readout, self.designs  # check what they are made of
+
+    @cached_property
+    def prior(self) -> Prior:
+        """What is believed before the first reading."""
+        return self.shape.prior if self.sensor_prior is None else Joint((self.sensor_prior, self.shape.prior))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names, one a column of theta: the sensor's that are not known, then the shape's."""
+        return self.prior.names
+
+    @cached_property
+    def shape_columns(self) -> IntArray:
+        """Columns of theta that hold the shape's parameters."""
+        n_shape = len(self.shape.prior.names)
+        return np.arange(len(self.names) - n_shape, len(self.names))
+
+    @cached_property
+    def readout(self) -> Readout:
+        """Noise, rounding and range of a reading."""
+        return Readout(self.noise_sd, self.step, *self.reading_range)
+
+    @cached_property
+    def designs(self) -> Designs:
+        """The readings that may be taken."""
+        return Designs(self.grid, self.orientations_rad, self.repeats)
+
+    @cached_property
+    def goal(self) -> Goal | None:
+        """The sds that the run ends on; of a set of shapes it is not known yet whose."""
+        if isinstance(self.shape, AnyOf):
+            return None
+        names = zip(self.shape_columns.tolist(), self.shape.prior.names, strict=True)
+        return Goal(tuple(column for column, name in names if name.endswith("_mm")), self.stop_sd_mm)
+
+    @cached_property
+    def forecast(self) -> Forecast:
+        """What predicts for many hypotheses at once, made when first asked for."""
+        return forecast_of(self.model)
+
+    def problem(self, readings: Sequence[Reading]) -> SensorProblem:
+        """Set up the inference from these readings."""
+        return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording_of(readings))
+
+    def blocks(self, theta: FloatArray) -> tuple[Block, ...]:
+        """Split hypotheses by shape: each uses the sensor's parameters and its own."""
+        if not isinstance(self.shape, AnyOf):
+            return (Block(np.arange(len(theta)), np.arange(theta.shape[1])),)
+        sensor = np.arange(self.shape_columns[0])
+        which = self.shape.which(theta[:, self.shape_columns])
+        return tuple(
+            Block(np.flatnonzero(which == k), np.concatenate([sensor, self.shape_columns[columns]]))
+            for k, columns in enumerate(self.shape.prior.columns)
+        )
+
+    def is_known(self, sd: FloatArray, shapes: Mapping[str, float]) -> bool:
+        """Tell whether the shape's posterior sds and the shapes' probabilities satisfy the stopping rule."""
+        likely = max(shapes.values(), default=1.0)
+        return widest_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability
+
+    def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
+        """Say what decides a run: a journal's first line."""
+        return {
+            "version": __version__,
+            "field": {
+                "width_mm": self.grid.width_mm,
+                "height_mm": self.grid.height_mm,
+                "n_x": self.grid.n_x,
+                "n_y": self.grid.n_y,
+            },
+            "shape": repr(self.shape),
+            "model": type(self.model).__name__,
+            "sensor": value_digest(self.model),
+            "sensor_prior": repr(self.sensor_prior),
+            "likelihood": repr(self.likelihood),
+            "likelihood_sha256": value_digest(self.likelihood),
+            "utility": repr(self.utility),
+            "seed": seed_text(seed),
+            "spawn_key": list(seed.spawn_key),
+            "options": {
+                "noise_sd": self.noise_sd,
+                "step": self.step,
+                "reading_range": [None if math.isinf(end) else end for end in self.reading_range],
+                "orientations_rad": list(self.orientations_rad),
+                "repeats": list(self.repeats),
+                "batch": self.batch,
+                "stop_sd_mm": self.stop_sd_mm,
+                "stop_probability": self.stop_probability,
+                "doubt_p": self.doubt_p,
+                "n_particles": self.n_particles,
+                "n_samples": self.n_samples,
+                "n_live": self.n_live,
+            },
+        }
+
+
+def widest_mm(names: tuple[str, ...], sd: FloatArray) -> float:
+    """Take the largest sd among the parameters in mm, whose names end so; NaN (no such parameter here) is left out."""
+    return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))
+
+
+def seed_text(seed: np.random.SeedSequence) -> str:
+    """Write the seed's number as text: it may be longer than a JSON number."""
+    return str(seed.entropy) if isinstance(seed.entropy, int) else ",".join(str(word) for word in seed.entropy or ())

@@ -1,0 +1,84 @@
+"""Score readings that the sensor rounds to whole steps and keeps within its scale."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.inference._residuals import residuals
+
+__all__ = ["Rounded"]
+
+_FAR = 200.0  # sds from the prediction that the table goes to
+_PER_SD = 50.0  # its entries a sd: a line between them is off by less than 1e-4
+
+
+@dataclass(frozen=True)
+class Rounded:
+    """Give each reading the probability of its cell: Gaussian noise of known sd, then rounding, then the scale's ends.
+
+    Where the noise is not much wider than a step, a density of the rounded reading claims more than was
+    read.
+
+    Parameters
+    ----------
+    sd
+        Sd of the noise before rounding, in units of the reading.
+    step
+        What readings are whole multiples of.
+    low, high
+        Ends of the scale: a reading there may stand for anything beyond.
+    """
+
+    sd: float
+    step: float = 1.0
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("sd", "step"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ParameterError(name, getattr(self, name), "greater than 0, finite")
+        if not self.low < self.high:
+            raise ParameterError("(low, high)", (self.low, self.high), "low < high")
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Natural log of the readings' probability, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        away = np.abs(residuals(readings, predicted)) / self.sd
+        at_end = (readings >= self.high) | (readings <= self.low)
+        if at_end.any():
+            within = self._log_cell(away[:, ~at_end]).sum(axis=1)
+            return np.asarray(within + self._log_end(readings[at_end], predicted[:, at_end]).sum(axis=1))
+        return np.asarray(self._log_cell(away).sum(axis=1))
+
+    def _log_cell(self, away: FloatArray) -> FloatArray:
+        """Log of a cell's probability by its distance from the prediction in sds, from a table of it."""
+        position = np.minimum(away, _FAR - 1.0) * _PER_SD
+        entry = position.astype(np.int64)
+        below = self._table[entry]
+        out = below + (position - entry) * (self._table[entry + 1] - below)
+        far = away > _FAR - 1.0
+        if far.any():
+            out[far] = _log_between(away[far], 0.5 * self.step / self.sd)
+        return np.asarray(out)
+
+    def _log_end(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Log probability of everything beyond the end of the scale that was read."""
+        inward = np.where(readings >= self.high, predicted - readings, readings - predicted)
+        return np.asarray(log_ndtr((inward + 0.5 * self.step) / self.sd))
+
+    @cached_property
+    def _table(self) -> FloatArray:
+        return _log_between(np.arange(0.0, _FAR + 1.0 / _PER_SD, 1.0 / _PER_SD), 0.5 * self.step / self.sd)
+
+
+def _log_between(away: FloatArray, half: float) -> FloatArray:
+    """Log probability that a standard normal lies within `half` of `away`; by the upper tail, which keeps its digits."""
+    upper, lower = log_ndtr(half - away), log_ndtr(-half - away)
+    return np.asarray(upper + np.log1p(-np.exp(lower - upper)))

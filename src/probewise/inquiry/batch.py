@@ -1,0 +1,68 @@
+"""Several readings chosen at once, before any of them is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.inquiry.choice import choose
+from probewise.inquiry.forecast import thinned
+from probewise.inquiry.prospect import Prospect
+
+__all__ = ["choose_several"]
+
+_OUTCOMES = 16  # imagined results of the readings chosen so far
+_FEW = 600  # hypotheses that imagine them
+
+
+def choose_several(prospect: Prospect, n: int, *, rng: np.random.Generator) -> tuple[int, ...]:
+    """Choose readings that together tell most: the best one, then the best one beside it, and so on.
+
+    Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the
+    best set (Nemhauser, Wolsey & Fisher 1978). The condition is averaged over imagined results: each
+    is a draw from what the posterior predicts, and leaves a posterior of its own.
+
+    Parameters
+    ----------
+    prospect
+        Posterior, designs and sensor.
+    n
+        How many readings.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    Rows of the prospect's designs, in the order in which they were chosen; two may be the same.
+    """
+    if n < 1:
+        raise ParameterError("n", n, "1 or more")
+    everywhere = np.ones(len(prospect.rows), dtype=np.bool_)
+    chosen = [choose(prospect.information(prospect.weight), everywhere, rng=rng)]
+    rows, share = thinned(prospect.weight, _FEW)
+    few = replace(prospect, theta=prospect.theta[rows], weight=share / share.sum())
+    weights = [few.weight] * _OUTCOMES
+    for _ in range(n - 1):
+        weights = _after_imagined(few, chosen[-1], weights, rng)
+        gain = np.mean([few.information(weight) for weight in weights], axis=0)
+        chosen.append(choose(gain, everywhere, rng=rng))
+    return tuple(int(prospect.rows[row]) for row in chosen)
+
+
+def _after_imagined(
+    prospect: Prospect, row: int, weights: list[FloatArray], rng: np.random.Generator
+) -> list[FloatArray]:
+    """Draw a result of one design for each posterior and take it in."""
+    model, readout = prospect.forecast.model, prospect.readout
+    level = model.predict(prospect.theta, prospect.plan.take(prospect.rows[[row]]))[:, 0]
+    sd = readout.noise_sd / np.sqrt(prospect.designs.n_repeats[prospect.rows[row]])
+    out = []
+    for weight in weights:
+        truth = rng.choice(len(weight), p=weight)
+        away = (level[truth] + sd * rng.standard_normal() - level) / sd
+        after = weight * np.exp(-0.5 * away**2)
+        out.append(after / after.sum())
+    return out

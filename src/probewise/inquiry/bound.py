@@ -1,0 +1,109 @@
+"""How few readings could do: the bits that are needed over the most that one reading can carry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.inquiry.forecast import spread_levels
+from probewise.inquiry.readout import Readout, entropy_bits
+
+__all__ = ["Bound", "capacity_bits", "fewest_readings", "target_entropy"]
+
+_PER_SD = 4.0
+_MOST_ROUNDS = 2000
+_CLOSE_BITS = 1e-4
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Fewest readings on average, search and refinement apart.
+
+    Attributes
+    ----------
+    search_bits, refinement_bits
+        Bits needed until the shape is met for the first time, and from there to the target.
+    search_capacity_bits, capacity_bits
+        Most that one reading carries: while nothing has been met, of a yes or no that is as likely as it can
+        be made; afterwards the sensor's capacity.
+    """
+
+    search_bits: float
+    refinement_bits: float
+    search_capacity_bits: float
+    capacity_bits: float
+
+    @property
+    def search(self) -> float:
+        """Readings until the shape is met."""
+        return self.search_bits / self.search_capacity_bits
+
+    @property
+    def refinement(self) -> float:
+        """Readings from there on."""
+        return self.refinement_bits / self.capacity_bits
+
+    @property
+    def readings(self) -> float:
+        """Readings in all."""
+        return self.search + self.refinement
+
+
+def fewest_readings(
+    prior_bits: float, met_bits: float, target_bits: float, *, most_covered: float, capacity: float
+) -> Bound:
+    """Bound the mean number of readings of any strategy.
+
+    Parameters
+    ----------
+    prior_bits, met_bits, target_bits
+        Differential entropy of the parameters: of the prior, at the first reading on the shape (on
+        average), and when they are known well enough (`target_entropy`).
+    most_covered
+        Probability that the best first place lies on the shape. A reading of the search says yes or no,
+        and it says yes no more often than that while the places left are no better.
+    capacity
+        Of the sensor, bits a reading (`capacity_bits`).
+    """
+    if not 0 < most_covered < 1:
+        raise ParameterError("most_covered", most_covered, "between 0 and 1")
+    if not prior_bits >= met_bits >= target_bits:
+        raise ParameterError(
+            "(prior_bits, met_bits, target_bits)", (prior_bits, met_bits, target_bits), "descending: learning narrows"
+        )
+    yes = min(most_covered, 0.5)
+    chance = np.array([yes, 1.0 - yes])
+    return Bound(prior_bits - met_bits, met_bits - target_bits, float(entropy_bits(chance)), capacity)
+
+
+def target_entropy(n_params: int, sd: float) -> float:
+    """Greatest differential entropy, bits, of parameters that are all known to an sd: the independent Gaussian's."""
+    return n_params * 0.5 * math.log2(2 * math.pi * math.e * sd**2)
+
+
+def capacity_bits(low: float, high: float, readout: Readout) -> float:
+    """Capacity of the sensor, bits a reading: the most that a reading can tell of a level from `low` to `high`.
+
+    The levels' distribution that carries most is found by Blahut and Arimoto's iteration (1972), until
+    its upper and lower bound are within 1e-4 bits.
+    """
+    if not low < high:
+        raise ParameterError("(low, high)", (low, high), "low < high")
+    levels = spread_levels(low, high, readout.noise_sd / _PER_SD)
+    chance = readout.probability(levels)
+    given = -entropy_bits(chance)
+    share: FloatArray = np.full(len(levels), 1.0 / len(levels))
+    lower = 0.0
+    for _ in range(_MOST_ROUNDS):
+        surprise = -np.log2(np.maximum(share @ chance, 1e-300))
+        divergence = given + chance @ surprise
+        lower, upper = float(share @ divergence), float(divergence.max())
+        if upper - lower < _CLOSE_BITS:
+            break
+        share = share * np.exp2(divergence - divergence.max())
+        share /= share.sum()
+    return lower

@@ -1,0 +1,115 @@
+"""The readings that might be taken next: places of a grid, and whatever else of a reading may be chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.inquiry.grid import Grid
+from probewise.recordings.plan import Plan
+
+__all__ = ["Design", "Designs"]
+
+
+@dataclass(frozen=True)
+class Design:
+    """One reading that might be taken: where, how turned, how often, and at which other settings."""
+
+    x_mm: float
+    y_mm: float
+    orientation_rad: float = 0.0
+    repeats: int = 1
+    settings: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Designs:
+    """Combine every place of a grid with every orientation, number of repeats and other setting.
+
+    Rows run over all places for the first combination, then for the next, so that values reshape to
+    (n_combinations, n_places).
+
+    Parameters
+    ----------
+    grid
+        The places.
+    orientations_rad
+        How the sensor may be turned.
+    repeats
+        How many readings may be taken on the spot; their mean counts.
+    settings
+        Other quantities by name, each with the values it may take, as a covariate of the plan: a
+        sensor's height, for instance, as ("height_mm", (8.0, 14.0)).
+    """
+
+    grid: Grid = field(default_factory=Grid)
+    orientations_rad: tuple[float, ...] = (0.0,)
+    repeats: tuple[int, ...] = (1,)
+    settings: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.orientations_rad or not np.isfinite(self.orientations_rad).all():
+            raise ParameterError("orientations_rad", self.orientations_rad, "one finite angle or more")
+        if not self.repeats or min(self.repeats) < 1:
+            raise ParameterError("repeats", self.repeats, "one number of readings or more, each 1 or greater")
+        for name, values in self.settings:
+            if not values or not np.isfinite(values).all():
+                raise ParameterError(f"settings {name}", values, "one finite value or more")
+
+    def __len__(self) -> int:
+        return self.grid.n_places * len(self.combinations)
+
+    @cached_property
+    def combinations(self) -> tuple[Design, ...]:
+        """What is combined with each place, as designs at the field's corner."""
+        names = [name for name, _ in self.settings]
+        return tuple(
+            Design(0.0, 0.0, turn, n, tuple(zip(names, values, strict=True)))
+            for turn, n in product(self.orientations_rad, self.repeats)
+            for values in product(*(values for _, values in self.settings))
+        )
+
+    def __getitem__(self, row: int) -> Design:
+        """Take one design by its row."""
+        which, place = divmod(row, self.grid.n_places)
+        x_mm, y_mm = self.grid.places_mm[place]
+        return replace(self.combinations[which], x_mm=float(x_mm), y_mm=float(y_mm))
+
+    @cached_property
+    def n_repeats(self) -> IntArray:
+        """Number of readings of each design, (n_designs,)."""
+        return np.repeat([combination.repeats for combination in self.combinations], self.grid.n_places)
+
+    def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
+        """Lay out one possible reading a design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
+        n_places, n_designs = self.grid.n_places, len(self)
+        once = self.grid.plan(pattern_name, time_s=time_s)
+        rows = np.tile(np.arange(n_places), len(self.combinations))
+
+        def column(values: list[float]) -> FloatArray:
+            return np.repeat(np.asarray(values, dtype=np.float64), n_places)
+
+        return replace(
+            once.take(rows),
+            orientation_rad=column([c.orientation_rad for c in self.combinations]),
+            scan=np.arange(n_designs),
+            scan_names=tuple(str(k) for k in range(n_designs)),
+            covariates={name: column([dict(c.settings)[name] for c in self.combinations]) for name, _ in self.settings},
+        )
+
+    def cost_s(self, travel_s: FloatArray, read_s: float) -> FloatArray:
+        """Seconds that each design takes, (n_designs,).
+
+        Parameters
+        ----------
+        travel_s
+            Seconds to move to each place and read there once, (n_places,).
+        read_s
+            Seconds of each further reading on the spot.
+        """
+        return np.tile(travel_s, len(self.combinations)) + read_s * (self.n_repeats - 1)

@@ -1,0 +1,339 @@
+"""What a known sensor reads of a disc, tabulated: away from the edge it is dark or bright, near it a smooth function.
+
+The response to a disc depends on three numbers: how far the sensor stands from the edge, in which
+direction of its own frame the edge lies, and how strongly it is bent. The sensor model itself fills
+a table of them once; a prediction is then an interpolation, and the map of all hypotheses over a
+grid needs one only in the ring about each edge, a few hundred places of many thousand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.errors import ParameterError
+from probewise.inquiry.grid import Grid
+from probewise.recordings.plan import Plan
+from probewise.scene import Circle, HypothesisScene
+from probewise.sensor import Chain, FixedMixture, NaiveSensor
+from probewise.sensor.stages import SensorModel, require_columns
+
+__all__ = ["DiscTable"]
+
+NAMES = ("x_mm", "y_mm", "radius_mm")
+
+_COARSE_MM = 0.5  # between distances at which the model is asked; a cubic spline leads from one to the next
+_FINE_MM = 0.125  # between entries
+_PROBE_MM = 80.0  # how far from the edge the model is asked at all
+_FLAT = 1e-5  # share of the levels' difference by which a level counts as that far from any edge
+_DIRECTIONS = 128
+_BENDS = 8
+_BLOCK = 256  # hypotheses at a time: the places near their edges stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class DiscTable:
+    """A sensor model over one disc, as a table: parameters x_mm, y_mm, radius_mm.
+
+    Attributes
+    ----------
+    dark, bright
+        Levels read far outside and far inside.
+    margin_mm
+        Distance from the edge within which the level differs from these.
+    bend_per_mm
+        Least and greatest 1 / radius of the table.
+    levels
+        Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in the
+        direction's pseudo-angle (the last repeats the first), and in distance from -margin to margin.
+    """
+
+    dark: float
+    bright: float
+    margin_mm: float
+    bend_per_mm: tuple[float, float]
+    levels: FloatArray
+
+    @classmethod
+    def of(cls, model: SensorModel) -> Self | None:
+        """Tabulate a model, or return None for one that a table does not hold.
+
+        A table holds a known mixture, or the naive sensor, without effects, over a single circle; it must see
+        no farther than 80 mm.
+        """
+        if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
+            return None
+        shape = model.scene.shape
+        if not isinstance(shape, Circle) or model.names != NAMES:
+            return None
+        low, high = shape.radius_mm
+        bends = (1.0 / high, 1.0 / low)
+        if isinstance(model, NaiveSensor):
+            dark, bright = _levels(model, high)
+            return cls(dark, bright, 0.0, bends, frozen(np.empty((0, 0, 0))))
+        if model.effects or not isinstance(model.ssf, FixedMixture):
+            return None
+        dark, bright = _levels(model, high)
+        directions = _direction(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
+        margin = _margin(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
+        if margin >= _PROBE_MM:
+            return None
+        coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
+        fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
+        asked = np.stack([_asked(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
+        asked = np.concatenate([asked, asked[:, :1]], axis=1)
+        return cls(dark, bright, margin, bends, frozen(CubicSpline(coarse, asked, axis=-1)(fine)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x_mm, y_mm, radius_mm."""
+        return NAMES
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings, theta (n_samples, 3) -> (n_samples, n_points), interpolated in all three numbers."""
+        require_columns(theta, NAMES)
+        away_x, away_y = plan.x_mm - theta[:, :1], plan.y_mm - theta[:, 1:2]
+        distance = np.hypot(away_x, away_y) - theta[:, 2:]
+        out = np.where(distance <= 0.0, self.bright, self.dark)
+        near = np.abs(distance) < self.margin_mm
+        if not near.any():
+            return out
+        hypothesis, point = np.nonzero(near)
+        cosine, sine = np.cos(plan.orientation_rad)[point], np.sin(plan.orientation_rad)[point]
+        x, y = away_x[near], away_y[near]
+        angle = _pseudo_angle(cosine * x + sine * y, cosine * y - sine * x)
+        n_bends, n_directions, n_distances = self.levels.shape
+        bend, along_bend = _cell((1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._per_bend, n_bends)
+        turn, along_turn = _cell(angle * ((n_directions - 1) / 4.0), n_directions)
+        step, along = _cell((distance[near] + self.margin_mm) * self._per_mm, n_distances)
+        corner = (bend[hypothesis] * n_directions + turn) * n_distances + step
+        along_bend = along_bend[hypothesis]
+        flat = self.levels.reshape(-1)
+
+        def between(first: IntArray) -> FloatArray:
+            low = flat[first]
+            return np.asarray(low + along * (flat[first + 1] - low))
+
+        def ring(first: IntArray) -> FloatArray:
+            low = between(first)
+            return np.asarray(low + along_turn * (between(first + n_distances) - low))
+
+        low = ring(corner)
+        out[near] = low + along_bend * (ring(corner + n_directions * n_distances) - low)
+        return out
+
+    def mass(
+        self, theta: FloatArray, weight: FloatArray, grid: Grid, levels: FloatArray, turn_rad: FloatArray
+    ) -> FloatArray:
+        """Weigh the levels that hypotheses predict at every place of a grid.
+
+        Parameters
+        ----------
+        theta, weight
+            Hypotheses (n_samples, 3) and what each weighs, (n_samples,).
+        grid
+            The places.
+        levels
+            Evenly spaced levels, (n_levels,), from the darkest to the brightest; a prediction counts for the nearest.
+        turn_rad
+            Orientation of the sensor at each place, (n_places,).
+
+        Returns
+        -------
+        Weight by place and level, (n_places, n_levels), each row summing to the hypotheses' weight.
+        """
+        n_levels = len(levels)
+        per_level = 1.0 / (levels[1] - levels[0])
+        ends = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64)
+        nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int32)
+        margin = self._margin_of(nearest, ends)
+        inside = np.zeros((grid.n_y, grid.n_x + 1))
+        keys, shares = [], []
+        for start in range(0, len(theta), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            spans = _Spans.of(theta[block], grid, margin)
+            inside += spans.inside(weight[block])
+            if margin > 0.0:
+                ring = spans.ring(theta[block])
+                keys.append(ring.place * n_levels + nearest.reshape(-1)[self._entry(ring, turn_rad)])
+                shares.append(weight[block][ring.hypothesis])
+        size = grid.n_places * n_levels
+        near = np.bincount(np.concatenate(keys), np.concatenate(shares), minlength=size) if keys else np.zeros(size)
+        mass = np.asarray(near, dtype=np.float64).reshape(grid.n_places, n_levels)
+        bright = np.cumsum(inside, axis=1)[:, :-1].ravel()
+        dark = weight.sum() - bright - mass.sum(axis=1)
+        mass[:, ends[1]] += bright
+        mass[:, ends[0]] += dark
+        return mass
+
+    def _margin_of(self, nearest: IntArray, ends: IntArray) -> float:
+        """Distance from an edge beyond which the nearest of a list of levels is that of no edge."""
+        if self.margin_mm == 0.0:
+            return 0.0
+        distance = np.linspace(-self.margin_mm, self.margin_mm, nearest.shape[2])
+        off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
+        return float(np.abs(distance[off]).max(initial=0.0))
+
+    def _entry(self, ring: _Ring, turn_rad: FloatArray) -> IntArray:
+        """Index of the table's nearest entry for pairs of hypothesis and place."""
+        _, n_directions, n_distances = self.levels.shape
+        x, y = ring.x_mm, ring.y_mm
+        step = np.sqrt(x * x + y * y) - ring.radius_mm
+        step += self.margin_mm
+        step *= self._per_mm
+        step += 0.5
+        if turn_rad.any():
+            cosine, sine = (f(turn_rad).astype(np.float32)[ring.place] for f in (np.cos, np.sin))
+            x, y = cosine * x + sine * y, cosine * y - sine * x
+        turn = _pseudo_angle(x, y)
+        turn *= (n_directions - 1) / 4.0
+        turn += 0.5
+        bend = (1.0 / ring.radius_mm - self.bend_per_mm[0]) * self._per_bend + 0.5
+        entry = bend.astype(np.int32) * n_directions
+        entry += turn.astype(np.int32)
+        entry *= n_distances
+        entry += step.astype(np.int32)
+        return np.asarray(entry)
+
+    @property
+    def _per_mm(self) -> float:
+        return float((self.levels.shape[2] - 1) / (2.0 * self.margin_mm))
+
+    @property
+    def _per_bend(self) -> float:
+        return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Spans:
+    """Grid columns that each disc covers in each row, (n_samples, n_y): first and last, in all and deep inside."""
+
+    grid: Grid
+    first: IntArray
+    last: IntArray
+    inner_first: IntArray
+    inner_last: IntArray
+
+    @classmethod
+    def of(cls, theta: FloatArray, grid: Grid, margin_mm: float) -> Self:
+        x, radius = theta[:, :1], theta[:, 2:]
+        up = grid.y_mm - theta[:, 1:2]
+        per_mm = (grid.n_x - 1) / grid.width_mm
+
+        def columns(reach: FloatArray) -> tuple[IntArray, IntArray]:
+            square = reach * np.abs(reach) - up * up
+            half = np.sqrt(np.maximum(square, 0.0))
+            half[square < 0.0] = -2.0 / per_mm  # no column lies that far within itself
+            first = np.ceil(np.maximum((x - half) * per_mm, 0.0)).astype(np.int64)
+            last = np.floor(np.minimum((x + half) * per_mm, grid.n_x - 1.0)).astype(np.int64)
+            np.maximum(last, -1, out=last)
+            return np.minimum(first, last + 1), last
+
+        first, last = columns(radius + margin_mm)
+        inner_first, inner_last = columns(radius - margin_mm)
+        return cls(grid, first, last, inner_first, inner_last)
+
+    def inside(self, share: FloatArray) -> FloatArray:
+        """Weight that begins (and, below zero, ends) at each column of each row, (n_y, n_x + 1)."""
+        n_y, width = self.grid.n_y, self.grid.n_x + 1
+        row = np.arange(n_y) * width
+        own = np.repeat(share, n_y)
+        begins = np.bincount((row + self.inner_first).ravel(), own, minlength=n_y * width)
+        ends = np.bincount((row + self.inner_last + 1).ravel(), own, minlength=n_y * width)
+        return np.asarray((begins - ends).reshape(n_y, width))
+
+    def ring(self, theta: FloatArray) -> _Ring:
+        """Pairs of hypothesis and place in the ring about the edge."""
+        some = self.inner_first <= self.inner_last
+        left_last = np.where(some, self.inner_first - 1, self.last)
+        right_first = np.where(some, self.inner_last + 1, self.last + 1)
+        first = np.concatenate([self.first.ravel(), right_first.ravel()])
+        count = np.maximum(np.concatenate([left_last.ravel(), self.last.ravel()]) - first + 1, 0)
+        origin = np.tile(np.arange(self.first.size), 2)
+        used = np.flatnonzero(count)
+        first, count, origin = first[used], count[used], origin[used]
+        hypothesis, row = np.divmod(origin, self.grid.n_y)
+        first = first - (np.cumsum(count) - count)
+        running = np.arange(int(count.sum()), dtype=np.int32)
+        column = np.repeat(first.astype(np.int32), count) + running
+        spacing = self.grid.width_mm / (self.grid.n_x - 1)
+
+        def each(values: FloatArray) -> FloatArray:
+            return np.repeat(values.astype(np.float32), count)
+
+        # Single precision holds a place to a ten-thousandth of a millimetre.
+        return _Ring(
+            np.repeat(hypothesis, count),
+            np.repeat(row.astype(np.int32) * self.grid.n_x, count) + column,
+            column.astype(np.float32) * np.float32(spacing) - each(theta[hypothesis, 0]),
+            each(self.grid.y_mm[row] - theta[hypothesis, 1]),
+            each(theta[hypothesis, 2]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Ring:
+    """Pairs of hypothesis and place near its edge: place relative to the centre, and the radius, all (n_pairs,)."""
+
+    hypothesis: IntArray
+    place: IntArray
+    x_mm: FloatArray
+    y_mm: FloatArray
+    radius_mm: FloatArray
+
+
+def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Grow from 0 to 4 around the origin as an angle does, without a trigonometric function."""
+    across = x / np.maximum(np.abs(x) + np.abs(y), 1e-300)
+    return np.asarray(np.where(y >= 0.0, 1.0 - across, 3.0 + across))
+
+
+def _direction(pseudo_angle: FloatArray) -> FloatArray:
+    """Turn pseudo-angles into unit vectors, (n, 2)."""
+    upper = pseudo_angle <= 2.0
+    across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
+    up = np.where(upper, 1.0, -1.0) * (1.0 - np.abs(across))
+    return np.asarray(np.stack([across, up], axis=-1) / np.hypot(across, up)[:, None])
+
+
+def _cell(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
+    """Split positions in units of the spacing into the entry below and the way to the next."""
+    below = np.clip(position.astype(np.int64), 0, n - 2)
+    return below, position - below
+
+
+def _asked(model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray) -> FloatArray:
+    """Ask the model at places about one disc, -> (n_directions, n_distances)."""
+    away = (radius_mm + distance_mm)[:, None] * directions[:, None, :]
+    places = away.reshape(-1, 2)
+    n = len(places)
+    zero = np.zeros(n, dtype=np.int64)
+    plan = Plan(places[:, 0], places[:, 1], np.zeros(n), np.zeros(n), zero, ("table",), zero, ("table",))
+    predicted = model.predict(np.array([[0.0, 0.0, radius_mm]]), plan)
+    return predicted.reshape(len(directions), len(distance_mm))
+
+
+def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
+    """Levels far outside and at the middle of a large disc."""
+    east = np.array([[1.0, 0.0]])
+    dark, bright = _asked(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
+    if dark == bright:
+        raise ParameterError("levels", (dark, bright), "a sensor that tells the disc from its surroundings")
+    return float(dark), float(bright)
+
+
+def _margin(
+    model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
+) -> float:
+    """Distance from an edge beyond which the level is that of no edge, for the smallest and the largest disc."""
+    margin = _COARSE_MM
+    for radius in (low_mm, high_mm):
+        distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
+        asked = _asked(model, radius, directions, distance)
+        off = np.abs(asked - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
+        margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
+    return margin

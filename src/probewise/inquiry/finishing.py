@@ -1,0 +1,91 @@
+"""Near the end, ask for the reading after which there may be nothing left to ask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.inquiry.forecast import predicted, spread_levels, thinned
+from probewise.inquiry.prospect import Goal, Prospect
+from probewise.inquiry.utility import InformationGain, Utility
+
+__all__ = ["Finishing"]
+
+_NEAR = 15.0  # times the sd that is asked for: farther off than that no single reading ends a run
+_MOST_ASKED = 800  # hypotheses
+_MOST_DESIGNS = 250  # the best by the other utility
+_PER_SD = 2.0
+_LEAST = 1e-12
+
+
+@dataclass(frozen=True)
+class Finishing:
+    """Probability that the next reading ends the run, where some reading may well do so; otherwise another utility.
+
+    Information counts every bit alike, also of what is known well enough. Greedy for bits, a robot goes on
+    sharpening one length while another is still too wide; this looks at the sds that the run is to end on.
+
+    Parameters
+    ----------
+    of
+        What a reading is worth until then.
+    least
+        Probability of ending the run from which on it is all that counts.
+    """
+
+    of: Utility = field(default_factory=InformationGain)
+    least: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 0 < self.least <= 1:
+            raise ParameterError("least", self.least, "greater than 0, up to 1")
+
+    def __call__(self, prospect: Prospect) -> FloatArray:
+        """Value every design that can be taken, (n,): all by the one measure or all by the other."""
+        worth = self.of(prospect)
+        if prospect.goal is None or not _is_near(prospect, prospect.goal):
+            return worth
+        best = np.argsort(-worth, kind="stable")[:_MOST_DESIGNS]
+        chance = _ends(prospect, prospect.goal, best)
+        if chance.max() < self.least:
+            return worth
+        out = np.zeros(len(worth))
+        out[best] = chance
+        return out
+
+
+def _is_near(prospect: Prospect, goal: Goal) -> bool:
+    lengths = prospect.theta[:, goal.columns]
+    spread = prospect.weight @ (lengths - prospect.weight @ lengths) ** 2
+    return bool(np.sqrt(spread.max()) < _NEAR * goal.sd)
+
+
+def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
+    """Probability of a reading after which every length is known well enough, at some designs, (n_designs,).
+
+    The moments of every length given every cell of the reading come from sums over the hypotheses by level.
+    """
+    rows, share = thinned(prospect.weight, _MOST_ASKED)
+    away = prospect.theta[rows][:, goal.columns]
+    away = away - share @ away / share.sum()
+    n = len(designs)
+    answers = predicted(prospect.forecast.model, prospect.theta[rows], prospect.plan.take(prospect.rows[designs]))
+    sd = prospect.readout.noise_sd
+    levels = spread_levels(float(answers.min()), float(answers.max()), sd / _PER_SD)
+    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+    key = (index + np.arange(n) * len(levels)).ravel()
+    chance = prospect.readout.probability(levels)
+
+    def given_cell(values: FloatArray) -> FloatArray:
+        by_level = np.bincount(key, np.repeat(share * values, n), minlength=n * len(levels))
+        return np.asarray(by_level.reshape(n, len(levels)) @ chance)
+
+    mass = np.maximum(given_cell(np.ones(len(rows))), _LEAST)
+    ends = np.ones(mass.shape, dtype=np.bool_)
+    for length in away.T:
+        mean = given_cell(length) / mass
+        ends &= given_cell(length**2) / mass - mean**2 < goal.sd**2
+    return np.asarray((mass * ends).sum(axis=1) / mass.sum(axis=1))

@@ -1,0 +1,79 @@
+"""What a measurement may be asked to tell apart: hypotheses get labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+
+__all__ = ["FunctionValue", "Label", "ParameterValue", "WhichShape"]
+
+
+class Label(Protocol):
+    """Label hypotheses: those of one label need not be told apart."""
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """Label weighted hypotheses, names of the columns, (n_samples, n_params), (n_samples,) -> (n_samples,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    """Tell the values of one parameter apart, in bins that are equally probable now."""
+
+    name: str
+    n_bins: int = 16
+
+    def __post_init__(self) -> None:
+        _require_bins(self.n_bins)
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """See `Label`."""
+        if self.name not in names:
+            raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
+        return _evenly_binned(theta[:, names.index(self.name)], weight, self.n_bins)
+
+
+@dataclass(frozen=True)
+class FunctionValue:
+    """Tell the values of any function of the parameters apart, (n_samples, n_params) -> (n_samples,)."""
+
+    function: Callable[[FloatArray], FloatArray]
+    n_bins: int = 16
+
+    def __post_init__(self) -> None:
+        _require_bins(self.n_bins)
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """See `Label`."""
+        return _evenly_binned(np.asarray(self.function(theta)), weight, self.n_bins)
+
+
+@dataclass(frozen=True)
+class WhichShape:
+    """Tell apart which shape of a set lies there."""
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """See `Label`."""
+        if "shape" not in names:
+            raise ParameterError("shape", names, "a set of shapes, two or more, to be told apart")
+        return np.floor(theta[:, names.index("shape")]).astype(np.int64)
+
+
+def _require_bins(n_bins: int) -> None:
+    if n_bins < 2:
+        raise ParameterError("n_bins", n_bins, "2 or more")
+
+
+def _evenly_binned(values: FloatArray, weight: FloatArray, n_bins: int) -> IntArray:
+    """Put values into bins of equal weight, numbered from the lowest."""
+    order = np.argsort(values, kind="stable")
+    before = np.cumsum(weight[order]) - 0.5 * weight[order]
+    out = np.empty(len(values), dtype=np.int64)
+    out[order] = np.minimum(n_bins * before / weight.sum(), n_bins - 1).astype(np.int64)
+    return out

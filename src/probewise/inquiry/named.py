@@ -1,0 +1,29 @@
+"""Utilities by the names that a command line or a table of rows gives them."""
+
+from __future__ import annotations
+
+from probewise.errors import ParameterError
+from probewise.inquiry.finishing import Finishing
+from probewise.inquiry.labels import ParameterValue, WhichShape
+from probewise.inquiry.utility import InformationAbout, InformationGain, PerSecond, ReadingEntropy, Utility
+
+__all__ = ["UTILITY_NAMES", "utility_named"]
+
+UTILITY_NAMES = ("finishing", "information", "entropy", "per-second", "about:PARAMETER", "which-shape")
+
+
+def utility_named(text: str) -> Utility:
+    """Build a utility from its name, such as "entropy" or "about:radius_mm"."""
+    name, _, parameter = text.partition(":")
+    if name == "about" and parameter:
+        return InformationAbout(ParameterValue(parameter))
+    plain: dict[str, Utility] = {
+        "finishing": Finishing(),
+        "information": InformationGain(),
+        "entropy": ReadingEntropy(),
+        "per-second": PerSecond(),
+        "which-shape": InformationAbout(WhichShape()),
+    }
+    if text not in plain:
+        raise ParameterError("utility", text, ", ".join(UTILITY_NAMES))
+    return plain[text]

@@ -1,0 +1,81 @@
+"""From a noise-free level to the number that is read: noise, rounding, the ends of the scale."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+
+__all__ = ["Readout", "entropy_bits"]
+
+_REACH = 5.0  # sds of noise beyond the levels that the cells cover
+_FINE = 0.5  # width of a cell, in sds of noise, where readings are not rounded: it hides 1 % of a nat
+_LEAST = np.float32(1e-30)
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Noise of known sd, then rounding to whole steps, then the ends of the scale.
+
+    Parameters
+    ----------
+    noise_sd
+        Sd of the Gaussian noise of one reading, in the sensor's unit.
+    step
+        What readings are whole multiples of; None: they are not rounded.
+    low, high
+        Least and greatest reading that the sensor can return.
+    """
+
+    noise_sd: float
+    step: float | None = None
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not 0 < self.noise_sd < math.inf:
+            raise ParameterError("noise_sd", self.noise_sd, "finite, greater than 0")
+        if self.step is not None and not 0 < self.step < math.inf:
+            raise ParameterError("step", self.step, "finite, greater than 0, or None")
+        if not self.low < self.high:
+            raise ParameterError("(low, high)", (self.low, self.high), "low < high")
+
+    def require(self, value: float) -> None:
+        """Refuse a reading that this sensor cannot return; NaN is a reading that did not come."""
+        if not (math.isnan(value) or self.low <= value <= self.high):
+            raise ParameterError(
+                "reading",
+                value,
+                f"{self.low:g} to {self.high:g}, the range of the sensor; is it the sensor that was calibrated?",
+            )
+
+    def edges(self, levels: FloatArray) -> FloatArray:
+        """Edges of the cells that readings of these levels may fall into, (n_cells - 1,); the end cells are open."""
+        width = _FINE * self.noise_sd if self.step is None else self.step
+        least = max(float(np.min(levels)) - _REACH * self.noise_sd, self.low)
+        most = min(float(np.max(levels)) + _REACH * self.noise_sd, self.high)
+        first, last = math.floor(least / width + 0.5), math.ceil(most / width - 0.5)
+        return np.asarray((np.arange(first, max(last, first + 1)) + 0.5) * width, dtype=np.float64)
+
+    def probability(self, levels: FloatArray, *, repeats: int = 1) -> FloatArray:
+        """Probability of each cell given each level, (n_levels,) -> (n_levels, n_cells).
+
+        Of several repeats it is that of their mean, as if it were rounded as finely as its noise is small.
+        """
+        sd = self.noise_sd / math.sqrt(repeats)
+        each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
+        below = ndtr((each.edges(levels) - levels[:, None]) / sd)
+        ends = np.zeros((len(levels), 1)), np.ones((len(levels), 1))
+        return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
+
+
+def entropy_bits(probability: FloatArray) -> FloatArray:
+    """Shannon entropy in bits along the last axis, any shape and precision; what cannot be has none."""
+    log = np.log2(np.maximum(probability, _LEAST))
+    log *= probability
+    return np.asarray(-log.sum(axis=-1))

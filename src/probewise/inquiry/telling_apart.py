@@ -1,0 +1,88 @@
+"""Where to measure to learn which model is true: one Gaussian or two, this effect or that one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen
+from probewise.errors import ParameterError, ShapeError
+from probewise.inquiry.forecast import predicted, spread_levels
+from probewise.inquiry.readout import Readout, entropy_bits
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import SensorModel
+
+__all__ = ["Rival", "tell_apart"]
+
+_PER_SD = 8.0  # levels a noise sd
+_BLOCK = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """One of the models that may be true: samples of its posterior and how probable it is.
+
+    `theta` has shape (n_samples, n_params), equally weighted; `probability` need not be normalised.
+    """
+
+    model: SensorModel
+    theta: FloatArray
+    probability: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", frozen(self.theta))
+        if self.theta.ndim != 2 or len(self.theta) == 0:
+            raise ShapeError(f"theta has shape {self.theta.shape}; allowed: (n_samples, n_params), one sample or more")
+        if not 0 <= self.probability < np.inf:
+            raise ParameterError("probability", self.probability, "finite, 0 or more")
+
+
+def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatArray:
+    """Give the bits that each reading of a plan is expected to tell of which rival is true.
+
+    The entropy of what may be read whoever is right, less its average when it is known who is: the
+    Jensen-Shannon divergence of the rivals' predictive distributions, each with its own uncertain
+    parameters. It is at most the entropy of the rivals' probabilities.
+
+    Parameters
+    ----------
+    rivals
+        Two models or more, of any parameters.
+    plan
+        Readings that might be taken, n_points rows, each by itself.
+    readout
+        Noise, rounding and range of a reading.
+
+    Returns
+    -------
+    Bits, (n_points,).
+    """
+    total = sum(rival.probability for rival in rivals)
+    if len(rivals) < 2 or not total > 0:
+        raise ParameterError("rivals", [rival.probability for rival in rivals], "two models or more, one probable")
+    answers = [predicted(rival.model, rival.theta, plan) for rival in rivals]
+    low, high = min(a.min() for a in answers), max(a.max() for a in answers)
+    levels = spread_levels(float(low), float(high), readout.noise_sd / _PER_SD)
+    chance = readout.probability(levels)
+    bits = np.zeros(len(plan))
+    for start in range(0, len(plan), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        mixed = np.zeros((len(bits[block]), chance.shape[1]))
+        for rival, answer in zip(rivals, answers, strict=True):
+            own = _shares(answer[:, block], levels) @ chance
+            share = rival.probability / total
+            mixed += share * own
+            bits[block] -= share * entropy_bits(own)
+        bits[block] += entropy_bits(mixed)
+    return np.maximum(bits, 0.0)
+
+
+def _shares(answers: FloatArray, levels: FloatArray) -> FloatArray:
+    """Share of the samples that predict each level, (n_samples, n_points) -> (n_points, n_levels)."""
+    n_samples, n_points = answers.shape
+    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+    key = index + np.arange(n_points) * len(levels)
+    count = np.bincount(key.ravel(), minlength=n_points * len(levels))
+    return np.asarray(count.reshape(n_points, -1) / n_samples)

@@ -1,0 +1,30 @@
+"""How many measurements does the robot need? Studies over many circles (paper, section 4, "Results").
+
+A study is a campaign of autonomous runs: every row of its table looks for the same circles and meets
+the same noise, and differs from a reference row in one thing.
+"""
+
+from probewise.study.circles import POPULATIONS, Population, noise_of
+from probewise.study.rows import REFERENCE, Row, standard_rows
+from probewise.study.run import Study, read_study, run_study
+from probewise.study.table import Estimate, Summary, share_within, summarise
+from probewise.study.trial import Trial, experiment_of, run_trial
+
+__all__ = [
+    "POPULATIONS",
+    "REFERENCE",
+    "Estimate",
+    "Population",
+    "Row",
+    "Study",
+    "Summary",
+    "Trial",
+    "experiment_of",
+    "noise_of",
+    "read_study",
+    "run_study",
+    "run_trial",
+    "share_within",
+    "standard_rows",
+    "summarise",
+]

@@ -1,0 +1,45 @@
+"""The circles that every row of a study looks for, and the noise it meets on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.scene import Circle, Field
+
+__all__ = ["FIELD", "POPULATIONS", "Population", "noise_of"]
+
+FIELD = Field()
+_SEED = 2013
+
+
+@dataclass(frozen=True)
+class Population:
+    """A family of circles, which is also what the robot believes beforehand."""
+
+    name: str
+    shape: Circle
+
+    def circles(self, n: int) -> FloatArray:
+        """Draw the first `n` circles, x_mm, y_mm and radius_mm, (n, 3): always the same ones."""
+        if n < 1:
+            raise ParameterError("n", n, "1 or more")
+        return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(_SEED).random((n, 3))))
+
+
+POPULATIONS: Mapping[str, Population] = {
+    p.name: p
+    for p in (
+        Population("anywhere", Circle(FIELD, (20.0, 150.0))),
+        Population("inside", Circle(FIELD, (50.0, 150.0), inside=True)),
+    )
+}
+
+
+def noise_of(circle: int, n: int) -> FloatArray:
+    """Noise of the first `n` readings of a run, in units of its sd, (n,): of every row's run the same."""
+    return np.random.default_rng([circle, 99]).standard_normal(n)

@@ -1,0 +1,99 @@
+"""The rows of a study: one factor at a time from a reference row."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from probewise.errors import ParameterError
+from probewise.inquiry import utility_named
+from probewise.study.circles import POPULATIONS
+
+__all__ = ["REFERENCE", "Row", "standard_rows"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to look for circles.
+
+    Parameters
+    ----------
+    population
+        Which circles, and what is believed of them: "anywhere" (radius 20 to 150 mm) or "inside" (50 to 150 mm,
+        wholly in the field).
+    model
+        What the robot takes its sensor for: "ssf" or "naive". The world's sensor is the SSF one always.
+    utility
+        Worth of a reading, by name (see `inquiry.utility_named`).
+    noise_sd
+        Sd of the world's noise, which the robot knows, LEGO units.
+    width
+        Width of the SSF that the robot believes in over that of the world's: 1, or a wrong one.
+    learn_sensor
+        Whether it learns the sensor along with the shape.
+    batch
+        Readings that are chosen together.
+    """
+
+    population: str = "inside"
+    model: str = "ssf"
+    utility: str = "information"
+    noise_sd: float = 1.0
+    width: float = 1.0
+    learn_sensor: bool = False
+    batch: int = 1
+
+    def __post_init__(self) -> None:
+        if self.population not in POPULATIONS:
+            raise ParameterError("population", self.population, " or ".join(POPULATIONS))
+        if self.model not in ("ssf", "naive"):
+            raise ParameterError("model", self.model, "ssf or naive")
+        utility_named(self.utility)
+        for name in ("noise_sd", "width"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ParameterError(name, getattr(self, name), "finite, greater than 0")
+
+    @property
+    def name(self) -> str:
+        """Say in a few words in what it differs from the reference."""
+        words = [self.population, "SSF" if self.model == "ssf" else "naive"]
+        if self.utility != REFERENCE.utility:
+            words.append(self.utility)
+        if self.noise_sd != REFERENCE.noise_sd:
+            words.append(f"noise {self.noise_sd:g}")
+        if self.width != REFERENCE.width:
+            words.append(f"believed {abs(self.width - 1):.0%} too {'wide' if self.width > 1 else 'narrow'}")
+        if self.learn_sensor:
+            words.append("learning it")
+        if self.batch != REFERENCE.batch:
+            words.append(f"{self.batch} at once")
+        return ", ".join(words)
+
+    def settings(self) -> dict[str, Any]:
+        """Give its fields, as JSON holds them."""
+        return asdict(self)
+
+
+REFERENCE = Row()
+
+
+def standard_rows() -> tuple[Row, ...]:
+    """List the rows of the published table, the reference first."""
+    changes: tuple[dict[str, Any], ...] = (
+        {},
+        {"model": "naive"},
+        {"population": "anywhere"},
+        {"population": "anywhere", "model": "naive"},
+        {"utility": "entropy"},
+        {"utility": "per-second"},
+        {"utility": "about:radius_mm"},
+        {"batch": 3},
+        {"noise_sd": 0.5},
+        {"noise_sd": 2.0},
+        {"width": 1.3},
+        {"width": 0.7},
+        {"width": 1.3, "learn_sensor": True},
+        {"width": 0.7, "learn_sensor": True},
+    )
+    return tuple(replace(REFERENCE, **change) for change in changes)

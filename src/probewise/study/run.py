@@ -1,0 +1,97 @@
+"""A study: rows by circles, done as a campaign, summed up as a table."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from probewise._version import __version__
+from probewise.campaign import read_campaign, run_campaign
+from probewise.errors import FileError, ParameterError
+from probewise.study.rows import Row
+from probewise.study.table import Summary, summarise
+from probewise.study.trial import Trial, run_trial
+
+__all__ = ["Study", "read_study", "run_study"]
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Results of each row, in the order of the circles, and how many readings a run could take."""
+
+    trials: Mapping[Row, tuple[Mapping[str, Any], ...]]
+    max_readings: int
+
+    def table(self) -> dict[Row, Summary]:
+        """Sum up every row that has two runs or more."""
+        return {row: summarise(t, max_readings=self.max_readings) for row, t in self.trials.items() if len(t) > 1}
+
+
+def run_study(
+    rows: Mapping[Row, int] | Sequence[Row],
+    n_circles: int | None = None,
+    *,
+    path: str | os.PathLike[str],
+    max_readings: int = 100,
+    executor: Executor | None = None,
+    progress: Callable[[str, Mapping[str, Any]], None] | None = None,
+) -> Study:
+    """Run every row over the first circles of its population, or go on with a study that was stopped.
+
+    Parameters
+    ----------
+    rows
+        The rows; as a mapping, each with its own number of circles.
+    n_circles
+        Circles a row, where `rows` does not say.
+    path
+        The campaign's file. More rows and more circles may be asked of it later: what it holds is not done again.
+    max_readings
+        A run that knows too little after so many readings counts as a miss.
+    executor
+        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
+    progress
+        Called with key and result of every run that ends.
+
+    Raises
+    ------
+    FileError, NotConvergedError
+        See `run_campaign`.
+    """
+    wanted = dict(rows) if isinstance(rows, Mapping) else dict.fromkeys(rows, n_circles or 0)
+    for row, n in wanted.items():
+        if n < 1:
+            raise ParameterError(f"circles of the row {row.name!r}", n, "1 or more")
+    # Circle by circle, so that a study that was stopped has as many of each row.
+    trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
+    results = run_campaign(
+        run_trial,
+        {trial.key: trial for trial in trials},
+        path=path,
+        settings={"study": __version__, "max_readings": max_readings},
+        executor=executor,
+        progress=progress,
+    )
+    own = {row: tuple(results[Trial(row, k).key] for k in range(n)) for row, n in wanted.items()}
+    return Study(own, max_readings)
+
+
+def read_study(path: str | os.PathLike[str], rows: Sequence[Row]) -> Study:
+    """Read what a study's file holds of these rows, finished or not.
+
+    Raises
+    ------
+    FileError
+        If the file is no study's.
+    """
+    found = read_campaign(path)
+    if "study" not in found.settings:
+        raise FileError(Path(path), "no study's campaign", "a file that `probewise study` wrote")
+    numbers = range(1 + max((int(key.rpartition(" / ")[2]) for key in found.results), default=-1))
+    keys = {row: [Trial(row, k).key for k in numbers] for row in rows}
+    trials = {row: tuple(found.results[k] for k in own if k in found.results) for row, own in keys.items()}
+    return Study(trials, found.settings["max_readings"])

@@ -1,0 +1,136 @@
+"""What a row of a study comes to, with errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom, poisson
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+
+__all__ = ["Estimate", "Summary", "share_within", "summarise"]
+
+WRONG_MM = 12.0
+"""An error that the stopping rule rules out, three times its 4 mm: a run that ends with it is sure and wrong."""
+
+_CHANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and the bounds of its error: one standard error to either side, or a 95 % interval where said."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        half = 0.5 * (self.high - self.low)
+        return f"{self.value:.3g} ± {half:.2g}"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One row of the table.
+
+    Attributes
+    ----------
+    n_runs
+        Circles looked for.
+    reached
+        Share of runs that came to know every length within the limit of readings, with its 95 % interval.
+    mean, median
+        Readings needed, a miss counted as the limit; the mean's standard error, the median's 95 % interval.
+    after_white
+        Readings after the first one on white, of runs that reached the end.
+    bits_each
+        Bits a reading, prior less posterior differential entropy.
+    error_mm
+        Largest error of a length at the stop, its median over runs that reached the end.
+    wrong
+        Runs that stopped sure with an error above `WRONG_MM`.
+    wrong_expected, wrong_limit
+        How many their own posteriors expect, and the number that Poisson's law exceeds in one of a hundred studies.
+    held
+        Share of the 95 % intervals at the stop that hold the truth, with the standard error over runs.
+    arm_s
+        Seconds of arm time a run, with the standard error.
+    cpu_s
+        Processor time a decision, median over runs of each run's median; None where it was not taken.
+    """
+
+    n_runs: int
+    reached: Estimate
+    mean: Estimate
+    median: Estimate
+    after_white: Estimate
+    bits_each: Estimate
+    error_mm: float
+    wrong: int
+    wrong_expected: float
+    wrong_limit: int
+    held: Estimate
+    arm_s: Estimate
+    cpu_s: float
+
+
+def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summary:
+    """Sum up the runs of one row, each a result of `run_trial`.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two: no error can be told.
+    """
+    if len(trials) < 2:
+        raise ParameterError("number of trials", len(trials), "2 or more, so that there is an error to tell")
+    sure = [t for t in trials if t["reached"]]
+    needed = np.array([t["readings"] if t["reached"] else max_readings for t in trials], dtype=np.float64)
+    after = [t["readings"] - t["first_white"] for t in sure if t["first_white"] is not None]
+    errors = np.array([t["error_mm"] for t in sure])
+    expected = float(sum(t["chance_wrong"] for t in sure))
+    return Summary(
+        n_runs=len(trials),
+        reached=share_within(len(sure), len(trials)),
+        mean=_mean(needed),
+        median=_median(needed),
+        after_white=_mean(np.array(after, dtype=np.float64)),
+        bits_each=_mean(np.array([t["bits"] / t["readings"] for t in trials])),
+        error_mm=float(np.median(errors)) if len(errors) else math.nan,
+        wrong=int((errors > WRONG_MM).sum()),
+        wrong_expected=expected,
+        wrong_limit=int(poisson.isf(_CHANCE, expected)) if expected > 0 else 0,
+        held=_mean(np.array([np.mean(t["held"]) for t in sure])),
+        arm_s=_mean(np.array([t["arm_s"] for t in trials])),
+        cpu_s=float(np.median([t["cpu_s"] for t in trials])),
+    )
+
+
+def share_within(k: int, n: int) -> Estimate:
+    """Estimate a share from k of n, with Wilson's 95 % interval.
+
+    Wilson's interval keeps its promise also near 0 and 1 (Wilson 1927).
+    """
+    z = 1.959963984540054
+    share, centre = k / n, (k + z * z / 2) / (n + z * z)
+    half = z / (n + z * z) * math.sqrt(n * share * (1 - share) + z * z / 4)
+    return Estimate(share, centre - half if k else 0.0, centre + half if k < n else 1.0)
+
+
+def _mean(values: FloatArray) -> Estimate:
+    if values.size < 2:
+        return Estimate(math.nan, math.nan, math.nan)
+    mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(values.size)
+    return Estimate(mean, mean - error, mean + error)
+
+
+def _median(values: FloatArray) -> Estimate:
+    """Median with the order statistics that enclose it with 95 %, whatever the distribution."""
+    ordered = np.sort(values)
+    below = max(int(binom.ppf(0.025, len(ordered), 0.5)) - 1, 0)
+    return Estimate(float(np.median(ordered)), float(ordered[below]), float(ordered[len(ordered) - 1 - below]))

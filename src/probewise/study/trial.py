@@ -1,0 +1,163 @@
+"""One autonomous run of a study: look for one circle in one way, and say how it went."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm import Pose, Reach, SimulatedArm
+from probewise.experiment import AdjustedMixture, Change, Experiment, Step, explore
+from probewise.inference import GaussianKnown, Naive
+from probewise.inquiry import Grid, utility_named
+from probewise.priors import Normal, Product
+from probewise.recordings import Disc
+from probewise.scene import HypothesisScene
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
+from probewise.study.circles import FIELD, POPULATIONS, noise_of
+from probewise.study.rows import Row
+from probewise.study.table import WRONG_MM
+from probewise.world import Blob, World, gaussian_spot
+
+__all__ = ["Trial", "experiment_of", "run_trial"]
+
+_SEED = 2013
+# The study's sensor: one Gaussian, mm and LEGO units; the same numbers for the robot and, by pixels, for the world.
+_DARK, _BRIGHT = 10.0, 60.0
+_CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
+_ON_WHITE = _DARK + 0.1 * (_BRIGHT - _DARK)
+_PIXEL_MM = 0.5
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A task of a study: the row, the number of the circle, and how many readings the robot may take."""
+
+    row: Row
+    circle: int
+    max_readings: int = 100
+
+    @property
+    def key(self) -> str:
+        """Name it in the campaign's file."""
+        return f"{self.row.name} / {self.circle}"
+
+
+def experiment_of(row: Row) -> Experiment:
+    """Pose what the robot of a row believes and wants."""
+    scene = HypothesisScene(POPULATIONS[row.population].shape)
+    common: dict[str, Any] = {
+        "noise_sd": row.noise_sd,
+        "grid": Grid(FIELD.width_mm, FIELD.height_mm),
+        "utility": utility_named(row.utility),
+        "batch": row.batch,
+    }
+    shape = POPULATIONS[row.population].shape
+    if row.model == "naive":
+        likelihood = Naive(_DARK, row.noise_sd, _BRIGHT, row.noise_sd)
+        model = NaiveSensor(FixedLevels(_DARK, _BRIGHT), scene)
+        # A reading on the edge fits neither level, and the naive model knows no edge.
+        return Experiment(shape, model, likelihood, **common, doubt_p=0.0)
+    sd_u, sd_v = (row.width * sd for sd in _SD)
+    covariance = np.array([[sd_u**2, _CORRELATION * sd_u * sd_v], [_CORRELATION * sd_u * sd_v, sd_v**2]])
+    mixture = FixedMixture(np.ones(1), np.array([_CENTRE]), covariance[None])
+    if not row.learn_sensor:
+        chain = Chain(mixture, FixedLevels(_DARK, _BRIGHT), scene, n_nodes=FAST_NODES)
+        return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
+    free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
+    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_changed())
+
+
+def run_trial(trial: Trial) -> dict[str, Any]:
+    """Look for a circle.
+
+    Returns
+    -------
+    A JSON object: whether every length became known (`reached`), the number of `readings`, that of the
+    first on white (`first_white`, or None), `bits` gained in all and when white was first met
+    (`bits_at_white`), the largest error of a length (`error_mm`) and the chance, by the run's own
+    posterior, that it is above 12 mm (`chance_wrong`), whether each 95 % interval holds the truth
+    (`held`), seconds of arm time (`arm_s`), median processor time a decision (`cpu_s`), the widest posterior sd
+    after each reading (`widest_mm`), and the fit (`p_value`).
+    """
+    truth = POPULATIONS[trial.row.population].circles(trial.circle + 1)[trial.circle]
+    experiment = experiment_of(trial.row)
+    arm = _arm_over(truth, trial)
+    rng = np.random.default_rng([_SEED, trial.circle])
+    widest, cpu, first_white, bits_at_white = [], [], None, None
+    with arm:
+        steps = explore(arm, experiment, rng=rng, max_readings=trial.max_readings)
+        while True:
+            before = time.process_time()
+            step = next(steps, None)
+            if step is None:
+                break
+            last = step
+            cpu.append(time.process_time() - before)
+            widest.append(round(step.widest_mm, 3))
+            if first_white is None and step.reading.value > _ON_WHITE:
+                first_white, bits_at_white = step.number, round(step.bits, 3)
+    return {
+        "reached": bool(last.p_value >= experiment.doubt_p and experiment.is_known(last.sd, last.shapes)),
+        "readings": last.number,
+        "first_white": first_white,
+        "bits": round(last.bits, 3),
+        "bits_at_white": bits_at_white,
+        **_judged(last, experiment, truth),
+        "arm_s": round(last.reading.time_s, 2),
+        "cpu_s": round(float(np.median(cpu)), 4),
+        "widest_mm": widest,
+        "p_value": last.p_value,
+    }
+
+
+def _judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
+    """Hold the last posterior of the shape against the truth, (3,)."""
+    columns = experiment.shape_columns
+    theta, weight = last.posterior.theta[:, columns], last.posterior.weight
+    off = np.abs(theta - weight @ theta).max(axis=1)
+    held = []
+    for values, true in zip(theta.T, truth, strict=True):
+        below = float(weight[values < true].sum() + 0.5 * weight[values == true].sum())
+        held.append(bool(0.025 <= below <= 0.975))
+    return {
+        "error_mm": round(float(np.abs(last.mean - truth).max()), 3),
+        "chance_wrong": float(weight[off > WRONG_MM].sum()),
+        "held": held,
+    }
+
+
+def _arm_over(truth: FloatArray, trial: Trial) -> SimulatedArm:
+    """Stand an arm that reaches the whole grid over the circle, with the noise that every row meets there."""
+    spot = gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
+    world = World(spot, black=_DARK, white=_BRIGHT, noise_sd=0.0)
+    disc = Disc((float(truth[0]), float(truth[1])), float(truth[2]))
+    noise, number = noise_of(trial.circle, trial.max_readings), itertools.count()
+
+    def light(pose: Pose, time_s: float, height_mm: float) -> float:
+        clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)
+        return clean + trial.row.noise_sd * float(noise[next(number)])
+
+    everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
+    return SimulatedArm(light, reach=everywhere, scale=None)
+
+
+def _changed() -> Product:
+    """Believe that the sensor may have changed as `experiment.sensor_prior` believes by default."""
+    change = Change()
+    level = change.level * (_BRIGHT - _DARK)
+    size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)
+    return Product(
+        {
+            "log_size_u": size,
+            "log_size_v": size,
+            "shift_u_mm": shift,
+            "shift_v_mm": shift,
+            "I_min": Normal(_DARK, level),
+            "I_max": Normal(_BRIGHT, level),
+        }
+    )

@@ -1,0 +1,111 @@
+"""A plan carried out by the arm: row after row, a person asked where there is something to do."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from probewise.arm import LegoArm, Pose, Reading, Rehearsal, carry_out, read_geometry, recorded, shipped_geometry
+from probewise.errors import ParameterError, ReachError
+from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
+
+GEOMETRY = read_geometry(shipped_geometry())
+ORIGIN = (524.0, 260.0)
+
+
+class Told:
+    """A machine of words, and the person beside it."""
+
+    def __init__(self):
+        self.asked = []
+        self.arm = LegoArm(Rehearsal(GEOMETRY, lambda text: None), GEOMETRY)
+
+    def take(self, plan, **options):
+        with self.arm:
+            return list(carry_out(self.arm, plan, origin_mm=ORIGIN, ask=self.asked.append, **options))
+
+
+@pytest.fixture
+def told():
+    return Told()
+
+
+def thinned(plan, step=20):
+    """Every twentieth row and the last four, the quadrants."""
+    return plan.take(np.r_[0 : len(plan) - 4 : step, len(plan) - 4 : len(plan)])
+
+
+def test_the_papers_plan_asks_for_four_turns_and_five_patterns(told):
+    plan = thinned(paper_plan())
+    readings = told.take(plan)
+    assert len(readings) == len(plan)
+    patterns = [text.split("'")[1] for text in told.asked if text.startswith("put pattern")]
+    assert patterns == ["boundary", "quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d"]
+    turns = [text.split(" degrees")[0].split()[-1] for text in told.asked if text.startswith("turn")]
+    assert turns == ["90", "180", "270", "0"]
+
+
+def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told):
+    plan = thinned(paper_plan())
+    readings = told.take(plan)
+    np.testing.assert_array_equal([r.pose.x_mm for r in readings], plan.x_mm)
+    np.testing.assert_array_equal([r.pose.y_mm for r in readings], plan.y_mm)
+    off = np.array([r.pose.orientation_rad for r in readings]) - plan.orientation_rad
+    off = np.degrees(np.angle(np.exp(1j * off)))
+    # The arm is 320 mm away: over 50 mm to either side its sensor turns by atan(50 / 320).
+    assert abs(off).max() == pytest.approx(math.degrees(math.atan2(50, 320)), abs=0.1)
+
+
+def test_the_field_place_is_the_plans_place_and_the_origin(told):
+    measured = []
+    measure = told.arm.measure
+    told.arm.measure = lambda pose: measured.append(pose) or measure(pose)
+    told.take(thinned(paper_plan(), 50))
+    assert measured[0].x_mm == 524.0 - 50.0
+    assert measured[0].y_mm == 260.0
+
+
+def test_it_goes_on_behind_the_rows_that_were_taken(told):
+    plan = thinned(paper_plan())
+    first = told.take(plan, first=len(plan) - 3)
+    assert len(first) == 3
+    # The person is asked anew: nobody knows what happened in between.
+    assert told.asked[0].startswith("put pattern 'quadrant_b'")
+
+
+def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):
+    plan = paper_plan()
+    with pytest.raises(ReachError, match=r"row 1 of the plan, and \d+ more, is \(-26.0, 20.0\);.*move the plan"):
+        list(carry_out(told.arm, plan, origin_mm=(24.0, 20.0), ask=told.asked.append))
+    assert not told.asked
+
+
+@pytest.mark.parametrize(("name", "value"), [("led", 0.0), ("height_mm", 8.0)])
+def test_what_the_arm_has_not_is_refused(told, name, value):
+    plan = thinned(paper_plan())
+    usual = {"led": 1.0, "height_mm": 14.0}[name]
+    column = np.full(len(plan), usual)
+    told.take(dataclasses.replace(plan, covariates={name: column}))
+    column = column.copy()
+    column[3] = value
+    with pytest.raises(ParameterError, match=f"the plan's {name} is {value}"):
+        told.take(dataclasses.replace(plan, covariates={name: column}))
+
+
+def test_a_recording_says_what_was_read_and_comes_back_from_its_file(tmp_path):
+    plan = thinned(two_way_plan(), 60)
+    readings = [
+        Reading(
+            20.0 + k, Pose(plan.x_mm[k], plan.y_mm[k], 0.01 * k), 2.5 * k, {"battery_mv": 7400.0 - k, "height_mm": 14.0}
+        )
+        for k in range(5)
+    ]
+    write_recording(recorded(plan, readings), tmp_path / "r.csv")
+    back = read_recording(tmp_path / "r.csv")
+    np.testing.assert_array_equal(back.readings, [20, 21, 22, 23, 24])
+    np.testing.assert_array_equal(back.plan.time_s, 2.5 * np.arange(5))
+    np.testing.assert_array_equal(back.plan.orientation_rad, 0.01 * np.arange(5))
+    np.testing.assert_array_equal(back.plan.covariates["battery_mv"], 7400.0 - np.arange(5))
+    np.testing.assert_array_equal(back.plan.x_mm, plan.x_mm[:5])
+    assert [back.plan.pattern_names[k] for k in back.plan.pattern] == [plan.pattern_names[k] for k in plan.pattern[:5]]

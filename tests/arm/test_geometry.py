@@ -1,0 +1,191 @@
+"""The arm's geometry: kinematics by two routes, reach, orientation, the file."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probewise.arm import Geometry, Joint, read_geometry, shipped_geometry
+from probewise.errors import FileError, ParameterError, ShapeError
+
+SHIPPED = read_geometry(shipped_geometry())
+RELATIVE = dataclasses.replace(
+    SHIPPED, elbow_is_relative=True, elbow=dataclasses.replace(SHIPPED.elbow, low_rad=-3.1, high_rad=0.0)
+)
+GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 50), np.linspace(0, 520, 30)), axis=-1).reshape(-1, 2)
+
+
+def by_complex_numbers(geometry: Geometry, base: float, shoulder: float, elbow: float) -> tuple[float, float, float]:
+    """Add up the arm as arrows in the plane of its links, one after another."""
+    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
+    tip = complex(*geometry.shoulder_mm)
+    tip += geometry.links_mm[0] * complex(math.cos(shoulder), math.sin(shoulder))
+    tip += geometry.links_mm[1] * complex(math.cos(lower), math.sin(lower))
+    tip += complex(geometry.sensor_mm[0], -geometry.sensor_mm[1])
+    place = complex(*geometry.axis_mm) + tip.real * complex(math.cos(base), math.sin(base))
+    return place.real, place.imag, tip.imag
+
+
+@pytest.mark.parametrize("geometry", [SHIPPED, RELATIVE], ids=["absolute", "relative"])
+def test_forward_kinematics_agree_with_arrows_in_the_plane(geometry):
+    angles = np.random.default_rng(1).uniform(-3, 3, (200, 3))
+    np.testing.assert_allclose(
+        geometry.position_mm(angles), [by_complex_numbers(geometry, *row) for row in angles], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("geometry", [SHIPPED, RELATIVE], ids=["absolute", "relative"])
+@pytest.mark.parametrize("height_mm", [14.0, 60.0])
+def test_inverse_kinematics_lead_back_by_the_arrows(geometry, height_mm):
+    angles = geometry.angles_rad(GRID, height_mm)
+    solved = np.isfinite(angles).all(axis=-1)
+    assert solved.mean() > 0.7
+    back = np.array([by_complex_numbers(geometry, *row) for row in angles[solved]])
+    np.testing.assert_allclose(back[:, :2], GRID[solved], atol=1e-9)
+    np.testing.assert_allclose(back[:, 2], height_mm, atol=1e-9)
+
+
+@pytest.mark.parametrize("geometry", [SHIPPED, RELATIVE], ids=["absolute", "relative"])
+def test_the_rise_with_each_angle_is_the_difference_quotient(geometry):
+    angles = np.random.default_rng(2).uniform(-3, 3, (50, 3))
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        quotient = (geometry.position_mm(angles + step) - geometry.position_mm(angles - step))[:, 2] / 2e-6
+        np.testing.assert_allclose(geometry.rise_mm_rad(angles)[:, k], quotient, atol=1e-4)
+
+
+def test_the_elbow_is_up():
+    """The elbow lies above the line from shoulder to wrist."""
+    angles = SHIPPED.angles_rad(GRID, 14.0)
+    shoulder, lower = angles[np.isfinite(angles).all(axis=-1)][:, 1:].T
+    assert (shoulder > lower).all()
+
+
+def test_a_place_within_the_links_sum_and_difference_can_be_reached_and_no_other():
+    """|L1 - L2| <= s <= L1 + L2, joints free, with links of 400 and 250 mm."""
+    free = {
+        name: dataclasses.replace(getattr(SHIPPED, name), low_rad=-2 * math.pi, high_rad=2 * math.pi)
+        for name in ("base", "shoulder", "elbow")
+    }
+    geometry = dataclasses.replace(SHIPPED, links_mm=(400.0, 250.0), **free)
+    out = np.arange(70.0, 800.0, 1.0)
+    angles = geometry.angles_rad(np.array(geometry.axis_mm) + out[:, None] * [0.0, -1.0], 14.0)
+    span = np.hypot(out - 60.0, 14.0 + 30.0 - 120.0)
+    np.testing.assert_array_equal(np.isfinite(angles).all(axis=-1), (span >= 150.0) & (span <= 650.0))
+
+
+def test_what_cannot_be_reached_is_nan_in_its_row_only():
+    places = np.array([[524.0, 200.0], [524.0, 579.0], [-400.0, 0.0], [np.nan, 1.0]])
+    angles = SHIPPED.angles_rad(places, 14.0)
+    np.testing.assert_array_equal(np.isnan(angles).all(axis=-1), [False, True, True, True])
+    np.testing.assert_array_equal(SHIPPED.holds(places), [True, False, False, False])
+
+
+def test_the_shipped_arm_holds_nearly_the_whole_field_and_nothing_off_it():
+    assert 0.95 < SHIPPED.holds(GRID).mean() < 1.0
+    assert not SHIPPED.holds(np.array([[524.0, 521.0], [-1.0, 300.0], [1049.0, 300.0]])).any()
+    assert "109 to 755 mm from the arm's axis at (524, 580) mm" in SHIPPED.sentence()
+
+
+def test_the_sensor_turns_with_the_base():
+    """orientation = mounting + base - 90 degrees; mounted at 180 degrees it is 0 straight ahead."""
+    away = 300.0
+    for degrees in (-170.0, -90.0, -45.0, -10.0):
+        place = np.array([SHIPPED.axis_mm]) + away * np.array(
+            [[math.cos(math.radians(degrees)), math.sin(math.radians(degrees))]]
+        )
+        assert math.degrees(SHIPPED.orientation_rad(place)[0]) == pytest.approx(180.0 + degrees - 90.0)
+
+
+def test_a_base_may_reach_beyond_half_a_turn():
+    """The upper left corner is at +173 degrees, which this base reaches as -187."""
+    angles = SHIPPED.angles_rad(np.array([[30.0, 640.0]]), 60.0)
+    assert math.degrees(angles[0, 0]) == pytest.approx(math.degrees(math.atan2(60, -494)) - 360)
+
+
+@given(st.floats(-1.9, 1.4), st.sampled_from([-1, 0, 1]))
+def test_counts_and_angles_agree_to_half_a_count(angle_rad, side):
+    for joint in (SHIPPED.base, Joint(0, -12.0, 0.3, -2.0, 2.0, 0.01)):
+        counts = joint.counts_at(angle_rad, side)
+        assert abs(joint.angle_at(counts, side) - angle_rad) <= 0.5 / abs(joint.counts_per_rad) * (1 + 1e-9)
+
+
+def test_the_play_lies_behind_the_motor():
+    """Arriving upwards, the joint is half the play below where the gears say; the motor goes so much farther."""
+    joint = Joint(0, 10.0, 0.0, -1.0, 1.0, math.radians(2.0))
+    assert [joint.counts_at(0.0, side) for side in (-1, 0, 1)] == [-10, 0, 10]
+    assert math.degrees(joint.angle_at(0, 1)) == pytest.approx(-1.0)
+
+
+def test_rows_must_have_the_right_length():
+    with pytest.raises(ShapeError, match=r"allowed: \(n, 2\)"):
+        SHIPPED.holds(np.zeros(2))
+    with pytest.raises(ShapeError, match=r"allowed: \(n, 3\)"):
+        SHIPPED.position_mm(np.zeros((4, 2)))
+
+
+# What a person may get wrong in the file, the line to spoil it with, and what is said.
+SPOILED = [
+    ('format = "arm/1"', 'format = "arm/2"', "format is 'arm/2'; allowed: \"arm/1\""),
+    ("x_mm = 524", "", "base.x_mm is missing"),
+    ("x_mm = 524", 'x_mm = "524"', "base.x_mm is '524'; allowed: a number"),
+    ("x_mm = 524", "x_mm = nan", "base.x_mm is nan"),
+    ("x_mm = 524", "x_mm = 1e9", "of magnitude up to 1e+06"),
+    ("x_mm = 524", "x_mm = true", "base.x_mm is True"),
+    ("x_mm = 524", "x_mn = 524\nx_mm = 524", "base.x_mn is not known"),
+    ("upper_mm = 350", "upper_mm = 0", "links_mm is 0.0; allowed: greater than 0"),
+    ('elbow = "absolute"', 'elbow = "up"', "links.elbow is 'up'"),
+    ("port = 1\n", "port = 5\n", "sensor.port is 5; allowed: 1, 2, 3 or 4"),
+    ("port = 1\n", "port = true\n", "sensor.port is True"),
+    ("read_height_mm = 14", "read_height_mm = 70", "heights above 0, each above the one before"),
+    ("whole_percent = true", "whole_percent = 1", "sensor.whole_percent is 1; allowed: true or false"),
+    ('port = "A"', 'port = "D"', "joints.base.port is 'D'"),
+    ('port = "A"', 'port = "B"', "a port of its own for each joint"),
+    ("gear_ratio = 21", "gear_ratio = 0", "joints.base.gear_ratio is 0.0"),
+    ("home_deg = -90", "home_deg = 90", "joints.base.home_deg is"),
+    ("low_deg = -190", "low_deg = 190", "the low one below the high"),
+    ("play_deg = 0.3", "play_deg = -1", "joints.base.play_deg is"),
+    ("[links]", "[lines]", "links is missing"),
+    ("[links]", "links = 3\n[lines]", "links is missing"),
+    ("[field]", "[field", "not TOML"),
+]
+
+
+@pytest.mark.parametrize(("line", "instead", "says"), SPOILED, ids=[f"{k} {s[1]!r}" for k, s in enumerate(SPOILED)])
+def test_a_file_that_cannot_be_used_is_refused_with_the_entry_named(tmp_path, line, instead, says):
+    text = shipped_geometry().read_text()
+    assert line in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(line, instead, 1))
+    with pytest.raises(FileError, match=re.escape(says)) as caught:
+        read_geometry(path)
+    assert "mine.toml" in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_not_text_is_refused(tmp_path):
+    with pytest.raises(FileError, match="cannot be read"):
+        read_geometry(tmp_path / "none.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(FileError, match="UTF-8"):
+        read_geometry(tmp_path / "bytes.toml")
+
+
+def test_the_examples_hold_the_shipped_file():
+    example = shipped_geometry().parents[3] / "examples" / "lego_arm.toml"
+    if not example.exists():
+        pytest.skip("no examples beside an installed package")
+    assert example.read_text() == shipped_geometry().read_text()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"port": 3}, {"gear_ratio": math.nan}, {"low_rad": 2.0}, {"home_rad": 3.0}, {"play_rad": 9.0}],
+    ids=str,
+)
+def test_a_joint_without_sense_is_refused(wrong):
+    with pytest.raises(ParameterError):
+        Joint(**{"port": 0, "gear_ratio": 7.0, "home_rad": 0.0, "low_rad": -1.0, "high_rad": 1.0, **wrong})

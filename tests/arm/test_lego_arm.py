@@ -1,0 +1,322 @@
+"""The LEGO arm as an instrument: down on a place from above, up again, behind the guard, on a brick made of paper."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from probewise.arm import (
+    Geometry,
+    Instrument,
+    LegoArm,
+    Pose,
+    Rehearsal,
+    SimulatedArm,
+    SoftLimits,
+    read_geometry,
+    shipped_geometry,
+)
+from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
+from probewise.errors import LinkError, ReachError
+
+SHIPPED = read_geometry(shipped_geometry())
+PLACES = [(300.0, 200.0), (800.0, 450.0), (524.0, 60.0), (524.0, 320.0), (60.0, 300.0)]
+
+
+def relative(geometry: Geometry) -> Geometry:
+    return dataclasses.replace(
+        geometry,
+        elbow_is_relative=True,
+        elbow=dataclasses.replace(geometry.elbow, home_rad=math.radians(-110), low_rad=-2.8, high_rad=-0.1),
+    )
+
+
+def reversed_gears(geometry: Geometry) -> Geometry:
+    turned = {
+        name: dataclasses.replace(joint, gear_ratio=-joint.gear_ratio)
+        for name, joint in zip(("base", "shoulder", "elbow"), geometry.joints, strict=True)
+    }
+    return dataclasses.replace(geometry, **turned)
+
+
+class Bench:
+    """An arm on a paper brick; `height_mm` and `place_mm` follow from the motors, play left out of account."""
+
+    def __init__(self, paper_brick, clock, geometry):
+        rigid = {
+            name: dataclasses.replace(joint, play_rad=0.0)
+            for name, joint in zip(("base", "shoulder", "elbow"), geometry.joints, strict=True)
+        }
+        self.geometry, self.paper = dataclasses.replace(geometry, **rigid), paper_brick
+        self.brick = Brick(Link(paper_brick, clock=clock), clock=clock)
+        self.arm = LegoArm(BrickMachine(self.brick, self.geometry), self.geometry, clock=clock)
+
+    @property
+    def sensor_mm(self):
+        angles = [
+            joint.home_rad + math.radians(self.paper.motors[joint.port].position / joint.gear_ratio)
+            for joint in self.geometry.joints
+        ]
+        return self.geometry.position_mm(np.array([angles]))[0]
+
+    def pose(self, x_mm, y_mm):
+        return Pose(x_mm, y_mm, float(self.arm.orientation_rad(np.array([[x_mm, y_mm]]))[0]))
+
+
+@pytest.fixture(params=[lambda g: g, relative, reversed_gears], ids=["shipped", "relative elbow", "reversed gears"])
+def bench(request, paper_brick, clock):
+    return Bench(paper_brick, clock, request.param(SHIPPED))
+
+
+def test_a_reading_is_taken_at_its_place_and_height(bench):
+    seen = []
+    carry_out = bench.paper.carry_out
+
+    def watched(opcode, body):
+        if opcode == 0x07:
+            seen.append(bench.sensor_mm)
+        return carry_out(opcode, body)
+
+    bench.paper.carry_out = watched
+    with bench.arm as arm:
+        for place in PLACES:
+            reading = arm.measure(bench.pose(*place))
+            np.testing.assert_allclose(seen[-1], [*place, 14.0], atol=2.0)
+            assert reading.value == 56  # 500 counts of the converter: 56.9 %
+            assert reading.covariates == {"height_mm": 14.0, "battery_mv": 7412}
+            assert bench.sensor_mm[2] > 45  # and it is up again
+    assert bench.paper.at_rest
+    assert not bench.paper.is_open
+
+
+def test_the_links_come_down_on_every_place(bench):
+    """The last command to a link lowers the sensor, that to the base turns it upwards, whatever way its gears turn."""
+    with bench.arm as arm:
+        for place in PLACES:
+            before = len(bench.paper.drives())
+            arm.go_down(*place)
+            last = {port: power for port, power, _ in bench.paper.drives()[before:]}
+            for k, joint in enumerate(bench.geometry.joints):
+                if joint.port in last:
+                    direction = np.sign(last[joint.port] * joint.gear_ratio)
+                    a_bit_on = np.tile(arm.angles_rad, (2, 1))
+                    a_bit_on[1, k] += 0.01 * direction
+                    heights = bench.geometry.position_mm(a_bit_on)[:, 2]
+                    assert direction == 1 if k == 0 else heights[1] < heights[0]
+
+
+def test_every_place_that_the_arm_holds_can_be_taken(bench):
+    """The way there and back, with all that the motors need beyond it, is never refused."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform((0, 0), (1048, 520), (200, 2))
+    with bench.arm as arm:
+        for x_mm, y_mm in places[bench.geometry.holds(places)]:
+            arm.measure(bench.pose(float(x_mm), float(y_mm)))
+            assert bench.sensor_mm[2] > bench.geometry.lowest_mm
+
+
+def test_the_pose_told_is_that_of_the_motors(bench):
+    with bench.arm as arm:
+        for place in PLACES:
+            reading = arm.measure(bench.pose(*place))
+            base = bench.geometry.base
+            turned = base.home_rad + math.radians(bench.paper.motors[0].position / base.gear_ratio)
+            assert reading.pose.orientation_rad == pytest.approx(
+                math.remainder(bench.geometry.mounting_rad + turned - math.pi / 2, 2 * math.pi), abs=1e-9
+            )
+            assert math.dist((reading.pose.x_mm, reading.pose.y_mm), place) < 2.5
+            assert reading.pose.orientation_rad == pytest.approx(bench.pose(*place).orientation_rad, abs=2e-3)
+
+
+def test_readings_carry_the_time_from_the_start(paper_brick, clock):
+    arm = Bench(paper_brick, clock, SHIPPED)
+    later = LegoArm(arm.arm._machine, arm.geometry, clock=clock, start_s=500.0)
+    with later:
+        first = later.measure(arm.pose(*PLACES[0]))
+        second = later.measure(arm.pose(*PLACES[1]))
+    assert 500 < first.time_s < second.time_s < clock.now_s - 100 + 500
+
+
+def test_a_place_out_of_reach_moves_nothing(bench):
+    with bench.arm as arm:
+        for place in ((-1.0, 100.0), (524.0, 519.0), (2.0, 2.0), (math.nan, 1.0)):
+            with pytest.raises(ReachError, match="allowed: a place on the field"):
+                arm.measure(Pose(*place))
+        with pytest.raises(ReachError):
+            arm.go_over(0.0, 2000.0)
+    assert not bench.paper.drives()
+
+
+def test_another_orientation_than_the_arm_gives_is_refused(bench):
+    with bench.arm as arm, pytest.raises(ReachError, match="no wrist"):
+        arm.measure(Pose(300.0, 200.0, 1.0))
+    assert not bench.paper.drives()
+
+
+def test_a_sensor_turned_on_its_mount_stands_otherwise(bench):
+    with bench.arm as arm:
+        before = bench.pose(300.0, 200.0).orientation_rad
+        arm.turned_rad = math.pi / 2
+        assert bench.pose(300.0, 200.0).orientation_rad == pytest.approx(before + math.pi / 2)
+        reading = arm.measure(bench.pose(300.0, 200.0))
+        assert reading.pose.orientation_rad == pytest.approx(before + math.pi / 2, abs=2e-3)
+
+
+def test_an_arm_can_be_brought_home_by_hand_or_by_itself(bench):
+    with bench.arm as arm:
+        arm.release()
+        for motor, turned in zip(bench.paper.motors, (40, -25, 60), strict=True):
+            motor.position += turned
+        arm.set_home()
+        arm.measure(bench.pose(*PLACES[0]))
+        arm.home()
+    assert [motor.position - motor.zero for motor in bench.paper.motors] == pytest.approx([0, 0, 0], abs=1)
+
+
+def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
+    with bench.arm as arm:
+        start = arm.angles_rad
+        arm.turn(0, math.radians(20))
+        np.testing.assert_allclose(arm.angles_rad - start, [math.radians(20), 0, 0], atol=2e-3)
+        with pytest.raises(ReachError, match=r"base is '.* degrees'; allowed: -190 to 10 degrees"):
+            arm.turn(0, math.radians(200))
+        with pytest.raises(ReachError, match="the sensor's height while the shoulder moves"):
+            arm.turn(1, math.radians(-100))
+
+
+def test_the_battery_and_the_sensor_can_be_read_without_moving(bench):
+    with bench.arm as arm:
+        assert arm.read_here() == pytest.approx(100 * 582 / 1023)
+        assert arm.battery_mv() == 7412
+    assert not bench.paper.drives()
+
+
+def test_fractions_are_kept_where_the_geometry_says_so(paper_brick, clock):
+    fine = Bench(paper_brick, clock, dataclasses.replace(SHIPPED, whole_percent=False))
+    with fine.arm as arm:
+        assert arm.measure(fine.pose(*PLACES[0])).value == pytest.approx(100 * 582 / 1023)
+
+
+def test_a_reading_that_is_there_is_not_lost_when_the_line_dies_on_the_way_up(paper_brick, clock):
+    bench = Bench(paper_brick, clock, SHIPPED)
+
+    def run():
+        with bench.arm as arm:
+            battery = arm._machine.battery_mv
+
+            def then_cut():
+                level = battery()
+                paper_brick.is_cut = True
+                return level
+
+            arm._machine.battery_mv = then_cut
+            readings.append(arm.measure(bench.pose(*PLACES[0])))
+            arm.measure(bench.pose(*PLACES[1]))
+
+    readings = []
+    with pytest.raises(LinkError, match="cut"):
+        run()
+    assert [reading.value for reading in readings] == [56]
+
+
+def test_a_stuck_motor_ends_the_run_with_everything_released(paper_brick, clock):
+    bench = Bench(paper_brick, clock, SHIPPED)
+    paper_brick.motors[1].blocked_at = -100
+
+    def run():
+        with bench.arm as arm:
+            arm.measure(bench.pose(*PLACES[0]))
+
+    with pytest.raises(MotorError, match="motor B"):
+        run()
+    assert paper_brick.at_rest
+    assert not paper_brick.is_open
+
+
+def test_a_brick_that_cannot_be_asked_at_the_start_is_let_go(paper_brick, clock):
+    bench = Bench(paper_brick, clock, SHIPPED)
+    paper_brick.is_cut = True
+    with pytest.raises(LinkError):
+        bench.arm.__enter__()
+    assert not paper_brick.is_open
+
+
+@settings(max_examples=50, deadline=None)
+@given(data=st.data())
+def test_no_command_passes_the_guard(make_paper_brick, data):
+    """Whatever is asked for, no motor ends outside its limits, and the sensor is never lower than allowed."""
+    paper_brick = make_paper_brick()
+    bench = Bench(paper_brick, paper_brick.clock, data.draw(st.sampled_from([SHIPPED, relative(SHIPPED)])))
+    carry_out = bench.paper.carry_out
+    coast = data.draw(st.floats(0.0, 0.4))
+
+    def watched(opcode, body):
+        answer = carry_out(opcode, body)
+        assert bench.sensor_mm[2] > bench.geometry.lowest_mm - 1.0
+        for joint in bench.geometry.joints:
+            angle = joint.angle_at(bench.paper.motors[joint.port].position)
+            assert joint.low_rad - 0.03 < angle < joint.high_rad + 0.03
+        return answer
+
+    for motor in bench.paper.motors:
+        motor.coast = coast
+    bench.paper.carry_out = watched
+    asked = st.one_of(
+        st.tuples(st.just("place"), st.floats(-100, 1148), st.floats(-100, 620)),
+        st.tuples(st.just("turn"), st.integers(0, 2), st.floats(-3, 3)),
+    )
+    with bench.arm as arm:
+        for what, first, second in data.draw(st.lists(asked, max_size=6)):
+            try:
+                if what == "place":
+                    arm.go_down(first, second)
+                else:
+                    arm.turn(first, second)
+            except ReachError:
+                pass
+
+
+def test_the_guard_lets_a_joint_that_is_outside_come_back():
+    limits = SoftLimits(SHIPPED)
+    outside = SHIPPED.base.counts_at(SHIPPED.base.low_rad) - 50
+    limits.stands(0, outside)
+    limits.check(0, outside, outside + 30)
+    with pytest.raises(ReachError):
+        limits.check(0, outside, outside - 1)
+
+
+def test_a_rehearsal_says_the_moves_and_makes_none():
+    said = []
+    arm: Instrument = LegoArm(Rehearsal(SHIPPED, said.append), SHIPPED)
+    with arm:
+        reading = arm.measure(Pose(300.0, 200.0, float(arm.orientation_rad(np.array([[300.0, 200.0]]))[0])))
+    assert math.isnan(reading.value)
+    joints = [line.split()[0] for line in said]
+    assert joints[0] == "base"
+    assert {"shoulder", "elbow", "read"} <= set(joints)
+    assert said[-1] == "release all motors"
+    assert "motor from 0 to" in said[0]
+
+
+def test_the_seconds_that_a_reading_takes_grow_with_the_way(bench):
+    places = np.array([[300.0, 200.0], [320.0, 200.0], [900.0, 200.0], [-900.0, 0.0]])
+    seconds = bench.arm.travel_s(Pose(300.0, 200.0), places)
+    assert seconds.shape == (4,)
+    assert seconds[0] < seconds[1] < seconds[2]
+    assert np.isnan(seconds[3])
+
+
+def test_a_simulated_arm_takes_the_geometry_of_a_real_one():
+    """Same reach, same orientation: a run on either asks for the same places."""
+    arm = SimulatedArm(lambda pose, time_s, height_mm: 50.0, reach=SHIPPED)
+    places = np.array(PLACES)
+    np.testing.assert_array_equal(arm.reachable(places), SHIPPED.holds(places))
+    np.testing.assert_array_equal(arm.orientation_rad(places), SHIPPED.orientation_rad(places))
+    assert arm.measure(Pose(*PLACES[0])).value == 50
+    with pytest.raises(ReachError, match="109 to 755 mm"):
+        arm.measure(Pose(2.0, 2.0))
+    plain = SimulatedArm(lambda pose, time_s, height_mm: 50.0)
+    np.testing.assert_array_equal(plain.orientation_rad(places), 0.0)

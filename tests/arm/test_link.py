@@ -1,0 +1,263 @@
+"""The link to the brick, on a line where bytes come in pieces, late, twice, or not at all."""
+
+import numpy as np
+import pytest
+
+from probewise.arm.nxt import BrickError, Link, NoAnswerError, TelegramError, Timing
+from probewise.arm.nxt import telegram as t
+from probewise.errors import LinkError, ParameterError
+
+ASLEEP, AWAKE = "02 00 00 0D", "07 00 02 0D 00 C0 27 09 00"
+BATTERY, VOLTS = "02 00 00 0B", "05 00 02 0B 00 F4 1C"
+LIGHT = "03 00 00 07 01"
+BRIGHT = "10 00 02 07 00 01 01 00 05 80 00 02 35 02 37 00 35 02"
+DARK = "10 00 02 07 00 01 01 00 05 80 00 03 10 00 01 00 10 00"
+MOVE, MOVED = "0C 00 00 04 00 32 07 01 00 20 5A 00 00 00", "03 00 02 04 00"
+STATE = "03 00 00 06 00"
+RUNNING = "19 00 02 06 00 00 32 07 01 00 20 5A 00 00 00" + 12 * " 00"
+FENCE = (BATTERY, (0.06, VOLTS))
+
+read = t.GetInputValues(1)
+move = t.SetOutputState(0, 50, 7, 1, 0, 0x20, 90)
+
+
+@pytest.fixture
+def link(script, clock):
+    """A link that has made sure of its line and told the brick to stay awake."""
+    script.expect(*FENCE)
+    script.expect(ASLEEP, (0.06, AWAKE))
+    link = Link(script, clock=clock)
+    link.keep_awake()
+    yield link
+    script.finish()
+
+
+def test_a_question_gets_its_answer(link, script):
+    script.expect(LIGHT, (0.06, BRIGHT))
+    assert link.ask(read).normalized == 565
+
+
+def test_what_another_program_left_on_the_line_is_no_answer(script, clock):
+    """The brick still answers a question that an earlier run asked, and died."""
+    script.coming = [(clock.now_s + after_s, bytes.fromhex(DARK)) for after_s in (-1.0, 0.1, 0.25)]
+    script.expect(BATTERY, (0.3, VOLTS))
+    script.expect(ASLEEP, (0.06, AWAKE))
+    script.expect(LIGHT, (0.06, BRIGHT))
+    assert Link(script, clock=clock).ask(read).normalized == 565
+    script.finish()
+
+
+def test_an_answer_may_come_in_pieces(link, script):
+    frame = bytes.fromhex(BRIGHT)
+    script.expect(LIGHT, *((0.05 + 0.02 * k, frame[k : k + 1].hex()) for k in range(len(frame))))
+    assert link.ask(read).normalized == 565
+
+
+def test_two_answers_may_come_in_one_piece(link, script):
+    script.expect(LIGHT, (0.06, BRIGHT + VOLTS))
+    script.expect(BATTERY)
+    assert link.ask(read).normalized == 565
+    assert link.ask(t.GetBatteryLevel()).millivolt == 7412
+
+
+def test_what_was_not_asked_for_is_put_aside(link, script):
+    """A program on the brick sends messages, type 80; a type nobody knows is put aside too."""
+    script.expect(LIGHT, (0.03, "07 00 80 09 00 03 68 69 00"), (0.04, "02 00 7F 7F"), (0.06, BRIGHT))
+    assert link.ask(read).normalized == 565
+    assert list(link.unasked) == [bytes.fromhex("80 09 00 03 68 69 00"), b"\x7f\x7f"]
+
+
+def test_only_the_latest_of_many_unasked_telegrams_are_kept(link, script):
+    for number in range(40):
+        script.expect(LIGHT, (0.03, f"02 00 7F {number:02X}"), (0.06, BRIGHT))
+        link.ask(read)
+    assert [telegram[1] for telegram in link.unasked] == list(range(8, 40))
+
+
+def test_a_question_without_an_answer_is_asked_again(link, script, clock):
+    script.expect(LIGHT)
+    script.expect(*FENCE)
+    script.expect(LIGHT, (0.06, BRIGHT))
+    before = clock.now_s
+    assert link.ask(read).normalized == 565
+    assert clock.now_s - before == pytest.approx(2.0 + 0.2 + 0.15, abs=0.05)
+
+
+@pytest.mark.parametrize("late_s", [2.05, 2.19, 2.3, 2.9, 3.9])
+def test_a_late_answer_is_never_taken_for_the_next(link, script, late_s):
+    """The old answer says dark, the new one bright. It comes while the line is drained, or before the fence's."""
+    script.expect(LIGHT, (late_s, DARK))
+    script.expect(BATTERY, (max(late_s - 2.2, 0.06) + 0.01, VOLTS))
+    script.expect(LIGHT, (0.06, BRIGHT))
+    assert link.ask(read).normalized == 565
+
+
+def test_a_fence_that_is_late_itself_is_followed_by_another(link, script):
+    """Battery's answer comes 3 s late, when the version has been asked for."""
+    script.expect(LIGHT)
+    script.expect(BATTERY, (3.0, VOLTS))
+    script.expect("02 00 01 88", (1.0, "07 00 02 88 00 7C 01 1F 01"))
+    script.expect(LIGHT, (0.06, BRIGHT))
+    assert link.ask(read).normalized == 565
+
+
+def test_a_move_is_sent_once_and_no_more(link, script):
+    """Limits add up: sent twice, it would go twice as far."""
+    script.expect(MOVE)
+    with pytest.raises(NoAnswerError, match=r"SETOUTPUTSTATE within 2 s on /dev/rfcomm0; is the brick on"):
+        link.ask(move)
+    script.expect(*FENCE)
+    script.expect(STATE, (0.06, RUNNING))
+    assert link.ask(t.GetOutputState(0)).limit_counts == 90
+
+
+def test_a_move_that_was_answered_late_leaves_nothing_behind(link, script):
+    script.expect(MOVE, (2.1, MOVED))
+    with pytest.raises(NoAnswerError):
+        link.ask(move)
+    script.expect(*FENCE)
+    script.expect(MOVE, (0.06, MOVED))
+    assert link.ask(move) == t.Done()
+
+
+def test_a_question_is_given_up_after_three_times(link, script, clock):
+    before = clock.now_s
+    for _ in range(2):
+        script.expect(LIGHT)
+        script.expect(*FENCE)
+    script.expect(LIGHT)
+    with pytest.raises(NoAnswerError, match="GETINPUTVALUES"):
+        link.ask(read)
+    assert clock.now_s - before < Timing().longest_s
+
+
+def test_a_silent_brick_is_told_of_within_the_deadline(link, script, clock):
+    script.expect(LIGHT)
+    for fence in (BATTERY, "02 00 01 88", ASLEEP):
+        script.expect(fence)
+    before = clock.now_s
+    with pytest.raises(LinkError, match=r"on /dev/rfcomm0 does not answer any more"):
+        link.ask(read)
+    assert clock.now_s - before < Timing().longest_s
+    # Nor does it later: what all those questions were answered cannot be told apart any more.
+    with pytest.raises(LinkError, match="does not answer any more"):
+        link.ask(read)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        BRIGHT[3:],  # the first byte is lost
+        BRIGHT[:30] + BRIGHT[33:],  # one in the middle
+        "FF FF" + BRIGHT,
+        "00 00" + BRIGHT,
+        "04 00 02 07 00 00",
+        "05 00 02 0B 00 F4 1C",  # an answer to a question that was not asked
+    ],
+)
+def test_torn_frames_are_drained_and_the_question_asked_again(link, script, broken):
+    script.expect(LIGHT, (0.06, broken))
+    script.expect(*FENCE)
+    script.expect(LIGHT, (0.06, BRIGHT))
+    assert link.ask(read).normalized == 565
+
+
+def test_a_move_with_a_torn_answer_is_not_repeated(link, script):
+    script.expect(MOVE, (0.06, "04 00 02 04 00 00"))
+    with pytest.raises(TelegramError, match="Done cannot be read"):
+        link.ask(move)
+    script.expect(*FENCE)
+    script.expect(STATE, (0.06, RUNNING))
+    link.ask(t.GetOutputState(0))
+
+
+def test_a_refusal_is_not_asked_again(link, script):
+    script.expect(LIGHT, (0.06, "03 00 02 07 C0"))
+    with pytest.raises(BrickError, match="C0"):
+        link.ask(read)
+
+
+def test_an_interrupted_question_does_not_leave_its_answer_to_the_next(link, script):
+    """Ctrl-C between question and answer; then the motors are stopped, and must not take it for theirs."""
+
+    def interrupted(size, timeout_s):
+        del script.read
+        raise KeyboardInterrupt
+
+    script.expect(LIGHT, (0.06, DARK))
+    script.read = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        link.ask(read)
+    script.expect(*FENCE)
+    script.expect(LIGHT, (0.06, BRIGHT))
+    assert link.ask(read).normalized == 565
+
+
+def test_the_radio_is_given_time_to_turn_round(link, script):
+    """60 ms a question, at least, and 30 ms after its answer; without an answer 15 ms."""
+    for _ in range(3):
+        script.expect(LIGHT, (0.001, BRIGHT))
+        link.ask(read)
+    script.expect(LIGHT, (0.05, BRIGHT))
+    link.ask(read)
+    stop = "0C 00 80 04 FF" + 9 * " 00"
+    script.expect(stop)
+    link.tell(t.SetOutputState(255, 0, 0, 0, 0, 0, 0))
+    script.expect(stop)
+    link.tell(t.SetOutputState(255, 0, 0, 0, 0, 0, 0))
+    np.testing.assert_allclose(np.diff(script.sent_at[2:]), [0.06, 0.06, 0.06, 0.08, 0.015], atol=1e-9)
+    assert (link.n_asked, link.n_told) == (6, 2)
+
+
+def test_a_long_run_keeps_the_brick_awake(link, script, clock):
+    """Every minute, though only questions are asked, which do not restart the brick's sleep timer."""
+    for _ in range(4):
+        clock.sleep(20.0)
+        if clock.now_s > 160:
+            script.expect(ASLEEP, (0.06, AWAKE))
+            script.expect(LIGHT, (0.06, BRIGHT))
+            link.ask(read)
+            break
+        script.expect(LIGHT, (0.06, BRIGHT))
+        link.ask(read)
+    else:
+        pytest.fail("the brick was left to fall asleep")
+
+
+def test_a_brick_that_sleeps_soon_is_told_more_often(script, clock):
+    """A limit of 30 s, which no menu has: every 10 s."""
+    link = Link(script, clock=clock)
+    script.expect(*FENCE)
+    for _ in range(2):
+        script.expect(ASLEEP, (0.06, "07 00 02 0D 00 30 75 00 00"))
+        link.keep_awake()
+        clock.sleep(9.0)
+        link.keep_awake()
+        clock.sleep(1.1)
+    script.finish()
+
+
+def test_a_brick_that_never_sleeps_is_asked_no_more_often(script, clock):
+    link = Link(script, clock=clock)
+    script.expect(*FENCE)
+    script.expect(ASLEEP, (0.06, "07 00 02 0D 00 00 00 00 00"))
+    link.keep_awake()
+    clock.sleep(59.0)
+    link.keep_awake()
+    script.finish()
+
+
+def test_a_cut_line_is_an_error_at_once(link, script, clock):
+    script.cut_after = len(script.sent_at)
+    before = clock.now_s
+    with pytest.raises(LinkError, match="cut"):
+        link.ask(read)
+    assert clock.now_s - before < 0.1
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"answer_s": 0.0}, {"silence_s": -1.0}, {"turn_s": -0.1}, {"n_repeats": -1}], ids=str
+)
+def test_a_timing_without_sense_is_refused(wrong):
+    with pytest.raises(ParameterError):
+        Timing(**wrong)

@@ -1,0 +1,196 @@
+"""A motor turned to a count, by a firmware that counts limits from its own target and lets go there."""
+
+import numpy as np
+import pytest
+
+from probewise.arm.nxt import Drive, Link, Motor, MotorError, NoAnswerError
+from probewise.errors import LinkError, ParameterError, ReachError
+
+
+@pytest.fixture
+def motor(paper_brick, clock):
+    return Motor(Link(paper_brick, clock=clock), 0, clock=clock)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_motor_comes_to_its_goal_from_the_same_side(motor, paper_brick, side):
+    rng = np.random.default_rng(1)
+    for goal in rng.integers(-2000, 2000, 30).tolist():
+        here = motor.move_to(goal, side)
+        assert abs(here - goal) <= 1
+        assert paper_brick.motors[0].position == here
+        assert np.sign(paper_brick.drives()[-1][1]) == side
+        assert paper_brick.at_rest
+
+
+def test_a_motor_that_is_there_already_is_left_alone(motor, paper_brick):
+    motor.move_to(100, 1)
+    before = len(paper_brick.drives())
+    motor.move_to(101, 1)
+    assert len(paper_brick.drives()) == before
+    motor.move_to(101, -1)
+    assert len(paper_brick.drives()) > before
+
+
+def test_every_move_has_a_limit_but_the_one_that_finds_the_target(motor, paper_brick):
+    paper_brick.motors[0].target = 5000  # as a program that ran before may have left it
+    for goal in (300, -300, 0):
+        motor.move_to(goal, 1)
+    endless = [drive for drive in paper_brick.drives() if not drive[2]]
+    assert endless == [(0, 15, 0)]
+    assert all(limit < 1000 for _, _, limit in paper_brick.drives())
+
+
+def test_the_coast_is_learned_whatever_it_is(motor, paper_brick):
+    """A motor that runs on twice as far as first thought: once learned, two moves do."""
+    paper_brick.motors[0].coast = 1.0
+    for goal in (500, 1500, 700, 1800):
+        motor.move_to(goal, 1)
+    before = len(paper_brick.drives())
+    motor.move_to(3500, 1)
+    assert len(paper_brick.drives()) - before == 2
+
+
+def test_a_rough_move_takes_one_command(motor, paper_brick):
+    motor.move_to(0, 1)
+    motor.move_near(1000)
+    motor.move_near(0)
+    before = len(paper_brick.drives())
+    here = motor.move_near(1000)
+    assert len(paper_brick.drives()) - before == 1
+    assert abs(here - 1000) < 30
+
+
+@pytest.mark.parametrize("lost", ["command", "answer"])
+def test_a_move_whose_answer_does_not_come_is_never_made_twice(motor, paper_brick, lost):
+    """Whether the command or its answer was lost, the motor comes to its goal, and never beyond it."""
+    motor.move_to(0, 1)
+    for goal in (600, 1300, 100, 900):
+        paper_brick.lose[len(paper_brick.commands) + 1] = lost
+        highest = max(goal, paper_brick.motors[0].position)
+        assert abs(motor.move_to(goal, 1) - goal) <= 1
+        assert paper_brick.motors[0].position <= highest + 1
+
+
+@pytest.mark.parametrize("which", [0, 1, 2, 3])
+def test_a_telegram_that_gets_lost_while_the_target_is_sought_does_no_harm(clock, paper_brick, which):
+    paper_brick.motors[0].target = -700
+    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock)
+    motor.counts()
+    paper_brick.lose = {len(paper_brick.commands) + 1 + which: "command"}
+    assert abs(motor.move_to(200, 1) - 200) <= 1
+    assert not paper_brick.lose
+
+
+def test_a_reset_makes_the_place_zero_and_the_target_is_still_known(motor, paper_brick):
+    motor.move_to(500, 1)
+    motor.reset()
+    assert abs(motor.counts()) == 0
+    before = len([drive for drive in paper_brick.drives() if not drive[2]])
+    assert abs(motor.move_to(100, 1) - 100) <= 1
+    assert paper_brick.motors[0].position == pytest.approx(600, abs=2)
+    assert len([drive for drive in paper_brick.drives() if not drive[2]]) == before
+
+
+def test_counters_that_somebody_else_set_back_are_noticed(motor, paper_brick):
+    motor.move_to(500, 1)
+    paper_brick.motors[0].zero = 400
+    assert abs(motor.move_to(300, 1) - 300) <= 1
+    assert len([drive for drive in paper_brick.drives() if not drive[2]]) == 2
+
+
+def test_a_motor_in_whose_way_something_is_is_held_and_told_of(motor, paper_brick):
+    motor.move_to(0, 1)
+    paper_brick.motors[0].blocked_at = 120
+    with pytest.raises(MotorError, match=r"motor A is stuck at 120 counts at power 60; is it plugged in"):
+        motor.move_to(900, 1)
+    assert paper_brick.at_rest
+    paper_brick.motors[0].blocked_at = None
+    assert abs(motor.move_to(900, 1) - 900) <= 1
+
+
+def test_a_motor_that_does_not_turn_at_all_is_told_of(motor, paper_brick):
+    paper_brick.motors[0].blocked_at = 0
+    with pytest.raises(MotorError, match="motor A does not turn as it is told"):
+        motor.move_to(100, 1)
+    assert paper_brick.at_rest
+
+
+def test_a_motor_that_runs_away_is_held(motor, paper_brick):
+    """Its target has been moved behind our back, by another program's telegram say."""
+    motor.move_to(0, 1)
+    paper_brick.motors[0].target += 3000
+    with pytest.raises(MotorError, match="runs on beyond"):
+        motor.move_to(900, 1)
+    assert paper_brick.at_rest
+    assert paper_brick.motors[0].position < 1300
+
+
+def test_a_motor_that_slips_is_given_up_after_some_moves(clock, paper_brick):
+    paper_brick.motors[0].coast = 7.0
+    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock, drive=Drive(n_moves=2))
+    with pytest.raises(MotorError, match="after 2 moves; is something in its way"):
+        motor.move_to(500, 1)
+
+
+def test_the_guard_is_asked_before_every_command_that_turns(clock, paper_brick):
+    asked = []
+
+    def guard(here, to):
+        asked.append((here, to))
+        if not -400 <= to <= 400:
+            raise ReachError("motor", to, "-400 to 400")
+
+    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock, guard=guard)
+    motor.move_to(300, 1)
+    for goal in (1000, -1000, 420):
+        turned = len(paper_brick.drives())
+        with pytest.raises(ReachError):
+            motor.move_to(goal, 1)
+        assert len(paper_brick.drives()) == turned or abs(paper_brick.motors[0].position) <= 401
+    assert asked
+    assert abs(paper_brick.motors[0].position) <= 401
+
+
+def test_the_target_is_sought_on_the_side_where_there_is_room(clock, paper_brick):
+    def guard(here, to):
+        if to < -20:
+            raise ReachError("motor", to, "-20 or more")
+
+    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock, guard=guard)
+    assert abs(motor.move_to(150, -1) - 150) <= 1
+
+
+def test_hold_and_release_are_what_the_firmware_calls_so(motor, paper_brick):
+    motor.hold()
+    motor.release()
+    held, released = (body for body in paper_brick.commands if body[1] == 0x04)
+    assert held == bytes.fromhex("00 04 00 00 07 01 00 20 00 00 00 00")
+    assert released == bytes.fromhex("00 04 00 00 00 00 00 00 00 00 00 00")
+
+
+def test_a_dead_line_is_an_error_within_its_deadline(motor, paper_brick, clock):
+    motor.move_to(0, 1)
+    paper_brick.lose = dict.fromkeys(range(len(paper_brick.commands), 10**4), "command")
+    before = clock.now_s
+    with pytest.raises(LinkError) as caught:
+        motor.move_to(500, 1)
+    assert not isinstance(caught.value, NoAnswerError)
+    assert clock.now_s - before < 15
+
+
+WRONG = [
+    {"slow_power": 0},
+    {"fast_power": 101},
+    {"slow_power": 70},
+    {"settle_s": -1.0},
+    {"n_moves": 0},
+    {"stuck_s": 0.0},
+    {"lead_counts": -1},
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
+def test_a_drive_without_sense_is_refused(wrong):
+    with pytest.raises(ParameterError):
+        Drive(**wrong)

@@ -1,0 +1,164 @@
+"""Runs of the command line on a brick made of paper: what is kept when the line dies, and how they go on."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+
+from probewise.arm import LegoArm
+from probewise.arm.nxt import Brick, BrickMachine, Link
+from probewise.calibration import FittedSensor, write_sensor
+from probewise.cli import main
+from probewise.errors import LinkError
+from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan
+from probewise.sensor import field_of, footprint_of
+
+DARK_COUNTS = 826  # 10 %
+
+
+@pytest.fixture
+def bricks(monkeypatch, make_paper_brick):
+    """Open a new paper brick each time; the n-th dies as it is to be read the m-th time, bricks[n] = m."""
+    deaths, opened = {}, []
+
+    def open_nxt(port, geometry, *, start_s=0.0):
+        paper = make_paper_brick()
+        paper.raw_counts = DARK_COUNTS
+        carry_out, asked = paper.carry_out, []
+        death = deaths.get(len(opened))
+        opened.append(paper)
+
+        def mortal(opcode, body):
+            if opcode == 0x0B:
+                asked.append(opcode)
+                if len(asked) - 1 == death:  # the first is how a link makes sure of its line
+                    paper.is_cut = True
+                    raise LinkError("the line is cut")
+            return carry_out(opcode, body)
+
+        paper.carry_out = mortal
+        clock = paper.clock
+        machine = BrickMachine(Brick(Link(paper, clock=clock), clock=clock), geometry)
+        return LegoArm(machine, geometry, clock=clock, start_s=start_s)
+
+    monkeypatch.setattr("probewise.cli.arm.open_nxt", open_nxt)
+    monkeypatch.setattr("probewise.cli.explore.open_nxt", open_nxt)
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
+    deaths["opened"] = opened
+    return deaths
+
+
+@pytest.fixture
+def plan_file(tmp_path):
+    plan = paper_plan()
+    write_plan(plan.take(np.r_[0:404:50, 404:408]), tmp_path / "plan.csv")
+    return tmp_path / "plan.csv"
+
+
+@pytest.fixture
+def sensor_file(tmp_path):
+    truth = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
+    axis = np.arange(-20.0, 20.5)
+    sensor = FittedSensor(
+        names=("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max"),
+        samples=truth + 1e-4 * np.random.default_rng(0).standard_normal((500, 8)),
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.6),
+        field=field_of(footprint_of(truth[None, :6], 1), u_mm=axis, v_mm=axis),
+        instrumentation=Instrumentation(),
+    )
+    write_sensor(sensor, tmp_path / "sensor.json")
+    return tmp_path / "sensor.json"
+
+
+def run(capsys, *arguments):
+    status = main([str(a) for a in arguments])
+    return status, capsys.readouterr().err
+
+
+def test_a_plan_is_recorded(bricks, plan_file, tmp_path, capsys):
+    out = tmp_path / "rec.csv"
+    status, asked = run(capsys, "arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet")
+    assert status == 0
+    assert asked.count("then press Enter") == 9
+    recording = read_recording(out)
+    assert len(recording) == 13
+    np.testing.assert_array_equal(recording.readings, 10)
+    assert (np.diff(recording.plan.time_s) > 1).all()
+    assert set(recording.plan.covariates) == {"battery_mv", "height_mm"}
+    assert recording.plan.instrumentation.step == 1
+    assert all(paper.at_rest and not paper.is_open for paper in bricks["opened"])
+
+
+def test_a_recording_that_a_dead_line_ended_goes_on(bricks, plan_file, tmp_path, capsys):
+    bricks.update({0: 1, 1: 5, 2: 3})
+    out = tmp_path / "rec.csv"
+    arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
+    status, said = run(capsys, *arguments)
+    assert status == 1
+    assert said.endswith("cut; nothing was read\n")
+    status, said = run(capsys, *arguments)
+    assert status == 1
+    assert "rec.csv keeps 4 of 13 readings; go on with --resume" in said
+    status, said = run(capsys, *arguments, "--resume")
+    assert "rec.csv keeps 6 of 13 readings" in said
+    status, said = run(capsys, *arguments, "--resume")
+    assert status == 0
+    recording = read_recording(out)
+    assert len(recording) == 13
+    assert (np.diff(recording.plan.time_s) > 1).all()
+
+
+def test_a_recording_goes_on_only_with_its_own_plan(bricks, plan_file, tmp_path, capsys):
+    bricks[0] = 4
+    out = tmp_path / "rec.csv"
+    run(capsys, "arm", "record", plan_file, "--out", out, "--arm", "nxt:x")
+    status, said = run(capsys, "arm", "record", "paper", "--out", out, "--arm", "nxt:x", "--resume")
+    assert status == 2
+    assert "readings of another plan" in said
+    assert len(read_recording(out)) == 3
+
+
+def test_nobody_to_press_enter_is_told_of(bricks, plan_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    status, said = run(capsys, "arm", "record", plan_file, "--out", tmp_path / "rec.csv", "--arm", "nxt:x")
+    assert status == 2
+    assert "a person who presses Enter" in said
+    assert bricks["opened"][0].at_rest
+
+
+@pytest.mark.parametrize("model", ["naive", pytest.param("ssf", marks=pytest.mark.slow)])
+def test_exploring_with_a_brick_goes_on_after_its_line_died(model, bricks, sensor_file, tmp_path, capsys):
+    """Each line of the journal is a reading, once, with the orientation that the base gave it."""
+    bricks.update({0: 1, 1: 3})
+    out = tmp_path / "found"
+    arguments = ["explore", "--sensor", sensor_file, "--out", out, "--arm", "nxt:x", "--max-readings", 3]
+    arguments += ["--model", model, "--quiet"]
+    status, said = run(capsys, *arguments)
+    assert status == 1
+    assert said.count("\n") == 1
+    status, said = run(capsys, *arguments, "--resume")
+    assert status == 1
+    assert "journal.jsonl keeps 2 readings; go on with --resume" in said
+    status, said = run(capsys, *arguments, "--resume")
+    assert (status, said) == (0, "")
+    lines = [json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()[1:]]
+    assert [line["index"] for line in lines] == [1, 2, 3]
+    assert [line["reading"] for line in lines] == [10] * 3
+    assert (np.diff([line["time_s"] for line in lines]) > 1).all()
+    for line in lines:
+        base = np.arctan2(line["pose"]["y_mm"] - 580, line["pose"]["x_mm"] - 524)
+        assert np.cos(line["pose"]["orientation_rad"] - (base + np.pi / 2)) == pytest.approx(1, abs=1e-5)
+    assert (out / "report.html").exists()
+
+
+def test_what_lies_under_a_real_arm_is_not_given(bricks, sensor_file, tmp_path, capsys):
+    arguments = ["explore", "--sensor", sensor_file, "--out", tmp_path / "x", "--arm", "nxt:x"]
+    status, said = run(capsys, *arguments, "--truth", "500,250,60")
+    assert status == 2
+    assert "--truth is '500,250,60'" in said
+    status, said = run(capsys, *arguments, "--field", "800,400")
+    assert status == 2
+    assert "1048,520, the geometry's" in said
+    assert not bricks["opened"]

@@ -1,0 +1,103 @@
+"""The verb `arm` and `explore --arm`: tasks at the bench, on no bench."""
+
+import pytest
+
+from probewise.arm import shipped_geometry
+from probewise.cli import main
+
+TASKS = [["jog", "300,200"], ["home"], ["read"], ["scan", "300,200", "310,200"], ["record", "paper"]]
+
+
+def said(capsys, *arguments, status=0):
+    assert main([str(a) for a in arguments]) == status
+    return capsys.readouterr()
+
+
+def test_check_says_and_draws_how_far_the_arm_reaches(tmp_path, capsys):
+    out = said(capsys, "arm", "check", "--out", tmp_path / "reach.png").out
+    assert "109 to 755 mm from the arm's axis" in out
+    assert "% of it within reach" in out
+    assert (tmp_path / "reach.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_check_names_what_is_wrong_with_a_file(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text(shipped_geometry().read_text().replace("gear_ratio = 21", "gear_ratio = 0"))
+    error = said(capsys, "arm", "check", "--geometry", path, status=2).err
+    assert error.count("\n") == 1
+    assert "mine.toml: joints.base.gear_ratio is 0.0" in error
+
+
+def test_an_arm_that_reaches_no_place_of_its_field_is_no_arm(tmp_path, capsys):
+    path = tmp_path / "far.toml"
+    path.write_text(shipped_geometry().read_text().replace("y_mm = 580", "y_mm = 5800"))
+    assert "nowhere on the field" in said(capsys, "arm", "check", "--geometry", path, status=2).err
+
+
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task[0])
+def test_a_dry_run_prints_the_moves_and_writes_nothing(task, tmp_path, capsys):
+    out = ["--out", tmp_path / "r.csv"] if task[0] == "record" else []
+    text = said(capsys, "arm", *task, "--dry-run", *out).out
+    assert "release all motors" in text
+    if task[0] not in ("read", "home"):
+        assert "base     to" in text
+    if task[0] == "record":
+        assert text.count("ask: ") == 9
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_joint_can_be_jogged(capsys):
+    assert "base     to" in said(capsys, "arm", "jog", "base", "-5", "--dry-run").out
+    assert "allowed: -190 to 10 degrees" in said(capsys, "arm", "jog", "base", "-500", "--dry-run", status=2).err
+
+
+def test_jog_down_asks_a_person_to_look(capsys):
+    assert "ask: look" in said(capsys, "arm", "jog", "300,200", "--down", "--dry-run").out
+
+
+def test_home_here_sets_the_counters_where_a_person_brought_the_arm(capsys):
+    out = said(capsys, "arm", "home", "--here", "--dry-run").out
+    assert "base -90, shoulder 90, elbow -20 degrees" in out
+    assert "set all counters to 0" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["jog", "wrist", "5"], "allowed: X,Y in mm; or base, shoulder, elbow, and degrees"),
+        (["jog", "base", "far"], "a number of degrees"),
+        (["jog", "300;200"], "X,Y in mm"),
+        (["jog", "5,5"], "a place on the field"),
+        (["scan", "300,200", "5,5"], "a place on the field"),
+        (["record", "nowhere.csv", "--out", "r.csv"], "nowhere.csv"),
+        (["record", "paper", "--out", "r.csv", "--origin-mm", "5,5"], "move the plan's origin"),
+        (["record", "paper", "--out", "r.csv", "--origin-mm", "middle"], "--origin-mm is 'middle'"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_what_cannot_be_done_is_refused_in_one_line(arguments, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    error = said(capsys, "arm", *arguments, "--dry-run", status=2).err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_an_arm_there_is_nothing_to_move(capsys):
+    assert "--arm is None; allowed: nxt:PORT" in said(capsys, "arm", "read", status=2).err
+    assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "simulated", status=2).err
+    assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "ev3:/dev/x", status=2).err
+
+
+def test_a_brick_that_is_not_there_is_told_of_with_status_1(tmp_path, capsys):
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    error = said(capsys, "arm", "read", "--arm", f"nxt:{tmp_path}/rfcomm0", status=1).err
+    assert "cannot be opened" in error
+    assert error.count("\n") == 1
+
+
+def test_a_recording_is_not_overwritten(tmp_path, capsys):
+    (tmp_path / "r.csv").write_text("mine")
+    error = said(capsys, "arm", "record", "paper", "--out", tmp_path / "r.csv", "--arm", "nxt:/none", status=2).err
+    assert "--resume to go on with it" in error
+    assert (tmp_path / "r.csv").read_text() == "mine"

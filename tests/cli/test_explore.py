@@ -1,0 +1,54 @@
+"""What `probewise explore` says of the choices it offers."""
+
+import json
+
+import pytest
+
+from probewise.cli import main
+from probewise.report import exploration
+
+
+@pytest.fixture
+def explore(sensor_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(exploration, "frame", lambda *_, **__: b"png")
+
+    def call(*options):
+        out = tmp_path / "found"
+        where = ("--sensor", sensor_file, "--truth", "500,250,90", "--out", out, "--seed", 3)
+        status = main([str(word) for word in ("explore", *where, *options)])
+        return status, [json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()]
+
+    return call
+
+
+def test_the_sensor_may_be_learnt_along(explore, capsys):
+    status, lines = explore("--learn-sensor", "--max-readings", 1)
+    assert status == 0
+    assert {"log_size_u", "log_size_v", "shift_u_mm", "shift_v_mm", "I_min", "I_max"} <= set(lines[1]["belief"]["mean"])
+    said = capsys.readouterr().out
+    assert "I_min" in said
+    assert "(sensor)" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "utility"),
+    [
+        ((), "Finishing(of=InformationGain(), least=0.25)"),
+        (("--utility", "entropy"), "ReadingEntropy(bin_width=1.0)"),
+        (("--utility", "about:radius_mm"), "InformationAbout(label=ParameterValue(name='radius_mm', n_bins=16))"),
+    ],
+)
+def test_the_journal_names_the_utility(explore, options, utility):
+    status, lines = explore("--max-readings", 1, *options)
+    assert status == 0
+    assert lines[0]["utility"] == utility
+    assert lines[0]["options"]["step"] == 1.0
+    assert lines[0]["options"]["reading_range"] == [1.0, 100.0]
+
+
+def test_readings_may_be_chosen_several_at_a_time(explore):
+    status, lines = explore("--batch", 2, "--max-readings", 2)
+    assert status == 0
+    assert lines[0]["options"]["batch"] == 2
+    first, second = (line["pose"] for line in lines[1:])
+    assert lines[1]["belief"]["next"] == second != first

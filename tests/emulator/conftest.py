@@ -1,0 +1,88 @@
+"""A brick on a clock that tests move, and one in a process of its own."""
+
+from __future__ import annotations
+
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+
+import pytest
+
+from probewise.emulator import Brick, Light, NothingAnalog, VirtualClock, sonar
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def brick(clock: VirtualClock) -> Brick:
+    """A light sensor at port 2 over something that reads 57.5 %, an ultrasonic sensor at port 4."""
+    sensors = [NothingAnalog(), Light(lambda lit: 57.5 if lit else 28.75, clock), NothingAnalog(), sonar(42)]
+    return Brick(clock, sensors=sensors, name="ARM1", files={"arm.rxe": b""})
+
+
+@pytest.fixture
+def ask(brick: Brick) -> Callable[[str], str]:
+    """Send a telegram as hexadecimal text, return the reply as such; nothing where there is none."""
+
+    def ask(telegram: str) -> str:
+        reply = brick.answer(bytes.fromhex(telegram))
+        return "" if reply is None else reply.hex(" ").upper()
+
+    return ask
+
+
+LIMIT_S = 60.0
+
+
+@dataclass
+class Running:
+    """An emulator that runs, and its device."""
+
+    process: subprocess.Popen[bytes]
+    device: str
+
+    def line(self) -> str:
+        """Read what it says next."""
+        assert self.process.stdout is not None
+        ready, _, _ = select.select([self.process.stdout], [], [], LIMIT_S)
+        assert ready, "the emulator says nothing"
+        return self.process.stdout.readline().decode().rstrip("\n")
+
+
+@contextmanager
+def _running(*options: str) -> Iterator[Running]:
+    """Run an emulator, and make sure that it ends."""
+    command = [sys.executable, "-m", "probewise", "emulate-nxt", *options]
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=0,
+        preexec_fn=_mind_interrupts,
+    ) as process:
+        try:
+            running = Running(process, "")
+            running.device = running.line()
+            running.line()
+            yield running
+        finally:
+            process.kill()
+
+
+def _mind_interrupts() -> None:
+    # A test runner in the background ignores Ctrl-C, and its children would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session")
+def emulator() -> Callable[..., AbstractContextManager[Running]]:
+    """Run `probewise emulate-nxt` with some options."""
+    return _running

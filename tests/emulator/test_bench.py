@@ -1,0 +1,239 @@
+"""The arm on the brick: from motor counts to a place over the field, and what the sensor sees there."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probewise.emulator import (
+    Bench,
+    EmulatedArm,
+    Geometry,
+    Sight,
+    Stand,
+    Table,
+    VirtualClock,
+    parse_scene,
+    read_geometry,
+    set_up,
+    shipped_geometry,
+)
+from probewise.errors import FileError, ParameterError
+from probewise.recordings import Disc, HalfPlane, Polygon, Quadrant, Uniform
+from probewise.world import Blob, Oval, Surface, World, gaussian_spot
+
+WORLD = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]), black=10.0, white=60.0, noise_sd=0.6)
+CIRCLE = Disc((524.0, 300.0), 100.0)
+
+
+@pytest.fixture
+def geometry() -> Geometry:
+    return read_geometry(shipped_geometry())
+
+
+def posed(geometry: Geometry, *angles_deg: float) -> Stand:
+    """Bring an arm's base, shoulder and elbow to these angles by hand."""
+    arm = EmulatedArm(geometry)
+    for joint, angle_deg in zip(arm.joints, angles_deg, strict=True):
+        joint.bring_to(angle_deg)
+    return arm.stand()
+
+
+def test_the_arm_stands_where_two_links_over_a_turning_base_lead(geometry: Geometry) -> None:
+    """rho = r0 + L1 cos a + L2 cos b + d, z = h0 + L1 sin a + L2 sin b - hs; worked out with complex numbers."""
+    stand = posed(geometry, -70.0, 50.0, -40.0)
+    upper, lower = geometry.links_mm
+    tip = (
+        complex(*geometry.shoulder_mm)
+        + upper * np.exp(1j * math.radians(50))
+        + lower * np.exp(-1j * math.radians(40))
+        + complex(geometry.sensor_mm[0], -geometry.sensor_mm[1])
+    )
+    place = complex(*geometry.base_mm) + tip.real * np.exp(-1j * math.radians(70))
+    assert (stand.x_mm, stand.y_mm, stand.height_mm) == pytest.approx((place.real, place.imag, tip.imag))
+    assert stand.orientation_rad == pytest.approx(math.radians(geometry.mounting_deg - 70 - 90))
+
+
+def test_a_relative_elbow_turns_with_the_upper_link(geometry: Geometry) -> None:
+    relative = posed(replace(geometry, elbow_is_absolute=False), -90.0, 50.0, -90.0)
+    absolute = posed(geometry, -90.0, 50.0, -40.0)
+    assert (relative.x_mm, relative.y_mm) == pytest.approx((absolute.x_mm, absolute.y_mm))
+    assert relative.height_mm == pytest.approx(absolute.height_mm)
+
+
+def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometry) -> None:
+    arm = EmulatedArm(geometry)
+    motor = arm.motors()["ABC".index(geometry.joints[0].port)]
+    angles = []
+    for way in (1, -1):
+        while way * motor.angle_deg < 70:
+            motor.step(1e-3, 40 * way, brake=False, battery_mv=7400)
+        angles.append(arm.stand().orientation_rad - math.radians(motor.angle_deg / geometry.joints[0].gear_ratio))
+    assert math.degrees(angles[1] - angles[0]) == pytest.approx(geometry.joints[0].play_deg)
+
+
+def test_the_brick_counts_what_a_hand_turns(geometry: Geometry, clock: VirtualClock) -> None:
+    bench = set_up(geometry, WORLD, CIRCLE, clock, seed=1)
+    shoulder = bench.arm.joints[1]
+    shoulder.bring_to(shoulder.numbers.home_deg + 10)
+    clock.sleep(0.01)
+    bench.radio.brick.advance()
+    counts = bench.radio.brick.outputs.ports["ABC".index(shoulder.numbers.port)].rotation_count
+    assert counts == pytest.approx(10 * shoulder.numbers.gear_ratio, abs=1)
+
+
+def test_a_joint_stops_beyond_its_limits(geometry: Geometry) -> None:
+    base = geometry.joints[0]
+    arm = EmulatedArm(geometry)
+    motor = arm.motors()["ABC".index(base.port)]
+    for _ in range(20_000):
+        motor.step(1e-3, 100, brake=False, battery_mv=9000)
+    end_deg = base.home_deg + motor.angle_deg / base.gear_ratio
+    assert min(abs(end_deg - base.low_deg), abs(end_deg - base.high_deg)) == pytest.approx(3.0)
+
+
+def sight(stand: Stand, clock: VirtualClock, *, albedo: float = 1.0) -> Sight:
+    world = replace(WORLD, noise_sd=0.0)
+    return Sight(world, Table(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
+
+
+def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock: VirtualClock) -> None:
+    assert sight(Stand(0, 0, 14.0, 0), clock)(True) == pytest.approx(60.5)
+    assert sight(Stand(0, 0, 14.0, 0), clock, albedo=0.0)(True) == pytest.approx(10.5)
+
+
+def test_without_the_led_contrast_is_halved_and_height_does_not_matter(clock: VirtualClock) -> None:
+    for height_mm in (5.0, 14.0, 60.0):
+        assert sight(Stand(0, 0, height_mm, 0), clock)(False) == pytest.approx(30.25)
+
+
+def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetres(clock: VirtualClock) -> None:
+    lit = {h: sight(Stand(0, 0, h, 0), clock)(True) for h in (0.0, 4.0, 8.0, 14.0, 25.0, 60.0)}
+    assert lit[8.0] == max(lit.values())
+    assert lit[0.0] == pytest.approx(30.25)
+    assert lit[14.0] > lit[25.0] > lit[60.0]
+    assert lit[60.0] == pytest.approx(30.25, abs=0.5)
+
+
+def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualClock) -> None:
+    """As on the simulated arm with the same seed, however often it is read at one stand."""
+    at = [Stand(0, 0, 14.0, 0)]
+    look = Sight(WORLD, Table(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
+    for number in range(4):
+        at[0] = Stand(10.0 * number, 0, 14.0, 0)
+        expected = 60.5 + 0.6 * np.random.default_rng([7, number]).standard_normal()
+        assert look(True) == pytest.approx(expected)
+        assert look(True) != pytest.approx(expected)
+
+
+def read_light(bench: Bench, clock: VirtualClock, port: int) -> int:
+    brick = bench.radio.brick
+    brick.answer(bytes((0x80, 0x05, port, 0x05, 0x80)))
+    clock.sleep(0.1)
+    reply = brick.answer(bytes((0x00, 0x07, port)))
+    assert reply is not None
+    valid, *_, scaled, _ = struct.unpack("<BBBBHHhh", reply[4:])
+    assert valid
+    return int(scaled)
+
+
+def test_a_brick_over_a_circle_reads_white_inside_and_black_outside(geometry: Geometry, clock: VirtualClock) -> None:
+    """The arm is put at reading height by inverse kinematics, worked out here with the law of cosines."""
+    bench = set_up(geometry, WORLD, CIRCLE, clock, seed=1)
+    upper, lower = geometry.links_mm
+    readings = []
+    for y_mm in (300.0, 450.0):
+        out = geometry.base_mm[1] - y_mm - geometry.shoulder_mm[0] - geometry.sensor_mm[0]
+        up = 14.0 + geometry.sensor_mm[1] - geometry.shoulder_mm[1]
+        far = math.hypot(out, up)
+        slope = math.atan2(up, out)
+        shoulder = slope + math.acos((upper**2 + far**2 - lower**2) / (2 * upper * far))
+        elbow = slope - math.acos((lower**2 + far**2 - upper**2) / (2 * lower * far))
+        for joint, angle_rad in zip(bench.arm.joints, (-math.pi / 2, shoulder, elbow), strict=True):
+            joint.bring_to(math.degrees(angle_rad))
+        stand = bench.arm.stand()
+        assert (stand.x_mm, stand.y_mm, stand.height_mm) == pytest.approx((524.0, y_mm, 14.0))
+        readings.append(read_light(bench, clock, geometry.sensor_port - 1))
+    assert readings[0] == pytest.approx(60, abs=3)
+    assert readings[1] == pytest.approx(10, abs=3)
+
+
+def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClock) -> None:
+    """Over an edge the spot's centre, 6 mm along v, is on the white side, then on the black one."""
+    table = Table(HalfPlane(math.pi / 2, 0.0))
+    world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
+    look = Sight(world, table, lambda: Stand(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
+    assert look(True) == pytest.approx(60.5)
+    table.obey("turn 180")
+    assert look(True) == pytest.approx(10.5)
+    table.obey("uniform:0.5")
+    assert look(True) == pytest.approx(35.5)
+
+
+def test_what_a_person_cannot_do_changes_nothing() -> None:
+    table = Table(CIRCLE)
+    for wish in ("turn", "turn round", "turn nan", "hexagon", ""):
+        with pytest.raises(ParameterError, match="turn DEGREES"):
+            table.obey(wish)
+    assert table == Table(CIRCLE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("gear_ratio = .*", "gear_ratio = 0", "gear_ratio is 0"),
+        ("gear_ratio = .*", 'gear_ratio = "7"', "gear_ratio is '7'"),
+        ("home_deg = .*", "home_deg = 400", "base.home_deg is 400"),
+        ("mounting_deg = .*", "", "mounting_deg is missing"),
+        ('elbow = "[a-z]*"', 'elbow = "bent"', "elbow"),
+        ('port = "A"', 'port = "D"', "base.port is 'D'"),
+        ('port = "A"', 'port = "B"', "ports are B, B, C"),
+        ("port = .*", "port = 5", "sensor.port is 5"),
+        (r"\[joints.base\]", "[joints.base", "not TOML"),
+    ],
+)
+def test_a_geometry_that_cannot_be_used_says_where(tmp_path: Path, old: str, new: str, found: str) -> None:
+    text = shipped_geometry().read_text(encoding="utf-8")
+    file = tmp_path / "arm.toml"
+    changed, n_changed = re.subn(old, new, text, count=1)
+    assert n_changed == 1
+    file.write_text(changed, encoding="utf-8")
+    with pytest.raises(FileError, match=found) as caught:
+        read_geometry(file)
+    assert str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "sleep_min"), [("", 10), ("fifteen letters", 10), ("a\tb", 10), ("NXT", 7)])
+def test_a_brick_that_cannot_be_is_refused(geometry: Geometry, clock: VirtualClock, name: str, sleep_min: int) -> None:
+    with pytest.raises(ParameterError):
+        set_up(geometry, WORLD, CIRCLE, clock, seed=1, name=name, sleep_min=sleep_min)
+
+
+@pytest.mark.parametrize(
+    ("text", "surface"),
+    [
+        ("524,300,100", CIRCLE),
+        ("circle:524,300,100", CIRCLE),
+        ("ellipse:1,2,3,4,90", Oval((1.0, 2.0), (3.0, 4.0), math.pi / 2)),
+        ("polygon:0,0,10,0,0,10", Polygon(((0.0, 0.0), (10.0, 0.0), (0.0, 10.0)))),
+        ("edge:180,-500", HalfPlane(math.pi, -500.0)),
+        ("corner:500,250,1,-1", Quadrant((500.0, 250.0), (1, -1))),
+        ("uniform:0.5", Uniform(0.5)),
+    ],
+)
+def test_a_scene_is_read_from_a_text(text: str, surface: Surface) -> None:
+    assert parse_scene(text) == surface
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1,2", "1,2,0", "1,2,nan", "blob:1,2,3", "polygon:1,2,3,4", "corner:1,2,0,1", "uniform:2", "a,b,c"]
+)
+def test_a_scene_of_no_form_is_refused_with_all_forms(text: str) -> None:
+    with pytest.raises(ParameterError, match="ellipse:X,Y,A,B,ANGLE"):
+        parse_scene(text)

@@ -1,0 +1,140 @@
+"""`probewise emulate-nxt` as a person meets it: a process with a serial device."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import pytest
+
+from probewise.cli import main
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
+
+LIMIT_S = 60.0
+Emulator: TypeAlias = Callable[..., AbstractContextManager[Any]]
+
+BATTERY, ANSWER = bytes.fromhex("02 00 00 0B"), bytes.fromhex("05 00 02 0B 00 F4 1C")
+
+
+def exchanged(device: str, sent: bytes, expected: int, *, limit_s: float = 10.0) -> bytes:
+    """Open the device, write, and read so many bytes."""
+    file = os.open(device, os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(file, sent)
+        got, deadline_s = b"", time.monotonic() + limit_s
+        while len(got) < expected and (left_s := deadline_s - time.monotonic()) > 0:
+            ready, _, _ = select.select([file], [], [], left_s)
+            if ready:
+                got += os.read(file, expected - len(got))
+        return got
+    finally:
+        os.close(file)
+
+
+def test_clients_come_and_go_and_ctrl_c_ends_it(emulator: Emulator, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with emulator("--log", str(log), "--name", "ARM1") as running:
+        for _ in range(3):
+            assert exchanged(running.device, BATTERY, len(ANSWER)) == ANSWER
+        info = exchanged(running.device, bytes.fromhex("02 00 01 9B"), 35)
+        assert info[5:10] == b"ARM1\0"
+        running.process.send_signal(signal.SIGINT)
+        _, complaint = running.process.communicate(timeout=LIMIT_S)
+        assert running.process.returncode == 130
+        assert complaint.decode() == "probewise emulate-nxt: stopped; the device is gone\n"
+        assert not Path(running.device).exists()
+    lines = log.read_text(encoding="utf-8").splitlines()
+    assert [line[11:] for line in lines[:2]] == ["> 00 0b  GETBATTERYLEVEL", "< 02 0b 00 f4 1c  GETBATTERYLEVEL"]
+    assert len(lines) == 8
+
+
+def test_all_byte_values_pass_unchanged(emulator: Emulator) -> None:
+    """A cooked terminal would eat 0x03, 0x11 and 0x13, and turn 0x0D into 0x0A."""
+    text = bytes(range(0x01, 0x1F))
+    with emulator() as running:
+        name = b"all.dat".ljust(20, b"\0")
+        opened = exchanged(running.device, bytes.fromhex("1A 00 01 81") + name + len(text).to_bytes(4, "little"), 6)
+        assert opened == bytes.fromhex("04 00 02 81 00 00")
+        written = exchanged(running.device, bytes((len(text) + 3, 0)) + b"\x01\x83\x00" + text, 8)
+        assert written[4] == 0
+        exchanged(running.device, bytes.fromhex("03 00 01 84 00"), 6)
+        exchanged(running.device, bytes.fromhex("16 00 01 80") + name, 10)
+        read = exchanged(running.device, bytes.fromhex("05 00 01 82 00") + len(text).to_bytes(2, "little"), 38)
+        assert read[8:] == text
+
+
+def test_a_person_changes_the_scene_by_typing(emulator: Emulator) -> None:
+    with emulator() as running:
+        running.process.stdin.write(b"uniform:0.5\ngremlins\n")
+        assert running.line() == "done: uniform:0.5"
+        assert "turn DEGREES" in running.line()
+        running.process.stdin.close()
+        assert exchanged(running.device, BATTERY, len(ANSWER)) == ANSWER
+
+
+def test_a_disconnection_takes_the_device_away_and_a_link_leads_to_the_new_one(
+    emulator: Emulator, tmp_path: Path
+) -> None:
+    link = tmp_path / "rfcomm0"
+    with emulator("--link", str(link), "--fault", "disconnect=1") as running:
+        assert running.device == str(link)
+        before = os.path.realpath(link)
+        file = os.open(link, os.O_RDWR | os.O_NOCTTY)
+        os.write(file, BATTERY)
+        deadline_s = time.monotonic() + 10
+        while _is_there(file) and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+        assert not _is_there(file)
+        os.close(file)
+        again = os.open(link, os.O_RDWR | os.O_NOCTTY)
+        assert os.path.realpath(link) != before or _is_there(again)
+        os.close(again)
+        running.process.send_signal(signal.SIGINT)
+        running.process.communicate(timeout=LIMIT_S)
+    assert not link.is_symlink()
+
+
+def _is_there(file: int) -> bool:
+    ready, _, _ = select.select([file], [], [], 0)
+    try:
+        return not ready or bool(os.read(file, 1))
+    except OSError:
+        return False
+
+
+def test_a_link_never_replaces_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("keep me", encoding="utf-8")
+    assert main(["emulate-nxt", "--link", str(precious)]) == 2
+    assert precious.read_text(encoding="utf-8") == "keep me"
+    assert str(precious) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        (["--fault", "gremlins"], "--fault"),
+        (["--scene", "1,2"], "--scene"),
+        (["--scene", "blob:1,2,3"], "--scene"),
+        (["--sleep", "7"], "sleep_min"),
+        (["--name", "a name that is too long"], "name"),
+        (["--geometry", "nowhere.toml"], "nowhere.toml"),
+        (["--sensor", "nowhere.json"], "nowhere.json"),
+        (["--seed", "-1"], "--seed"),
+    ],
+)
+def test_a_wrong_command_line_is_told_in_one_line(
+    options: list[str], found: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["emulate-nxt", *options]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert found in said.err
+    assert said.err.count("\n") == 1

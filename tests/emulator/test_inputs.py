@@ -1,0 +1,142 @@
+"""Input ports: what the firmware makes of a voltage, and when it says that it is valid."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probewise.emulator import Brick, Light, NothingAnalog, VirtualClock
+
+
+class Fixed:
+    def __init__(self, value: int) -> None:
+        self.value = value
+
+    def counts(self, *, lit: bool) -> int:
+        return self.value
+
+
+def values(ask: Callable[[str], str]) -> tuple[int, int, int, int]:
+    """Read port 2: valid, raw, normalized, scaled."""
+    valid, _, _, _, raw, normalized, scaled, _ = struct.unpack("<BBBBHHhh", bytes.fromhex(ask("00 07 01"))[4:])
+    return valid, raw, normalized, scaled
+
+
+def light_brick(clock: VirtualClock, sensor: object) -> Brick:
+    return Brick(clock, sensors=[NothingAnalog(), sensor, NothingAnalog(), NothingAnalog()])  # type: ignore[list-item]
+
+
+def asking(brick: Brick) -> Callable[[str], str]:
+    return lambda telegram: (brick.answer(bytes.fromhex(telegram)) or b"").hex(" ").upper()
+
+
+@pytest.mark.parametrize(
+    ("raw", "normalized", "percent"),
+    [(0, 1023, 100), (200, 1023, 100), (300, 876, 85), (500, 582, 56), (700, 288, 28), (842, 79, 7), (1023, 0, 0)],
+)
+def test_light_is_scaled_as_the_firmware_does(clock: VirtualClock, raw: int, normalized: int, percent: int) -> None:
+    ask = asking(light_brick(clock, Fixed(raw)))
+    for mode, scaled in (("00", normalized), ("80", percent)):
+        ask(f"80 05 01 05 {mode}")
+        clock.sleep(0.1)
+        assert values(ask) == (1, raw, normalized, scaled)
+
+
+def test_readings_are_invalid_for_20_ms_after_a_change_of_type_and_show_the_old_values(ask, clock) -> None:
+    ask("80 05 01 05 80")
+    clock.sleep(0.1)
+    lit = values(ask)
+    assert lit[0] == 1
+    ask("80 05 01 06 80")
+    for _ in range(20):
+        assert values(ask) == (0, *lit[1:])
+        clock.sleep(0.001)
+    clock.sleep(0.001)
+    dark = values(ask)
+    assert dark[0] == 1
+    assert dark[3] == 28
+    assert lit[3] == 57
+
+
+def test_a_change_of_mode_alone_is_valid_a_millisecond_later(ask, clock) -> None:
+    ask("80 05 01 05 80")
+    clock.sleep(0.1)
+    ask("80 05 01 05 00")
+    assert values(ask)[0] == 0
+    clock.sleep(0.001)
+    assert values(ask)[0] == 1
+
+
+def test_setting_the_same_type_and_mode_again_does_not_shorten_the_wait(ask, clock) -> None:
+    ask("80 05 01 05 80")
+    clock.sleep(0.01)
+    ask("80 05 01 05 80")
+    clock.sleep(0.002)
+    assert values(ask)[0] == 0
+
+
+def test_the_converter_takes_a_new_sample_every_three_milliseconds(clock: VirtualClock) -> None:
+    taken = []
+
+    def seen(lit: bool) -> float:
+        taken.append(lit)
+        return 50.0
+
+    light = Light(seen, clock)
+    for _ in range(30):
+        light.counts(lit=True)
+        clock.sleep(0.001)
+    assert len(taken) == 10
+
+
+@given(percent=st.floats(0, 100))
+def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
+    """One count of the converter is 0.147 %, and the firmware truncates."""
+    clock = VirtualClock()
+    ask = asking(light_brick(clock, Light(lambda lit: percent, clock)))
+    ask("80 05 01 05 00")
+    clock.sleep(0.1)
+    assert values(ask)[2] * 100 / 1023 == pytest.approx(percent, abs=0.3)
+
+
+@given(percent=st.floats(-1e6, 1e6))
+def test_no_light_leaves_the_converter_s_range(percent: float) -> None:
+    assert 0 <= Light(lambda lit: percent, VirtualClock()).counts(lit=True) <= 1023
+
+
+def test_an_empty_port_reads_the_full_voltage_and_a_touch_sensor_s_rest(clock: VirtualClock) -> None:
+    ask = asking(light_brick(clock, NothingAnalog()))
+    ask("80 05 01 01 20")
+    clock.sleep(0.1)
+    assert values(ask) == (1, 1023, 1023, 0)
+
+
+def test_a_pressed_touch_sensor_is_true(clock: VirtualClock) -> None:
+    ask = asking(light_brick(clock, Fixed(180)))
+    ask("80 05 01 01 20")
+    clock.sleep(0.1)
+    assert values(ask) == (1, 180, 180, 1)
+
+
+@given(telegrams=st.lists(st.binary(max_size=70), max_size=6))
+def test_the_brick_answers_any_bytes_with_a_reply_or_not_at_all(telegrams: list[bytes]) -> None:
+    clock = VirtualClock()
+    brick = Brick(clock)
+    for telegram in telegrams:
+        reply = brick.answer(telegram)
+        clock.sleep(0.01)
+        if reply is not None:
+            assert telegram[0] in (0, 1)
+            assert reply[:2] == bytes((2, telegram[1]))
+            assert 3 <= len(reply) <= 128
+
+
+@given(body=st.binary(max_size=60), opcode=st.sampled_from(range(0x14)))
+def test_a_direct_reply_is_never_longer_than_64_bytes(body: bytes, opcode: int) -> None:
+    reply = Brick(VirtualClock()).answer(bytes((0, opcode)) + body)
+    assert reply is not None
+    assert len(reply) <= 64

@@ -1,0 +1,252 @@
+"""Motors and the firmware over them, on a clock that tests move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from probewise.emulator import Battery, Brick, Motor, MotorNature, VirtualClock
+from probewise.emulator.output import Output, RunState
+
+RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
+
+
+def little(value: int) -> str:
+    return value.to_bytes(4, "little").hex(" ")
+
+
+def turn(ask: Callable[[str], str], power: int, limit: int, *, how: str = RUN, port: int = 0) -> None:
+    ask(f"80 04 {port:02X} {power & 0xFF:02X} {how} {little(limit)}")
+
+
+def wait(clock: VirtualClock, brick: Brick, seconds: float) -> Output:
+    """Let time pass and return port A."""
+    clock.sleep(seconds)
+    brick.advance()
+    return brick.outputs.ports[0]
+
+
+def coasted(speed_deg_s: float, nature: MotorNature) -> float:
+    """Integrate speed' = -speed/T - f to standstill: T v - f T^2 ln(1 + v / (f T))."""
+    t, f = nature.coasting_s, nature.friction_deg_s2
+    return t * speed_deg_s - f * t * t * math.log1p(speed_deg_s / (f * t))
+
+
+def test_a_coasting_motor_stops_where_the_integral_says() -> None:
+    motor = Motor(speed_deg_s=600.0)
+    for _ in range(2000):
+        motor.step(1e-3, 0, brake=False, battery_mv=7400)
+    assert motor.angle_deg == pytest.approx(coasted(600.0, motor.nature), rel=0.01)
+    assert motor.speed_deg_s == 0
+
+
+def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock, brick) -> None:
+    turn(ask, 50, 0, how="01 00 00 20")
+    port = wait(clock, brick, 1.0)
+    nature = port.motor.nature
+    expected = nature.full_speed_deg_s * 0.5 * 7412 / nature.rated_mv - nature.friction_deg_s2 * nature.driven_s
+    assert port.motor.speed_deg_s == pytest.approx(expected, rel=0.01)
+
+
+def test_a_weak_motor_does_not_start(ask, clock, brick) -> None:
+    """Stiction: 5 % of 840 deg/s over 60 ms is less than the friction of 1200 deg/s^2."""
+    turn(ask, 5, 0, how="01 00 00 20")
+    assert wait(clock, brick, 1.0).motor.angle_deg == 0
+
+
+@pytest.mark.parametrize("battery_mv", [7412, 6500])
+def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(
+    clock: VirtualClock, battery_mv: float
+) -> None:
+    brick = Brick(clock, battery=Battery(battery_mv))
+    brick.answer(bytes.fromhex(f"80 04 00 1E {RUN} 00 00 00 00"))
+    begun = wait(clock, brick, 2.0).tacho_count
+    assert wait(clock, brick, 4.0).tacho_count - begun == pytest.approx(1200, abs=15)
+
+
+def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(ask, clock, brick) -> None:
+    """360 asked for, 420 measured (plain limit, coasting)."""
+    turn(ask, 75, 360)
+    port = brick.outputs.ports[0]
+    while port.run_state != RunState.IDLE:
+        wait(clock, brick, 0.001)
+    at_limit = port.tacho_count
+    assert 360 <= at_limit <= 362
+    assert port.motor.speed_deg_s > 400
+    wait(clock, brick, 1.0)
+    assert port.motor.speed_deg_s == 0
+    assert 400 <= port.tacho_count <= 440
+
+
+def test_hold_ends_the_coasting_and_the_motor_settles(ask, clock, brick) -> None:
+    turn(ask, 75, 360)
+    while wait(clock, brick, 0.01).run_state != RunState.IDLE:
+        pass
+    wait(clock, brick, 0.02)
+    ask(f"80 04 00 {HOLD}")
+    settled = wait(clock, brick, 0.8).tacho_count
+    assert 360 < settled < 400
+    assert wait(clock, brick, 1.0).tacho_count == settled
+    assert brick.outputs.ports[0].run_state == RunState.RUNNING
+
+
+def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick) -> None:
+    ask(f"80 04 00 {HOLD}")
+    port = wait(clock, brick, 0.5)
+    port.motor.angle_deg += 20
+    port.motor.speed_deg_s = 1.0
+    assert abs(wait(clock, brick, 2.0).tacho_count) <= 3
+    ask(f"80 04 00 00 {COAST} 00 00 00 00")
+    port.motor.angle_deg += 20
+    assert wait(clock, brick, 2.0).tacho_count >= 17
+
+
+def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, brick) -> None:
+    """The goal runs on from where the last run should have ended."""
+    for _ in range(2):
+        turn(ask, 75, 360)
+        port = wait(clock, brick, 2.0)
+    assert 720 + 40 <= port.tacho_count <= 720 + 80
+
+
+def test_a_run_back_by_less_than_the_overshoot_from_the_goal_goes_too_far(ask, clock, brick) -> None:
+    turn(ask, 75, 360)
+    overshot = wait(clock, brick, 2.0).tacho_count
+    turn(ask, -75, 360)
+    assert wait(clock, brick, 2.0).tacho_count < 0 < overshot - 360
+
+
+def test_a_goal_behind_the_motor_makes_a_move_look_ignored(ask, clock, brick) -> None:
+    turn(ask, 75, 360)
+    before = wait(clock, brick, 2.0).tacho_count
+    turn(ask, 20, 10)
+    assert wait(clock, brick, 1.0).tacho_count - before <= 1
+
+
+def test_a_run_without_limit_draws_the_goal_along(ask, clock, brick) -> None:
+    turn(ask, 75, 360)
+    wait(clock, brick, 2.0)
+    turn(ask, 30, 0)
+    here = wait(clock, brick, 2.0).tacho_count
+    turn(ask, 30, 200)
+    there = wait(clock, brick, 3.0).tacho_count
+    assert 200 <= there - here <= 230
+
+
+def test_a_hold_does_not_draw_the_goal_along(ask, clock, brick) -> None:
+    turn(ask, 75, 360)
+    wait(clock, brick, 2.0)
+    ask(f"80 04 00 {HOLD}")
+    wait(clock, brick, 0.5)
+    turn(ask, 75, 360)
+    assert 720 + 40 <= wait(clock, brick, 2.0).tacho_count <= 720 + 80
+
+
+def test_the_three_counters_are_reset_apart(ask, clock, brick) -> None:
+    turn(ask, 75, 360)
+    count = wait(clock, brick, 2.0).tacho_count
+    ask("80 0A 00 01")
+    assert ask("00 06 00").endswith(f"{little(count)} 00 00 00 00 {little(count)}".upper())
+    ask("80 0A 00 00")
+    assert ask("00 06 00").endswith(f"{little(count)} 00 00 00 00 00 00 00 00".upper())
+
+
+def test_braking_is_shorter_than_coasting() -> None:
+    ends = []
+    for brake in (True, False):
+        motor = Motor(speed_deg_s=600.0)
+        for _ in range(1000):
+            motor.step(1e-3, 0, brake=brake, battery_mv=7400)
+        ends.append(motor.angle_deg)
+    assert ends[0] < ends[1] / 2
+
+
+def test_a_ramp_down_ends_with_less_overshoot_than_a_plain_run(ask, clock, brick) -> None:
+    turn(ask, 75, 0)
+    while brick.outputs.ports[0].tacho_count < 500:
+        wait(clock, brick, 0.01)
+    goal = brick.outputs.ports[0].tacho_count + 400
+    turn(ask, 0, 400, how="03 00 00 40")
+    port = wait(clock, brick, 6.0)
+    assert port.run_state == RunState.IDLE
+    assert goal <= port.tacho_count <= goal + 15
+
+
+def test_a_ramp_up_gets_faster_until_its_limit(ask, clock, brick) -> None:
+    turn(ask, 75, 720, how="03 00 00 10")
+    powers = []
+    while (port := wait(clock, brick, 0.05)).run_state == RunState.RAMP_UP:
+        powers.append(port.power)
+    assert powers == sorted(powers)
+    assert powers[0] == 10
+    assert powers[-1] >= 65
+    assert port.tacho_count >= 720
+
+
+def test_motors_in_step_stay_together_though_one_has_more_friction(clock: VirtualClock) -> None:
+    heavy = Motor(MotorNature(friction_deg_s2=2400))
+    brick = Brick(clock, motors=[Motor(), heavy, Motor()])
+    for port in ("00", "01"):
+        brick.answer(bytes.fromhex(f"80 04 {port} 32 07 02 00 20 00 00 00 00"))
+    clock.sleep(4.0)
+    brick.advance()
+    one, two, _ = (port.block_count for port in brick.outputs.ports)
+    assert one > 1000
+    assert abs(one - two) <= 10
+
+
+def test_a_turn_ratio_slows_the_inner_motor(clock: VirtualClock) -> None:
+    brick = Brick(clock)
+    for port in ("00", "01"):
+        brick.answer(bytes.fromhex(f"80 04 {port} 32 07 02 32 20 00 00 00 00"))
+    clock.sleep(4.0)
+    brick.advance()
+    one, two, _ = (port.block_count for port in brick.outputs.ports)
+    assert abs(one) < 0.6 * abs(two) or abs(two) < 0.6 * abs(one)
+
+
+def test_a_motor_stands_still_at_its_stop() -> None:
+    motor = Motor(MotorNature(stops_deg=(-50.0, 100.0)))
+    for _ in range(1000):
+        motor.step(1e-3, 80, brake=False, battery_mv=7400)
+    assert (motor.angle_deg, motor.speed_deg_s) == (100.0, 0.0)
+
+
+def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up() -> None:
+    motor = Motor(MotorNature(play_deg=8.0))
+    for side in (1, -1):
+        while side * motor.angle_deg < 100:
+            motor.step(1e-3, 50 * side, brake=False, battery_mv=7400)
+        assert motor.driven_deg == pytest.approx(motor.angle_deg - side * 4.0)
+
+
+def test_starting_a_program_lets_motors_and_sensor_types_go(ask, clock, brick) -> None:
+    turn(ask, 50, 0)
+    ask("80 05 01 05 00")
+    wait(clock, brick, 1.0)
+    ask("80 00 61 72 6D 2E 72 78 65" + " 00" * 13)
+    assert wait(clock, brick, 2.0).motor.speed_deg_s == 0
+    assert ask("00 07 01").split()[6] == "00"
+
+
+def test_the_brick_sleeps_unless_it_is_kept_awake(ask, clock, brick) -> None:
+    """Only KEEPALIVE counts; asleep, it answers nothing and its motors coast."""
+    clock.sleep(599.0)
+    assert ask("00 0D") == "02 0D 00 C0 27 09 00"
+    clock.sleep(598.0)
+    assert ask("00 0B") != ""
+    turn(ask, 50, 0)
+    clock.sleep(3.0)
+    assert ask("00 0B") == ""
+    assert brick.is_off
+    wait(clock, brick, 2.0)
+    assert brick.outputs.ports[0].motor.speed_deg_s == 0
+
+
+def test_the_battery_sags_by_the_minute(clock: VirtualClock) -> None:
+    brick = Brick(clock, battery=Battery(7400, sag_mv_min=60))
+    clock.sleep(300.0)
+    assert brick.battery_mv == 7100
+    assert brick.answer(bytes.fromhex("00 0B")) == bytes.fromhex("02 0B 00 BC 1B")

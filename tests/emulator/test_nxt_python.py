@@ -1,0 +1,152 @@
+"""Somebody else's client drives the brick: nxt-python, through its backend for serial devices.
+
+It waits for ever for an answer that does not come, so each of its programs runs in a process with a limit.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals"),
+    pytest.mark.skipif(
+        importlib.util.find_spec("nxt") is None, reason="nxt-python is not installed: pip install 'probewise[test]'"
+    ),
+]
+
+LIMIT_S = 60.0
+HEAD = """
+import sys, nxt.error, nxt.locator, nxt.motor, nxt.sensor, nxt.sensor.generic
+with nxt.locator.find(backends=["devfile"], config=None, filename=sys.argv[1]) as brick:
+"""
+
+
+@pytest.fixture(scope="module")
+def device(emulator: Callable[..., AbstractContextManager[Any]]) -> Iterator[str]:
+    with emulator("--scene", "524,300,100") as running:
+        yield running.device
+
+
+@pytest.fixture
+def client(device: str) -> Callable[[str], list[str]]:
+    """Run statements with `brick` in hand and return the lines they print."""
+
+    def client(statements: str) -> list[str]:
+        body = "".join(f"    {line}\n" for line in statements.strip().splitlines())
+        done = subprocess.run(
+            [sys.executable, "-c", HEAD + body, device],
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_S,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    return client
+
+
+def test_its_own_test_program_is_content(device: str) -> None:
+    program = Path(sys.executable).parent / "nxt-test"
+    done = subprocess.run(
+        [program, "--backend", "devfile", "--filename", device],
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Firmware version 1.31" in done.stdout
+    assert "Battery level 7412 mV" in done.stdout
+
+
+def test_it_reads_the_light_sensor(client: Callable[[str], list[str]]) -> None:
+    """High above black with room light only: half of 10 %, 51 of 1023 or so."""
+    (lit, dark) = client("""
+light = brick.get_sensor(nxt.sensor.Port.S1, nxt.sensor.generic.Light)
+print(light.get_sample())
+light.set_illuminated(False)
+print(light.get_sample())
+""")
+    assert 30 < int(lit) < 80
+    assert 30 < int(dark) < 80
+
+
+def test_it_reads_the_ultrasonic_sensor(client: Callable[[str], list[str]]) -> None:
+    assert client("print(brick.get_sensor(nxt.sensor.Port.S4, nxt.sensor.generic.Ultrasonic).get_sample())") == ["42"]
+
+
+def test_it_turns_a_motor(client: Callable[[str], list[str]]) -> None:
+    """Its own tolerance for turns over Bluetooth is 70 degrees."""
+    there, back = client("""
+motor = brick.get_motor(nxt.motor.Port.A)
+motor.reset_position(False)
+motor.turn(40, 180)
+print(motor.get_tacho().rotation_count)
+motor.turn(-40, 180)
+print(motor.get_tacho().rotation_count)
+motor.idle()
+""")
+    assert abs(int(there) - 180) <= 70
+    assert abs(int(back)) <= 70
+
+
+def test_it_renames_the_brick(client: Callable[[str], list[str]]) -> None:
+    assert client('brick.set_brick_name("ROBBIE")\nprint(brick.get_device_info()[0])') == ["ROBBIE"]
+    client('brick.set_brick_name("NXT")')
+
+
+def test_it_exchanges_messages_with_a_program(client: Callable[[str], list[str]]) -> None:
+    assert client("""
+brick.start_program("echo.rxe")
+print(brick.get_current_program_name())
+brick.message_write(2, b"ok")
+print(brick.message_read(12, 2, True))
+brick.stop_program()
+""") == ["echo.rxe", "(2, b'ok\\x00')"]
+
+
+def test_it_finds_the_errors_that_it_knows(client: Callable[[str], list[str]]) -> None:
+    assert client("""
+def raised(call, *arguments):
+    try:
+        return call(*arguments)
+    except Exception as error:
+        return type(error).__name__
+print(raised(brick.stop_program))
+print(raised(brick.message_read, 12, 2, True))
+brick.start_program("echo.rxe")
+print(raised(brick.message_read, 12, 2, True))
+brick.stop_program()
+print(raised(brick.file_open_read, "missing.txt"))
+print(raised(brick.start_program, "missing.rxe"))
+""") == [
+        "NoActiveProgramError",
+        "NoActiveProgramError",
+        "EmptyMailboxError",
+        "FileNotFoundError",
+        "DirectProtocolError",
+    ]
+
+
+@pytest.mark.slow
+def test_it_writes_a_file_and_reads_it_back(client: Callable[[str], list[str]]) -> None:
+    assert client("""
+with brick.open_file("note.txt", "wt", 300) as file:
+    file.write("abc" * 100)
+with brick.open_file("note.txt", "rt") as file:
+    print(len(file.read()))
+for _ in range(20):
+    names = [name for name, size in brick.find_files("*.*")]
+print(names)
+brick.file_delete("note.txt")
+""") == ["300", "['echo.rxe', 'note.txt']"]

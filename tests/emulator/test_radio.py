@@ -1,0 +1,175 @@
+"""The link and its mishaps: do they happen as often as they are asked to, and nothing else with them?
+
+Accepted counts come from the binomial distribution, so that a right program fails less than once in 10 000.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from probewise.emulator import Brick, Faults, Radio, VirtualClock, VirtualLine
+from probewise.emulator.protocol import framed
+from probewise.errors import LinkError, ParameterError
+
+BATTERY = framed(bytes.fromhex("000B"))
+ANSWER = framed(bytes.fromhex("020B00F41C"))
+N = 2000
+
+
+def link(clock: VirtualClock, faults: Faults, *, seed: int = 5) -> tuple[VirtualLine, Radio]:
+    radio = Radio(Brick(clock, sleep_min=0), clock, rng=np.random.default_rng(seed), faults=faults)
+    return VirtualLine(radio, clock), radio
+
+
+def likely(count: int, n: int, rate: float) -> bool:
+    low, high = binom.interval(1 - 1e-4, n, rate)
+    return bool(low <= count <= high)
+
+
+def answers(clock: VirtualClock, faults: Faults, n: int = N) -> list[tuple[bytes, float]]:
+    """Ask n times, wait for all that comes, return the bytes and the time from asking to the last of them."""
+    line, _ = link(clock, faults)
+    got = []
+    for _ in range(n):
+        asked_s = last_s = clock()
+        line.write(BATTERY)
+        answer = b""
+        while piece := line.read(1, 0.2 + faults.late_s):
+            answer, last_s = answer + piece, clock()
+        got.append((answer, last_s - asked_s))
+    return got
+
+
+def test_a_link_without_faults_answers_everything_after_the_turnaround(clock: VirtualClock) -> None:
+    assert all(a == ANSWER and s == pytest.approx(0.060) for a, s in answers(clock, Faults(), 50))
+
+
+def test_silence_befalls_its_share_of_requests(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(silence=0.1, late_s=0.0))
+    assert {a for a, _ in got} == {b"", ANSWER}
+    assert likely(sum(a == b"" for a, _ in got), N, 0.1)
+
+
+def test_lateness_befalls_its_share_and_lasts_as_long_as_said(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(late=0.2, late_s=2.5))
+    assert all(a == ANSWER for a, _ in got)
+    late = [s for _, s in got if s > 1]
+    assert likely(len(late), N, 0.2)
+    assert late == pytest.approx([2.56] * len(late))
+
+
+def test_every_byte_of_a_reply_is_dropped_at_its_rate(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(drop=0.02, late_s=0.0))
+    assert likely(N * len(ANSWER) - sum(len(a) for a, _ in got), N * len(ANSWER), 0.02)
+
+
+def test_fragments_are_the_whole_reply_in_order(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(fragment=0.5, late_s=0.0))
+    assert all(a == ANSWER for a, _ in got)
+    assert likely(sum(s > 0.0601 for _, s in got), N, 0.5)
+
+
+def test_an_unasked_message_comes_before_a_share_of_the_replies(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(unasked=0.3, late_s=0.0))
+    assert all(a.endswith(ANSWER) for a, _ in got)
+    extra = {a.removesuffix(ANSWER) for a, _ in got} - {b""}
+    assert extra == {framed(bytes.fromhex("8009000368 6900"))}
+    assert likely(sum(a != ANSWER for a, _ in got), N, 0.3)
+
+
+def test_a_lost_request_is_not_carried_out_and_a_silent_one_is(clock: VirtualClock) -> None:
+    start = framed(bytes.fromhex("00 04 00 32 01 00 00 20 00 00 00 00"))
+    for faults, moves in ((Faults(deaf=1.0), False), (Faults(silence=1.0), True)):
+        line, radio = link(clock, faults)
+        line.write(start)
+        assert line.read(1, 1.0) == b""
+        radio.brick.advance()
+        assert (radio.brick.outputs.ports[0].tacho_count > 0) is moves
+
+
+def test_a_disconnection_ends_the_line_and_not_the_motors(clock: VirtualClock) -> None:
+    line, radio = link(clock, Faults(disconnect=1.0))
+    line.write(framed(bytes.fromhex("80 04 00 32 01 00 00 20 00 00 00 00")))
+    with pytest.raises(LinkError, match="cut"):
+        line.read(1, 1.0)
+    with pytest.raises(LinkError, match="cut"):
+        line.write(BATTERY)
+    clock.sleep(1.0)
+    radio.brick.advance()
+    assert radio.brick.outputs.ports[0].motor.speed_deg_s > 200
+    assert VirtualLine(radio, clock).read(1, 0.1) == b""
+
+
+def test_disconnections_come_at_their_rate(clock: VirtualClock) -> None:
+    line, radio = link(clock, Faults(disconnect=0.05))
+    n_cut = 0
+    for _ in range(N):
+        line.write(BATTERY)
+        if not radio.is_open:
+            n_cut += 1
+            line = VirtualLine(radio, clock)
+    assert likely(n_cut, N, 0.05)
+
+
+def test_no_byte_overtakes_another(clock: VirtualClock) -> None:
+    """As on a real link: whatever waits behind a late reply is late too."""
+    line, _ = link(clock, Faults(late=0.3, fragment=0.5, unasked=0.2))
+    for _ in range(200):
+        line.write(BATTERY + framed(bytes.fromhex("000D")))
+    received = line.read(10**6, 60.0)
+    for unasked in (framed(bytes.fromhex("8009000368 6900")),):
+        received = received.replace(unasked, b"")
+    assert received == (ANSWER + framed(bytes.fromhex("020D0000000000"))) * 200
+
+
+def test_the_same_seed_brings_the_same_mishaps() -> None:
+    faults = Faults(fragment=0.3, late=0.1, drop=0.01, silence=0.1, unasked=0.1, late_s=0.5)
+    assert answers(VirtualClock(), faults, 300) == answers(VirtualClock(), faults, 300)
+
+
+def test_a_record_names_every_telegram_and_mishap(clock: VirtualClock) -> None:
+    noted: list[tuple[float, str, str]] = []
+    radio = Radio(
+        Brick(clock),
+        clock,
+        rng=np.random.default_rng(1),
+        faults=Faults(silence=1.0),
+        trace=lambda now_s, event, text: noted.append((now_s, event, text)),
+    )
+    radio.send(BATTERY)
+    assert radio.mishaps == {"silence": 1}
+    assert noted == [(0.0, ">", "00 0b  GETBATTERYLEVEL"), (0.0, "!", "silence")]
+
+
+def test_a_sleeping_brick_ends_the_line(clock: VirtualClock) -> None:
+    radio = Radio(Brick(clock, sleep_min=2), clock, rng=np.random.default_rng(1))
+    line = VirtualLine(radio, clock)
+    clock.sleep(121.0)
+    with pytest.raises(LinkError):
+        line.write(BATTERY)
+
+
+def test_faults_are_read_from_texts() -> None:
+    faults = Faults.parse(["fragment", "late=0.1,1.5", "drop=0.25", "sag=30"])
+    assert faults == Faults(fragment=1.0, late=0.1, late_s=1.5, drop=0.25, sag=30.0)
+    assert Faults.parse(["late=0.1"]).late_s == Faults().late_s
+
+
+@pytest.mark.parametrize("text", ["gremlins", "drop=2", "drop=x", "drop=", "drop=0.1,0.2", "late=0.1,-1", "late=1,2,3"])
+def test_an_impossible_fault_is_refused(text: str) -> None:
+    with pytest.raises(ParameterError, match="--fault"):
+        Faults.parse([text])
+
+
+@pytest.fixture
+def check() -> Callable[[int], bool]:
+    return lambda count: likely(count, N, 0.1)
+
+
+def test_the_accepted_range_is_neither_empty_nor_everything(check: Callable[[int], bool]) -> None:
+    assert check(N // 10)
+    assert not check(N // 10 + 70)

@@ -1,0 +1,103 @@
+"""The sensor learnt along with the shape: a wrong SSF is rescued."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.arm.instrument import Reading
+from probewise.errors import ParameterError
+from probewise.experiment import AdjustedMixture, Change, run
+from probewise.inference import GaussianKnown
+from probewise.inquiry import Grid
+from probewise.priors import Normal, Product
+from probewise.scene import Circle, Field, HypothesisScene
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels
+
+TRUE = FixedMixture([0.6, 0.4], [[0.5, 1.5], [0.0, -1.0]], [[[16.0, 2.0], [2.0, 9.0]], [[30.0, 0.0], [0.0, 12.0]]])
+SENSOR = Product(
+    {
+        "log_size_u": Normal(0.0, 0.3),
+        "log_size_v": Normal(0.0, 0.3),
+        "shift_u_mm": Normal(0.0, 1.0),
+        "shift_v_mm": Normal(0.0, 1.0),
+        "I_min": Normal(10.0, 1.5),
+        "I_max": Normal(60.0, 1.5),
+    }
+)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def test_no_adjustment_is_the_calibrated_footprint():
+    adjusted = AdjustedMixture(TRUE).footprint(np.zeros((1, 4)))
+    for name in ("weight", "u_mm", "v_mm", "var_u", "var_v", "cov_uv"):
+        np.testing.assert_allclose(getattr(adjusted, name), getattr(TRUE.footprint(np.empty((1, 0))), name))
+
+
+def test_an_adjustment_stretches_about_the_mean_and_shifts():
+    """By samples of the mixture: stretched along each axis about their mean, then shifted."""
+    theta = np.array([[0.2, -0.4, 1.0, -2.0]])
+    which = rng().random(200_000) < 0.6
+    draws = np.where(
+        which[:, None],
+        rng(1).multivariate_normal(TRUE.means_mm[0], TRUE.covs_mm2[0], 200_000),
+        rng(2).multivariate_normal(TRUE.means_mm[1], TRUE.covs_mm2[1], 200_000),
+    )
+    moved = TRUE.mean_mm + (draws - TRUE.mean_mm) * np.exp(theta[0, :2]) + theta[0, 2:]
+    foot = AdjustedMixture(TRUE).footprint(theta)
+    weight, u, v = foot.weight[0, 0], foot.u_mm[0, 0], foot.v_mm[0, 0]
+    np.testing.assert_allclose([weight @ u, weight @ v], moved.mean(axis=0), atol=0.05)
+    var_u = weight @ (foot.var_u[0, 0] + u**2) - (weight @ u) ** 2
+    cov = weight @ (foot.cov_uv[0, 0] + u * v) - (weight @ u) * (weight @ v)
+    np.testing.assert_allclose([var_u, cov], [np.var(moved[:, 0]), np.cov(moved.T)[0, 1]], rtol=0.1, atol=0.1)
+
+
+def test_a_change_below_zero_is_refused():
+    with pytest.raises(ParameterError, match="shift_mm"):
+        Change(shift_mm=-1.0)
+
+
+class TrueArm:
+    """Reads the true sensor over a true circle, with unit noise of its own."""
+
+    def __init__(self, circle, truth):
+        self.chain = Chain(TRUE, FixedLevels(10.0, 60.0), HypothesisScene(circle))
+        self.truth, self.noise = np.array([truth]), rng(5)
+
+    def reachable(self, places_mm):
+        return np.ones(len(places_mm), bool)
+
+    def orientation_rad(self, places_mm):
+        return np.zeros(len(places_mm))
+
+    def travel_s(self, start, places_mm):
+        return np.ones(len(places_mm))
+
+    def measure(self, pose):
+        plan = Grid(2.0, 2.0, 2, 2).plan("field").take(np.array([0]))
+        plan = replace(plan, x_mm=np.array([pose.x_mm]), y_mm=np.array([pose.y_mm]))
+        value = self.chain.predict(self.truth, plan)[0, 0] + self.noise.standard_normal()
+        return Reading(float(value), pose, 0.0)
+
+
+@pytest.mark.slow
+def test_a_footprint_taken_for_a_half_too_wide_is_put_right(small):
+    """Within five sds; the wrong SSF taken for true is off by more than it states."""
+    circle = Circle(Field(400.0, 300.0), (40.0, 100.0), True)
+    wide = FixedMixture(TRUE.weights, TRUE.means_mm, TRUE.covs_mm2 * 1.5**2)
+    truth = (220.0, 150.0, 70.0)
+    options = {"shape": circle, "likelihood": GaussianKnown(1.0), "n_particles": 1500, "stop_sd_mm": 1.0}
+    scene = HypothesisScene(circle)
+    learning = small.experiment(
+        model=Chain(AdjustedMixture(wide), FreeLevels(), scene, n_nodes=FAST_NODES), sensor_prior=SENSOR, **options
+    )
+    found = run(TrueArm(circle, truth), learning, rng=rng(), max_readings=25)
+    assert (np.abs(found.last.mean - truth) < 5 * found.last.sd).all()
+    assert found.last.names == ("x_mm", "y_mm", "radius_mm")
+    assert found.last.samples.shape[1] == 3
+    size, error = found.last.sensor["log_size_u"]
+    assert abs(size - np.log(1 / 1.5)) < 5 * error
+    assert "log_size_u" in found.summary()

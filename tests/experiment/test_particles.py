@@ -1,0 +1,170 @@
+"""The posterior that is carried from reading to reading, against integrals over a lattice of all hypotheses."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from probewise.arm.instrument import Pose, Reading
+from probewise.errors import ParameterError
+from probewise.experiment.judging import information
+from probewise.experiment.kernels import LocalKernels
+from probewise.experiment.particles import Block, prior_particles, update
+from probewise.nested import run
+from probewise.priors import Product, Uniform
+
+READINGS = [(120.0, 80.0, 10.3), (300.0, 200.0, 9.6), (250.0, 140.0, 59.2), (250.0, 203.0, 36.0), (190.0, 140.0, 41.5)]
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def whole(theta):
+    return (Block(np.arange(len(theta)), np.arange(theta.shape[1])),)
+
+
+def never():
+    raise AssertionError("no reading here is a surprise")
+
+
+def noisy(small):
+    return small.experiment(likelihood=small.gaussian(4.0), noise_sd=4.0)
+
+
+def problem_of(small, n):
+    """Noise of 4 units, so that a lattice of 2 mm can add up what is as sharp as 1.6 mm."""
+    return noisy(small).problem([Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS[:n]])
+
+
+def carried(small, *, n_particles=3000, seed=0, steps=5):
+    random = rng(seed)
+    posterior = prior_particles(problem_of(small, 0).prior, n_particles, rng=random)
+    for n in range(1, steps + 1):
+        posterior = update(posterior, problem_of(small, n), rng=random, fall_back=never, blocks=whole)
+    return posterior
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    """Every hypothesis of the small prior at 2 mm: x, y, radius."""
+    axes = np.meshgrid(np.arange(1, 400, 2.0), np.arange(1, 300, 2.0), np.arange(21, 150, 2.0), indexing="ij")
+    return np.stack([axis.ravel() for axis in axes], axis=1)
+
+
+def by_lattice(small, lattice, n):
+    """log Z, mean and sd by adding up; see `problem_of`."""
+    problem = problem_of(small, n)
+    log_likelihood = np.concatenate([problem.log_likelihood(part) for part in np.array_split(lattice, 100)])
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    mean = weight @ lattice
+    return float(logsumexp(log_likelihood)) - math.log(len(lattice)), mean, np.sqrt(weight @ (lattice - mean) ** 2)
+
+
+@pytest.mark.parametrize("n", [2, 4, 5])
+def test_evidence_and_moments_are_those_of_adding_up_all_hypotheses(small, lattice, n):
+    """log Z within five of its stated errors (0.05 besides, for the lattice); means within 15 % of the sds."""
+    posterior = carried(small, steps=n)
+    log_z, mean, sd = by_lattice(small, lattice, n)
+    assert posterior.log_z == pytest.approx(log_z, abs=5 * posterior.log_z_error + 0.05)
+    np.testing.assert_allclose(posterior.mean(), mean, atol=0.15 * sd.max())
+    np.testing.assert_allclose(posterior.sd(), sd, rtol=0.12)
+
+
+def test_the_stated_error_of_the_evidence_is_its_scatter(small):
+    """Twelve seeds: a chi-square of 11 degrees of freedom, 1e-4 on either side, and a factor for correlations."""
+    runs = [carried(small, n_particles=600, seed=seed) for seed in range(12)]
+    z = (np.array([r.log_z for r in runs]) - np.mean([r.log_z for r in runs])) / np.array([r.log_z_error for r in runs])
+    assert 1.6 < (z**2).sum() < 4 * 36.0
+
+
+def test_samples_stay_distinct(small):
+    posterior = carried(small)
+    assert len(np.unique(posterior.theta, axis=0)) > 0.85 * len(posterior.theta)
+    assert posterior.n_eff >= 0.5 * len(posterior.theta)
+
+
+def test_one_seed_gives_one_posterior(small):
+    one, again = carried(small, n_particles=300), carried(small, n_particles=300)
+    np.testing.assert_array_equal(one.theta, again.theta)
+    assert one.log_z == again.log_z
+
+
+def test_a_reading_that_surprises_is_taken_in_from_scratch(small):
+    """A posterior certain of the left half, then a reading on white in the right one."""
+    problem = problem_of(small, 3)
+    theta = problem.prior.from_unit_cube(rng().random((500, 3)))
+    theta[:, 0] *= 0.2
+    even = np.full(500, -math.log(500))
+    start = prior_particles(problem.prior, 500, rng=rng())
+    before = type(start)(start.names, theta, np.zeros(500), even, 0.0, 0.0, 500.0, 0, -math.inf)
+    found = update(before, problem, rng=rng(1), fall_back=lambda: run(problem, rng=rng(2), n_live=100), blocks=whole)
+    assert found.run is not None
+    assert found.log_z == found.run.log_z
+    assert found.mean()[0] == pytest.approx(250.0, abs=40.0)
+    assert len(found.theta) == 500
+
+
+class Window:
+    """Allows readings within five units, and no others."""
+
+    def log_prob(self, readings, predicted):
+        return np.where((np.abs(readings - predicted) < 5.0).all(axis=1), 0.0, -np.inf)
+
+
+def test_hypotheses_that_are_ruled_out_stay_so(small):
+    """A likelihood of zero or one: the evidence is the share of the prior that every reading leaves."""
+    experiment = small.experiment(likelihood=Window())
+    random, posterior = rng(), prior_particles(experiment.prior, 3000, rng=rng(1))
+    readings = [Reading(10.0, Pose(x, y), 0.0) for x, y in ((120.0, 80.0), (300.0, 200.0), (60.0, 250.0))]
+    for n in range(1, 4):
+        posterior = update(posterior, experiment.problem(readings[:n]), rng=random, fall_back=never, blocks=whole)
+    theta = experiment.prior.from_unit_cube(rng(2).random((200_000, 3)))
+    left = np.isfinite(experiment.problem(readings).log_likelihood(theta)).mean()
+    assert math.exp(posterior.log_z) == pytest.approx(left, rel=5 * posterior.log_z_error + 0.02)
+    assert information(posterior) == pytest.approx(-posterior.log_z)
+
+
+def test_a_missing_reading_changes_nothing(small):
+    before = carried(small, n_particles=300, steps=3)
+    readings = [Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS[:3]]
+    problem = noisy(small).problem([*readings, Reading(math.nan, Pose(10.0, 10.0), 1.0)])
+    after = update(before, problem, rng=rng(), fall_back=never, blocks=whole)
+    np.testing.assert_allclose(after.log_weight, before.log_weight)
+    assert after.log_z == pytest.approx(before.log_z)
+
+
+class Massless(Product):
+    """Draws from where its density is zero."""
+
+    def from_unit_cube(self, u):
+        return super().from_unit_cube(u) + 5.0
+
+
+def test_a_prior_without_mass_is_refused():
+    with pytest.raises(ParameterError, match="one with mass"):
+        prior_particles(Massless({"x_mm": Uniform(0.0, 1.0)}), 100, rng=rng())
+
+
+def test_kernels_have_the_density_of_the_gaussians_they_draw_from():
+    """Two routes to the density: the product of features, and scipy's for each kernel."""
+    points = rng().normal(size=(400, 3)) * [30.0, 1.0, 8.0] + [500.0, 200.0, 80.0]
+    kernels = LocalKernels.about(points, rng=rng(1))
+    at = kernels.draw(50, rng=rng(2))
+    each = [
+        multivariate_normal(kernels.origin + centre, root @ root.T).pdf(at)
+        for centre, root in zip(kernels.centre, kernels.root, strict=True)
+    ]
+    np.testing.assert_allclose(kernels.log_density(at), np.log(np.mean(each, axis=0)), atol=1e-4)
+
+
+def test_kernels_follow_a_bent_shell():
+    """Points within 0.2 of a circle of radius 100: draws stay within a few times that, one covariance would not."""
+    angle = rng().uniform(0, 2 * np.pi, 3000)
+    radius = 100.0 + 0.2 * rng(1).standard_normal(3000)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    away = np.hypot(*LocalKernels.about(points, rng=rng(2)).draw(2000, rng=rng(3)).T) - 100.0
+    assert np.quantile(np.abs(away), 0.9) < 0.8

@@ -1,0 +1,46 @@
+"""Readings that are rounded have the probability of their cell."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from probewise.errors import ParameterError
+from probewise.inference import GaussianKnown, Rounded
+
+PREDICTED = np.linspace(0.0, 110.0, 221)[:, None]
+
+
+@pytest.mark.parametrize("reading", [1.0, 2.0, 47.0, 99.0, 100.0])
+def test_a_reading_has_the_mass_of_its_cell(reading):
+    upper = np.inf if reading == 100 else reading + 0.5
+    lower = -np.inf if reading == 1 else reading - 0.5
+    mass = norm.cdf(upper, PREDICTED, 1.2) - norm.cdf(lower, PREDICTED, 1.2)
+    far = mass < 1e-8
+    found = Rounded(1.2, 1.0, 1.0, 100.0).log_prob(np.array([reading]), PREDICTED)
+    np.testing.assert_allclose(found[~far[:, 0]], np.log(mass[~far]), atol=2e-4)
+    assert np.isfinite(found).all()
+    assert (found[far[:, 0]] < -18).all()
+
+
+def test_all_readings_together_have_mass_one():
+    readings = np.arange(1.0, 101.0)
+    each = [Rounded(0.4, 1.0, 1.0, 100.0).log_prob(np.array([r]), np.array([[37.3]]))[0] for r in readings]
+    assert np.exp(each).sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_fine_steps_are_a_density_times_the_step():
+    readings, predicted = np.array([30.0, 31.0]), np.array([[30.4, 29.0], [31.0, 31.0]])
+    density = GaussianKnown(2.0).log_prob(readings, predicted) + 2 * np.log(0.01)
+    np.testing.assert_allclose(Rounded(2.0, 0.01).log_prob(readings, predicted), density, atol=1e-3)
+
+
+def test_far_readings_fall_off_like_the_gaussians_tail():
+    rounded = Rounded(0.1)
+    found = rounded.log_prob(np.array([50.0]), np.array([[10.0], [25.0]]))
+    np.testing.assert_allclose(found, norm.logsf([395.0, 245.0]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("change", [{"sd": 0.0}, {"step": -1.0}, {"low": 3.0, "high": 1.0}])
+def test_options_out_of_range_are_refused(change):
+    with pytest.raises(ParameterError):
+        Rounded(**{"sd": 1.0, **change})

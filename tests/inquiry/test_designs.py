@@ -1,0 +1,50 @@
+"""The readings that may be taken: places, orientations, repeats, other settings, and what they cost."""
+
+import numpy as np
+import pytest
+
+from probewise.errors import ParameterError
+from probewise.inquiry import Design, Designs, Grid
+
+SMALL = Grid(2.0, 1.0, 3, 2)
+
+
+def test_every_combination_stands_at_every_place():
+    designs = Designs(SMALL, (0.0, 1.5), (1, 3), (("height_mm", (8.0, 14.0)),))
+    plan = designs.plan("field", time_s=7.0)
+    assert len(designs) == len(plan) == 6 * 8
+    for row in range(len(designs)):
+        design = designs[row]
+        assert (design.x_mm, design.y_mm) == (plan.x_mm[row], plan.y_mm[row])
+        assert design.orientation_rad == plan.orientation_rad[row]
+        assert design.repeats == designs.n_repeats[row]
+        assert dict(design.settings) == {"height_mm": plan.covariates["height_mm"][row]}
+    assert len({designs[row] for row in range(len(designs))}) == len(designs)
+    assert (plan.time_s == 7.0).all()
+    assert (plan.direction == 0).all()
+
+
+def test_the_default_is_one_reading_a_place():
+    designs = Designs(SMALL)
+    assert designs[4] == Design(1.0, 1.0)
+    assert len(designs) == 6
+
+
+def test_repeats_cost_their_reading_time():
+    designs = Designs(SMALL, repeats=(1, 5))
+    cost = designs.cost_s(np.arange(6.0), 1.2).reshape(2, 6)
+    np.testing.assert_allclose(cost, [np.arange(6.0), np.arange(6.0) + 4.8])
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"orientations_rad": ()}, "orientations_rad"),
+        ({"repeats": (0,)}, "repeats"),
+        ({"settings": (("height_mm", ()),)}, "height_mm"),
+        ({"orientations_rad": (np.nan,)}, "orientations_rad"),
+    ],
+)
+def test_designs_that_are_none_are_refused(change, name):
+    with pytest.raises(ParameterError, match=name):
+        Designs(SMALL, **change)

@@ -1,0 +1,106 @@
+"""The table of what a sensor reads of a disc, against the sensor model itself."""
+
+import time
+
+import numpy as np
+import pytest
+
+from probewise.effects import VOCABULARY
+from probewise.inquiry import AskedForecast, Designs, DiscTable, Grid, InformationGain, forecast_of, utility_map
+from probewise.scene import Circle, HypothesisScene, Rectangle
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+
+LEVELS = np.linspace(10.0, 60.0, 101)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def places():
+    return Designs(Grid(), (0.0, 0.7, -2.0)).plan("field").take(rng(1).integers(3 * 8515, size=400))
+
+
+def test_the_table_predicts_what_the_model_does_at_any_place_and_orientation(made, places):
+    """Two routes: quadrature of 64 nodes for every pair, and the interpolated table; the levels are 50 apart."""
+    theta = made.circles(60)
+    table = DiscTable.of(made.chain())
+    away = np.abs(table.predict(theta, places) - made.chain().predict(theta, places))
+    assert away.max() < 0.03
+    assert np.sqrt((away**2).mean()) < 0.001
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(made, turn):
+    """On a subset of places: by rounding a hypothesis may count for the next level, but the mean stays."""
+    theta, grid = made.circles(300), Grid()
+    weight = rng(2).dirichlet(np.ones(300))
+    mass = DiscTable.of(made.chain()).mass(theta, weight, grid, LEVELS, np.full(grid.n_places, turn))
+    rows = rng(3).integers(grid.n_places, size=300)
+    answers = made.chain().predict(theta, grid.plan("field", orientation_rad=turn).take(rows))
+    np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(mass[rows] @ LEVELS, weight @ answers, atol=0.02)
+    counted = np.zeros((300, len(LEVELS)))
+    index = np.rint((answers - 10.0) / 0.5).astype(int)
+    np.add.at(counted, (np.arange(300) + 0 * index, index), np.broadcast_to(weight[:, None], index.shape))
+    apart = np.abs(np.cumsum(counted, axis=1) - np.cumsum(mass[rows], axis=1))
+    assert np.quantile(apart, 0.99) < weight.max()
+
+
+def test_an_orientation_of_each_place_is_that_place_turned(made):
+    theta, grid = made.circles(100), Grid()
+    weight = np.full(100, 0.01)
+    turn = rng(4).uniform(-3, 3, grid.n_places)
+    mass = DiscTable.of(made.chain()).mass(theta, weight, grid, LEVELS, turn)
+    rows = rng(5).integers(grid.n_places, size=200)
+    plan = Designs(grid).plan("field")
+    answers = made.chain().predict(theta, type(plan)(**{**vars(plan), "orientation_rad": turn}).take(rows))
+    np.testing.assert_allclose(mass[rows] @ LEVELS, weight @ answers, atol=0.02)
+
+
+def test_the_naive_sensor_is_counted_exactly(made):
+    theta, grid = made.circles(200), Grid()
+    mass = DiscTable.of(made.naive()).mass(
+        theta, np.full(200, 0.005), grid, np.array([10.0, 60.0]), np.zeros(grid.n_places)
+    )
+    share = (made.naive().predict(theta, grid.plan("field")) > 35).mean(axis=0)
+    np.testing.assert_allclose(mass[:, 1], share, atol=1e-12)
+
+
+def test_discs_that_leave_the_field_or_lie_between_its_rows_are_counted(made):
+    theta = np.array([[0.0, 0.0, 20.0], [1048.0, 520.0, 150.0], [500.3, 260.9, 20.0], [524.0, -10.0, 20.0]])
+    grid = Grid()
+    mass = DiscTable.of(made.chain()).mass(theta, np.full(4, 0.25), grid, LEVELS, np.zeros(grid.n_places))
+    expected = made.chain().predict(theta, grid.plan("field")).mean(axis=0)
+    np.testing.assert_allclose(mass @ LEVELS, expected, atol=0.25)  # one hypothesis a place: its level is rounded
+
+
+def test_only_a_known_sensor_over_one_circle_has_a_table(made):
+    mixture = FixedMixture([1.0], [[0.0, 0.0]], [[[9.0, 0.0], [0.0, 9.0]]])
+    rectangles = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(Rectangle()))
+    assert DiscTable.of(rectangles) is None
+    assert isinstance(forecast_of(rectangles), AskedForecast)
+    wide = FixedMixture([1.0], [[0.0, 0.0]], [[[900.0, 0.0], [0.0, 900.0]]])
+    assert DiscTable.of(Chain(wide, FixedLevels(10.0, 60.0), HypothesisScene(Circle()))) is None
+    assert DiscTable.of(made.chain().with_effects(VOCABULARY["backlash"]())) is None
+
+
+def test_the_information_of_the_table_is_that_of_asking(made):
+    """The same 400 hypotheses by both routes, all places of a coarse grid."""
+    theta, grid = made.circles(400), Grid(n_x=27, n_y=14)
+    quick = made.over_discs(made.chain(20), theta, grid=grid, orientations_rad=(0.0, 1.0))
+    slow = type(quick)(**{**vars(quick), "forecast": AskedForecast(made.chain(20))})
+    bits = InformationGain()(quick)
+    np.testing.assert_allclose(bits, InformationGain()(slow), atol=0.01)
+    assert bits.max() > 0.3
+
+
+def test_the_whole_map_of_3000_hypotheses_is_quick(made):
+    """Aim: 0.1 s of one core; three times that leaves room for a busy machine."""
+    prospect = made.over_discs(made.chain(20), made.circles(3000))
+    utility_map(prospect, InformationGain())
+    again = type(prospect)(**{k: v for k, v in vars(prospect).items() if k in prospect.__dataclass_fields__})
+    start = time.process_time()
+    utility_map(again, InformationGain())
+    assert time.process_time() - start < 0.3

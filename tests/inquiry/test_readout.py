@@ -1,0 +1,54 @@
+"""Noise, rounding and the ends of the scale."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from probewise.errors import ParameterError
+from probewise.inquiry import Readout, entropy_bits
+
+
+def test_the_cells_of_a_rounding_sensor_are_its_readings():
+    levels = np.array([30.2, 47.0])
+    readout = Readout(0.8, 1.0, 1.0, 100.0)
+    chance = readout.probability(levels)
+    edges = readout.edges(levels)
+    np.testing.assert_allclose(edges, np.arange(edges[0], edges[-1] + 0.5))
+    np.testing.assert_allclose(chance.sum(axis=1), 1.0)
+    reading = np.concatenate([[edges[0] - 0.5], edges + 0.5])
+    np.testing.assert_allclose(chance @ reading, levels, atol=1e-5)
+    assert chance[0, reading == 30.0] == pytest.approx(norm.cdf(0.3 / 0.8) - norm.cdf(-0.7 / 0.8))
+
+
+def test_the_ends_of_the_scale_take_all_beyond():
+    readout = Readout(2.0, 1.0, 1.0, 100.0)
+    chance = readout.probability(np.array([0.0, 99.5]))
+    assert chance[0, 0] == pytest.approx(norm.cdf(1.5 / 2.0))
+    assert chance[1, -1] == pytest.approx(norm.sf(0.0))
+
+
+def test_fine_cells_give_the_gaussians_entropy():
+    """The entropy of cells of width w is the differential entropy less log2 w; Sheppard: 0.015 bits more."""
+    bits = entropy_bits(Readout(1.5).probability(np.array([20.0])))[0]
+    assert bits + math.log2(0.75) == pytest.approx(0.5 * math.log2(2 * math.pi * math.e * 1.5**2), abs=0.02)
+
+
+def test_what_is_certain_has_no_entropy():
+    assert entropy_bits(np.array([0.0, 1.0, 0.0])) == 0.0
+    assert entropy_bits(np.full((2, 8), 0.125)) == pytest.approx([3.0, 3.0])
+
+
+def test_a_reading_that_the_sensor_cannot_return_is_refused():
+    readout = Readout(1.0, 1.0, 1.0, 100.0)
+    readout.require(100.0)
+    readout.require(math.nan)
+    with pytest.raises(ParameterError, match=r"reading is 130.0; allowed: 1 to 100, the range of the sensor"):
+        readout.require(130.0)
+
+
+@pytest.mark.parametrize("change", [{"noise_sd": 0.0}, {"step": -1.0}, {"low": 5.0, "high": 5.0}])
+def test_a_readout_out_of_range_is_refused(change):
+    with pytest.raises(ParameterError):
+        Readout(**{"noise_sd": 1.0, **change})

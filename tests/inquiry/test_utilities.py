@@ -1,0 +1,199 @@
+"""What a reading is worth, against counting, quadrature and what must hold of any information."""
+
+from dataclasses import replace
+from math import log2
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.inquiry import (
+    Finishing,
+    FunctionValue,
+    Goal,
+    Grid,
+    InformationAbout,
+    InformationGain,
+    ParameterValue,
+    PerSecond,
+    ReadingEntropy,
+    WhichShape,
+    choose_several,
+    utility_map,
+    utility_named,
+)
+
+APART = [[0.0, 0.0, 0.0], [0.0, 40.0, 40.0], [0.0, 0.0, 80.0], [0.0, 40.0, 120.0]]
+"""Four hypotheses: the first place tells nothing, the second one bit, the third all two."""
+
+
+def by_quadrature(levels, weight, sd):
+    """H(y) - H(noise) of a mixture of Gaussians, bits, on a fine line."""
+    y = np.linspace(min(levels) - 8 * sd, max(levels) + 8 * sd, 20001)
+    density = sum(w * norm.pdf(y, m, sd) for m, w in zip(levels, weight, strict=True))
+    whole = -np.trapezoid(np.where(density > 0, density * np.log2(np.maximum(density, 1e-300)), 0.0), y)
+    return whole - 0.5 * np.log2(2 * np.pi * np.e * sd**2)
+
+
+def test_hypotheses_far_apart_are_told_apart_in_whole_bits(made):
+    np.testing.assert_allclose(InformationGain()(made.listed(APART)), [0.0, 1.0, 2.0], atol=1e-3)
+
+
+def test_predictions_nearer_than_the_noise_tell_what_quadrature_says(made):
+    """Unrounded readings in fine cells lose one percent; levels are rounded to half a noise sd."""
+    table = np.random.default_rng(0).normal(0.0, [[0.5, 1.0, 2.0, 4.0, 8.0]], (40, 5))
+    weight = np.random.default_rng(1).dirichlet(np.ones(40))
+    exact = [by_quadrature(column, weight, 1.0) for column in table.T]
+    bits = InformationGain()(made.listed(table, weight=weight, step=None))
+    np.testing.assert_allclose(bits, exact, atol=0.03)
+
+
+def test_rounding_and_noise_lower_the_information(made):
+    table = np.random.default_rng(2).normal(0.0, 5.0, (100, 20))
+    fine, rounded, noisy = (
+        InformationGain()(made.listed(table, **options))
+        for options in ({"step": None}, {"step": 5.0}, {"noise_sd": 4.0})
+    )
+    assert (rounded < fine).all()
+    assert (noisy < fine).all()
+
+
+def test_the_papers_entropy_counts_disagreement_that_the_noise_hides(made):
+    table = np.random.default_rng(3).normal(0.0, 1.0, (50, 10))
+    prospect = made.listed(table, noise_sd=5.0)
+    assert (ReadingEntropy()(prospect) > 1.5).all()
+    assert (InformationGain()(prospect) < 0.1).all()
+
+
+def test_repeats_tell_more_and_never_more_than_all_there_is(made):
+    table = np.random.default_rng(4).normal(0.0, 1.0, (30, 6))
+    prospect = made.listed(table, step=None, repeats=(1, 4, 16))
+    once, four, sixteen = InformationGain()(prospect).reshape(3, 6)
+    assert (once < four).all()
+    assert (four < sixteen).all()
+    assert (sixteen <= log2(30)).all()
+    narrow = InformationGain()(made.listed(table, step=None, noise_sd=0.5))
+    np.testing.assert_allclose(four, narrow, atol=0.02)
+
+
+def test_information_about_a_label_leaves_the_rest_out(made):
+    """Rows 0, 1 | 2, 3: the second place tells rows of one label apart, the third also the labels."""
+    label = FunctionValue(lambda theta: theta[:, 0], n_bins=2)
+    np.testing.assert_allclose(InformationAbout(label)(made.listed(APART)), [0.0, 0.0, 1.0], atol=1e-3)
+
+
+def test_information_about_everything_is_the_information(made):
+    table = np.random.default_rng(5).normal(0.0, 3.0, (16, 8))
+    prospect = made.listed(table)
+    about = InformationAbout(ParameterValue("row", n_bins=16))(prospect)
+    np.testing.assert_allclose(about, InformationGain()(prospect), atol=1e-3)
+
+
+def test_information_about_a_parameter_is_never_more_than_about_all(made):
+    prospect = made.over_discs(made.chain(20), made.circles(400), grid=Grid(n_x=27, n_y=14))
+    about = InformationAbout(ParameterValue("radius_mm"))(prospect)
+    assert (about <= InformationGain()(prospect) + 1e-3).all()
+    assert about.max() > 0.01
+
+
+def test_worth_a_second_prefers_the_near_place(made):
+    prospect = made.listed(APART, cost_s=[1.0, 1.0, 4.0])
+    np.testing.assert_allclose(PerSecond()(prospect), InformationGain()(prospect) / [1.0, 1.0, 4.0])
+    assert int(np.argmax(PerSecond()(prospect))) == 1
+    with pytest.raises(ParameterError, match="cost_s"):
+        PerSecond()(made.listed(APART, cost_s=[0.0, 1.0, 1.0]))
+
+
+@pytest.mark.parametrize("least", [0.0, 1.5])
+def test_a_chance_that_is_none_is_refused(least):
+    with pytest.raises(ParameterError, match="least"):
+        Finishing(least=least)
+
+
+def test_readings_chosen_together_do_not_repeat_each_other(made):
+    """Two bits in two places of one bit each, a third that repeats the first but for a little less noise's worth."""
+    table = [[0.0, 0.0, 0.0], [0.0, 40.0, 0.0], [40.0, 0.0, 30.0], [40.0, 40.0, 30.0]]
+    chosen = choose_several(made.listed(table), 2, rng=np.random.default_rng(6))
+    assert set(chosen) in ({0, 1}, {1, 2})
+    with pytest.raises(ParameterError, match="n is 0"):
+        choose_several(made.listed(table), 0, rng=np.random.default_rng(6))
+
+
+def test_a_single_reading_chosen_together_is_the_best_one(made):
+    assert choose_several(made.listed(APART), 1, rng=np.random.default_rng(7)) == (2,)
+
+
+def test_a_flat_map_says_so(made):
+    assert utility_map(made.listed([[3.0, 3.0], [3.0, 3.0]]), InformationGain()).flat
+    assert not utility_map(made.listed(APART), InformationGain()).flat
+
+
+def test_a_utility_of_the_wrong_size_or_not_finite_is_refused(made):
+    with pytest.raises(ShapeError, match="one a design"):
+        utility_map(made.listed(APART), lambda prospect: np.zeros(2))
+    with pytest.raises(ParameterError, match="finite"):
+        utility_map(made.listed(APART), lambda prospect: np.full(3, np.nan))
+
+
+@pytest.mark.parametrize(
+    ("name", "utility"),
+    [
+        ("finishing", Finishing()),
+        ("information", InformationGain()),
+        ("entropy", ReadingEntropy()),
+        ("per-second", PerSecond()),
+        ("about:radius_mm", InformationAbout(ParameterValue("radius_mm"))),
+        ("which-shape", InformationAbout(WhichShape())),
+    ],
+)
+def test_a_utility_has_a_name(name, utility):
+    assert utility_named(name) == utility
+
+
+def test_unknown_names_list_those_that_are_known(made):
+    with pytest.raises(ParameterError, match="finishing, information, entropy"):
+        utility_named("entropie")
+    with pytest.raises(ParameterError, match="one of row"):
+        InformationAbout(ParameterValue("radius_mm"))(made.listed(APART))
+    with pytest.raises(ParameterError, match="a set of shapes"):
+        InformationAbout(WhichShape())(made.listed(APART))
+
+
+def narrow(made, goal, *, sd=6.0, seed=0):
+    """A prospect near the end: a disc known to a few millimetres."""
+    theta = np.array([500.0, 250.0, 80.0]) + sd * np.random.default_rng(seed).standard_normal((600, 3))
+    prospect = made.over_discs(made.chain(20), theta, grid=Grid(n_x=131, n_y=65))
+    return replace(prospect, goal=goal)
+
+
+def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
+    """Only the radius is asked for, and it is unknown by little more than allowed."""
+    goal = Goal((2,), 5.0)
+    prospect = narrow(made, goal)
+    chance = Finishing()(prospect)
+    assert chance.max() > 0.25
+    assert chance.max() <= 1.0
+    best = int(chance.argmax())
+    assert chance[best] == pytest.approx(by_importance(made, prospect, goal, best), abs=0.06)
+
+
+def by_importance(made, prospect, goal, design, n=4000):
+    """Draw readings from every hypothesis, reweigh all by each, count how often the sds are small enough."""
+    level = made.chain(20).predict(prospect.theta, prospect.plan.take(np.array([design])))[:, 0]
+    rng = np.random.default_rng(1)
+    reading = rng.choice(level, n) + rng.standard_normal(n)
+    weight = np.exp(-0.5 * (reading[:, None] - level) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    lengths = prospect.theta[:, goal.columns]
+    spread = weight @ lengths**2 - (weight @ lengths) ** 2
+    return (spread < goal.sd**2).all(axis=1).mean()
+
+
+def test_far_from_the_end_or_without_a_goal_information_decides(made):
+    far = narrow(made, Goal((0, 1, 2), 0.2))
+    np.testing.assert_array_equal(Finishing()(far), InformationGain()(far))
+    goalless = narrow(made, None)
+    np.testing.assert_array_equal(Finishing()(goalless), InformationGain()(goalless))
+    hopeless = narrow(made, Goal((0, 1, 2), 1.0))
+    np.testing.assert_array_equal(Finishing()(hopeless), InformationGain()(hopeless))

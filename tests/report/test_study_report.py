@@ -1,0 +1,72 @@
+"""The page of a study: every row, with its numbers and their errors."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from probewise.report import plots
+from probewise.report import study as report
+from probewise.study import REFERENCE, Row, Study
+
+ROWS = [REFERENCE, Row(model="naive")]
+
+
+def trial(rng, mean):
+    n = int(rng.poisson(mean)) + 2
+    reached = bool(n < 40)
+    return {
+        "reached": reached,
+        "readings": n if reached else 40,
+        "first_white": 2,
+        "bits": 22.0,
+        "bits_at_white": 9.0,
+        "error_mm": float(rng.exponential(1.0)),
+        "chance_wrong": 1e-4,
+        "held": [True, True, True],
+        "arm_s": 4.0 * n,
+        "cpu_s": 0.2,
+        "widest_mm": np.geomspace(300.0, 3.0, n).round(2).tolist(),
+        "p_value": 0.4,
+    }
+
+
+@pytest.fixture(scope="module")
+def study():
+    rng = np.random.default_rng(0)
+    return Study({row: tuple(trial(rng, 10 * (k + 1)) for _ in range(30)) for k, row in enumerate(ROWS)}, 40)
+
+
+def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
+    page = report.write_page(study, command="probewise study")
+    needed = study.table()[REFERENCE].mean.value
+    assert f"{needed:.1f}" in page.split("<figure>")[0]
+    assert all(row.name in page for row in ROWS)
+    assert "http" not in page
+    assert page.count("data:image/png") == 2
+
+
+def test_the_csv_holds_every_number_and_its_bounds(study):
+    rows = list(csv.DictReader(io.StringIO(report.table_csv(study))))
+    assert [row["row"] for row in rows] == [row.name for row in ROWS]
+    for row, summary in zip(rows, study.table().values(), strict=True):
+        assert float(row["mean"]) == pytest.approx(summary.mean.value, rel=1e-5)
+        assert float(row["mean_low"]) < float(row["mean"]) < float(row["mean_high"])
+        assert "cpu" not in ",".join(row)
+
+
+def test_each_curve_is_the_median_of_its_runs():
+    widths = [np.array([100.0, 10.0, 2.0]), np.array([200.0, 50.0, 30.0, 3.0]), np.array([300.0, 3.0])]
+    ax = plots.widths_of_runs({"some": widths})
+    drawn = ax.lines[0].get_ydata()
+    # A run that has ended stays at its last width.
+    np.testing.assert_allclose(drawn, [200.0, 10.0, 3.0, 3.0])
+    assert "mm" in ax.get_ylabel()
+
+
+def test_what_rows_need_is_drawn_with_its_bounds(study):
+    axes = plots.readings_needed({row.name: found for row, found in study.table().items()})
+    assert [text.get_text() for text in axes[0, 0].get_yticklabels()] == [row.name for row in ROWS]
+    assert len(axes[0, 0].containers) == 2
+    assert len(axes[0, 1].containers) == 1

@@ -19,16 +19,19 @@ from probewise.diagnosis.coordinates import (
 )
 from probewise.diagnosis.covariates import Covariate
 from probewise.diagnosis.evidence import SCALES, Blocks, Linearised, block_log_bayes_factors
+from probewise.diagnosis.fit import Fit, Model
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import places, windows
 from probewise.diagnosis.noise import NoiseModel, Whitener, noise_statistics, steps_within_scans, white
+from probewise.diagnosis.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.verdict import Hypothesis, credible_set, decide
-from probewise.effects import VOCABULARY, CorrelatedNoise, Extent
+from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
-from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform
+from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, two_way_plan
+from probewise.recordings.plans import jittered
 from probewise.sensor import footprint_of
 
-EXTENT = Extent(10.0, 60.0, 100.0, 600.0)
+EXTENT = Extent(10.0, 60.0, jittered(two_way_plan(), rng=np.random.default_rng(0)))
 
 
 def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
@@ -84,6 +87,36 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
     np.testing.assert_allclose(drawn[:, 1:].std(axis=0), theta[:, 1:8].std(axis=0), rtol=0.06)
     with pytest.raises(ParameterError, match=r"sensor\.names"):
         sensor_from_posterior(("x",), np.zeros(1), np.eye(1))
+
+
+def test_the_evidence_of_one_variant_becomes_that_of_the_choice():
+    """Route two: the mean of all variants' Bayes factors, by hand."""
+    one = (np.zeros((5, 1)),) * 5
+    templates = EffectTemplates(one, one, (Backlash(),) * 3, np.array([0, 0, 1, 2, 2]))
+    scores = np.log([1.0, 3.0, 10.0, 5.0, 1.0])
+    np.testing.assert_allclose(templates.weights(scores), [0.2, 0.5, 0.3])
+    alone = math.log(10.0)
+    assert alone + templates.log_share(2, scores) == pytest.approx(math.log((4.0 + 10.0 + 6.0) / 3))
+
+
+def test_templates_of_a_variant_are_what_its_scans_change():
+    """Route one: in its own scans alone; route two: the whole plan with and without it."""
+    plan = two_way_plan()
+    sensor = default_sensor(EXTENT, 1)
+    model = Model(sensor, (), plan)
+    z = np.full(sensor.n_params, 0.2)
+    predicted = model.predict(z[None, :])[0]
+    usable = np.flatnonzero(np.arange(len(plan)) % 7)
+    found = Fit(model, z, predicted[usable], np.zeros(len(usable)), np.zeros((len(usable), 7)), 1.0, 0.0)
+    for name in ("scan_misplacement", "height_offset", "ambient_step", "lag"):
+        effect = VOCABULARY[name].for_extent(EXTENT)
+        templates = effect_templates(found, effect, usable)
+        assert len(templates.columns) == len(templates.settings) == len(templates.choice)
+        for at in range(0, len(templates.choice), 9):
+            richer = model.with_effect(templates.variant(at))
+            theta = np.concatenate([sensor.theta(z[None, :]), templates.settings[at]], axis=1)
+            change = richer.chain.predict(theta, plan)[0] - predicted
+            np.testing.assert_allclose(templates.columns[at][:, 0], change[usable], atol=1e-7)
 
 
 @pytest.mark.parametrize("name", VOCABULARY)
@@ -256,6 +289,7 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
         ({"clean": 0.2, "backlash": 0.8}, "named", ("backlash",)),
         ({"clean": 0.2, "backlash": 0.4, "lag": 0.4}, "cannot_tell", ("backlash",)),
         ({"clean": 0.1, "backlash": 0.4, "glint": 0.3, "lag": 0.2}, "cannot_tell", ("backlash",)),
+        ({"clean": 0.1, "backlash": 0.4, "tilt": 0.2, "glint": 0.3}, "cannot_tell", ("backlash",)),
         ({"clean": 0.1, "correlated_noise": 0.9}, "noise", ("correlated_noise",)),
         ({"clean": 0.1, "backlash__correlated_noise": 0.9}, "named", ("backlash", "correlated_noise")),
         ({"clean": 0.45, "glint": 0.3, "lag": 0.25}, "cannot_tell", ()),
@@ -263,7 +297,7 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
     ],
 )
 def test_verdicts_follow_the_probabilities(probability, verdict, combination):
-    aliases = (Alias(("backlash", "lag"), 0.99, "scan backwards", 8),)
+    aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
     assert decide(hypotheses(**probability), NOISE, aliases) == (verdict, combination)
 
 

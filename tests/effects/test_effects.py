@@ -1,28 +1,45 @@
-"""Every effect of the vocabulary keeps the contract of an effect, and does what the vocabulary says."""
+"""Every effect of the vocabulary keeps the contract of an effect; the priors are what they say."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import permutations
+
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from probewise.effects import (
     VOCABULARY,
+    AlbedoGradient,
     AmbientGradient,
+    AmbientStep,
     Backlash,
     CorrelatedNoise,
+    EdgeMisplacement,
     Extent,
+    Flicker,
     GainDrift,
+    Glint,
+    Halo,
     HeavyTailed,
+    HeightOffset,
+    Lag,
     LogHeavyTailed,
     Nonlinearity,
+    PeriodicPositionError,
     Saturation,
+    ScanAngleError,
+    ScanMisplacement,
 )
+from probewise.effects.spots import scanned_lines
 from probewise.errors import ParameterError
-from probewise.recordings import HalfPlane, Plan, Recording
-from probewise.sensor import NoiseLevel, Poses, Stage
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, two_way_plan
+from probewise.recordings.plans import jittered
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel, Stage
 
-EXTENT = Extent(10.0, 60.0, 100.0, 600.0)
+PLAN = jittered(two_way_plan(), rng=np.random.default_rng(0))
+EXTENT = Extent(10.0, 60.0, PLAN)
 
 
 def there_and_back() -> Plan:
@@ -40,6 +57,12 @@ def there_and_back() -> Plan:
     )
 
 
+def base() -> Chain:
+    return Chain(
+        FixedMixture([1.0], [[0.5, 1.5]], [[[16.0, 1.0], [1.0, 9.0]]]), FixedLevels(10, 60), KnownScene(PLAN.patterns)
+    )
+
+
 @pytest.mark.parametrize("name", VOCABULARY)
 def test_every_effect_keeps_the_contract(name):
     effect = VOCABULARY[name].for_extent(EXTENT)
@@ -48,28 +71,81 @@ def test_every_effect_keeps_the_contract(name):
     assert isinstance(effect.stage, Stage)
     assert len(effect.units) == len(names)
     assert effect.covariates
-    bank = effect.bank()
-    assert bank.ndim == 3
-    assert bank.shape[2] == len(names)
-    assert np.isfinite(effect.prior.log_prob(bank.reshape(-1, len(names)))).all()
-    said = effect.sentence(bank[0, 0], np.abs(bank[0, 0]) / 10 + 1e-6)
-    assert said[0].islower()
-    assert any(c.isdigit() for c in said)
+    for variant in (effect.variants()[0], effect.variants()[-1]):
+        bank = variant.bank()
+        assert bank.ndim == 3
+        assert bank.shape[2] == len(names)
+        assert variant.prior.names == names
+        assert np.isfinite(variant.prior.log_prob(bank.reshape(-1, len(names)))).all()
+        said = variant.sentence(bank[0, 0], np.abs(bank[0, 0]) / 10 + 1e-6)
+        assert said[0].islower()
+        assert any(c.isdigit() for c in said)
+        assert all(scan in said for scan in variant.scans)
+        assert len(variant.variants()) == len(effect.variants())
     VOCABULARY[name]()  # a sensor file needs its function only, whatever the prior's scale
+
+
+@pytest.mark.parametrize("name", [name for name, kind in VOCABULARY.items() if kind.stage is not Stage.NOISE])
+def test_every_setting_of_every_bank_changes_finite_readings(name):
+    """And what is an amplitude does nothing at zero."""
+    effect = VOCABULARY[name].for_extent(EXTENT)
+    plain = base().predict(np.zeros((1, 0)), PLAN)
+    changed = 0.0
+    for variant in effect.variants()[:: max(len(effect.variants()) // 6, 1)]:
+        settings = variant.bank().reshape(-1, len(variant.prior.names))[:40]
+        chain = base().with_effects(variant)
+        readings = chain.predict(settings, PLAN)
+        assert readings.shape == (len(settings), len(PLAN))
+        assert np.isfinite(readings).all()
+        changed = max(changed, float(np.abs(readings - plain).max()))
+        if effect.amplitudes:
+            none = settings.copy()
+            none[:, effect.amplitudes] = 0.0
+            np.testing.assert_allclose(chain.predict(none, PLAN), np.repeat(plain, len(none), axis=0), atol=1e-9)
+    assert changed > 1e-3
 
 
 @pytest.mark.parametrize("name", VOCABULARY)
 def test_a_prior_maps_the_unit_cube_to_its_own_density(name):
-    """Route one: draws through the cube; route two: the density integrated over their inner 90 %."""
+    """Route one: the density; route two: the determinant of the way back to the cube, by central differences."""
     prior = VOCABULARY[name].for_extent(EXTENT).prior
-    u = np.random.default_rng(1).random((4000, len(prior.names)))
+    n_params = len(prior.names)
+    u = np.random.default_rng(1).uniform(0.1, 0.9, (50, n_params))
     theta = prior.from_unit_cube(u)
-    assert np.isfinite(prior.log_prob(theta)).all()
-    for k, marginal in enumerate(prior.marginals.values()):
-        low, high = marginal.from_unit(np.array([0.3, 0.8]))
-        mass, _ = quad(lambda x, m=marginal: float(np.exp(m.log_prob(np.array(x)))), low, high, limit=400)
-        assert mass == pytest.approx(0.5, abs=2e-4)
-        assert np.mean((theta[:, k] > low) & (theta[:, k] < high)) == pytest.approx(0.5, abs=0.04)
+    np.testing.assert_allclose(prior.to_unit_cube(theta), u, atol=1e-9)
+    slopes = np.empty((50, n_params, n_params))
+    for k in range(n_params):
+        step = np.zeros_like(theta)
+        step[:, k] = 1e-5 * np.abs(theta[:, k]) + 1e-9 * np.ptp(theta[:, k])
+        rise = prior.to_unit_cube(theta + step) - prior.to_unit_cube(theta - step)
+        slopes[:, :, k] = rise / (2 * step[:, k : k + 1])
+    np.testing.assert_allclose(np.exp(prior.log_prob(theta)), np.abs(np.linalg.det(slopes)), rtol=2e-4)
+
+
+def test_lines_are_found_whichever_way_they_were_scanned():
+    """The two-way plan goes along X, forth and back, and once along Y; a turned plan along its own line."""
+    along_x, along_y = scanned_lines(PLAN)
+    assert (along_x.angle_rad, along_x.offset_mm, along_x.low_mm, along_x.high_mm) == (0.0, 0.0, -50.0, 50.0)
+    assert along_y.angle_rad == pytest.approx(np.pi / 2)
+    assert (along_y.offset_mm, along_y.low_mm, along_y.high_mm) == pytest.approx((5.0, -60.0, 60.0))
+    line = paper_plan().take(np.arange(101))
+    c, s = np.cos(0.4), np.sin(0.4)
+    (found,) = scanned_lines(replace(line, x_mm=c * line.x_mm - s * 7, y_mm=s * line.x_mm + c * 7))
+    assert (found.angle_rad, found.offset_mm, found.length_mm) == pytest.approx((0.4, 7.0, 100.0))
+    x, y = found.place(np.array([3.0]), np.array([-2.0]))
+    np.testing.assert_allclose(found.coordinates(x, y), [[3.0], [-2.0]], atol=1e-12)
+
+
+def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():
+    """In the cube's coordinates the distance from the line changes no reading, and the height keeps up with it."""
+    glint = VOCABULARY["glint"].for_extent(EXTENT).variants()[0]
+    u = np.repeat([[0.8, 0.55, 0.5, 0.6]], 5, axis=0)
+    u[:, 2] = (0.02, 0.3, 0.5, 0.7, 0.98)
+    theta = glint.prior.from_unit_cube(u)
+    assert np.ptp(theta[:, 2]) > 2 * theta[0, 3]
+    on_line = PLAN.take(PLAN.y_mm == 0)
+    readings = glint.apply(np.zeros((5, len(on_line))), theta, on_line)
+    np.testing.assert_allclose(readings, np.repeat(readings[:1], 5, axis=0), atol=1e-12)
 
 
 def test_a_heavy_tail_is_exact_at_both_ends():
@@ -90,12 +166,110 @@ def test_a_heavy_tail_refuses_a_size_of_zero():
         HeavyTailed(0.0)
 
 
-def test_backlash_leaves_the_sensor_behind_whichever_way_it_came():
-    plan = there_and_back()
-    poses = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
-    moved = Backlash().apply(poses, np.array([[0.4]]), plan)
-    np.testing.assert_allclose(moved.x_mm[0] - plan.x_mm, [-0.2, -0.2, -0.2, 0.2, 0.2, 0.2])
-    np.testing.assert_allclose(moved.y_mm[0], 0.0)
+def test_an_effect_that_could_not_show_is_not_built():
+    """The paper's plan goes one way, with no battery; one scan has no other to differ from; a spot has no X."""
+    plan = replace(paper_plan(), covariates={})
+    one_way = Extent(10.0, 60.0, plan)
+    missing = {name for name, kind in VOCABULARY.items() if kind.for_extent(one_way) is None}
+    assert missing == {"hysteresis", "battery_sag"}
+    one_scan = Extent(10.0, 60.0, plan.take(np.arange(101)))
+    missing = {name for name, kind in VOCABULARY.items() if kind.for_extent(one_scan) is None}
+    assert missing == {"hysteresis", "battery_sag", "scan_misplacement", "scan_angle_error", "height_offset"}
+    nowhere = Extent(10.0, 60.0, plan.take(np.arange(404, 405)))
+    assert PeriodicPositionError.for_extent(nowhere) is None
+    assert Glint.for_extent(nowhere) is None
+    assert AmbientStep.for_extent(nowhere) is None
+
+
+def test_effects_of_a_mounting_may_sit_in_each_mounting_and_each_scan():
+    names = PLAN.scan_names
+    at_90 = tuple(name for name in names if "90" in name)
+    for kind in (ScanAngleError, HeightOffset):
+        effect = kind.for_extent(EXTENT)
+        found = [variant.scans for variant in effect.variants()]
+        assert at_90 in found
+        assert [scans for scans in found if len(scans) == 1] == [(name,) for name in names]
+        assert len(found) == len(set(found)) == len(names) + 4
+    assert [v.scans for v in ScanMisplacement.for_extent(EXTENT).variants()] == [(name,) for name in names]
+
+
+def test_effects_of_one_scan_leave_the_others_alone():
+    """Turned, raised or moved in one scan: the readings of all others are those of the plain chain."""
+    plain = base().predict(np.zeros((1, 0)), PLAN)
+    inside = np.array([PLAN.scan_names[k] == "edge_90_out" for k in PLAN.scan])
+    for kind, size in ((ScanAngleError, 20.0), (HeightOffset, 1.0), (ScanMisplacement, 1.0)):
+        effect = next(v for v in kind.for_extent(EXTENT).variants() if v.scans == ("edge_90_out",))
+        found = base().with_effects(effect).predict(np.array([[size]]), PLAN)
+        np.testing.assert_allclose(found[:, ~inside], plain[:, ~inside], atol=1e-9)
+        assert np.abs(found[:, inside] - plain[:, inside]).max() > 0.5
+
+
+def test_effects_stack_alike_whatever_the_order_given():
+    """Three of one stage among others: names, columns and readings do not depend on who came first."""
+    effects = (EdgeMisplacement(), AlbedoGradient(), Flicker(), AmbientGradient(), Backlash(), Halo())
+    sizes = {
+        "edge_misplacement": [0.5],
+        "albedo_gradient": [2e-3, 1e-3],
+        "flicker": [0.5, 0.1, 1.0],
+        "ambient_gradient": [0.01, 0.0],
+        "backlash": [0.4],
+        "halo": [0.05, 25.0],
+    }
+    plan = PLAN.take(np.arange(60, 130, 7))
+    found = []
+    for order in [*permutations(effects)][::97]:
+        chain = base().with_effects(*order)
+        theta = np.array([[x for effect in chain.effects for x in sizes[effect.name]]])
+        found.append((chain.names, chain.predict(theta, plan)))
+    for names, readings in found[1:]:
+        assert names == found[0][0]
+        np.testing.assert_array_equal(readings, found[0][1])
+
+
+def test_the_moments_of_a_step_lie_between_the_readings():
+    step = AmbientStep.for_extent(EXTENT)
+    ends = np.array([variant.between_s for variant in step.variants()])
+    np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1])
+    assert (ends[0, 0], ends[-1, 1]) == (PLAN.time_s.min(), PLAN.time_s.max())
+    short = AmbientStep.for_extent(Extent(0.0, 1.0, paper_plan()))
+    assert len(short.variants()) == 407
+    for variant in (short.variants()[5], short.variants()[-1]):
+        low, high = variant.between_s
+        readings = variant.apply(np.zeros((1, 408)), np.array([[2.0, low + 0.1], [2.0, high - 0.1]]), paper_plan())
+        np.testing.assert_array_equal(readings[0], readings[1])
+        np.testing.assert_array_equal(readings[0], 2.0 * (paper_plan().time_s >= high))
+
+
+def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():
+    step = AmbientStep.for_extent(Extent(0.0, 1.0, there_and_back()))
+    theta = np.full((4000, 2), [1.5, 5.0])
+    weights = np.array([0.0, 0.25, 0.75, 0.0, 0.0])
+    found = step.variants()[2].spread(theta, weights, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(found[:, 0], 1.5)
+    assert (found[:, 1].min() > 10.0, found[:, 1].max() < 30.0) == (True, True)
+    assert np.mean(found[:, 1] < 20.0) == pytest.approx(0.25, abs=0.03)
+    plain = Backlash().spread(theta[:, :1], np.ones(1), rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(plain, theta[:, :1])
+
+
+@pytest.mark.parametrize("kind", [Flicker, PeriodicPositionError])
+def test_sine_and_cosine_join_into_amplitude_and_phase(kind):
+    effect = kind.for_extent(EXTENT)
+    entry = effect.bank()[3]
+    start = effect.start(entry, np.array([1.2, -0.5]))
+    rate = entry[0, 1]
+    x = np.linspace(0, 7, 50)
+    w = 2 * np.pi * (rate if kind is Flicker else 1 / rate)
+    both = entry[0, 0] * (1.2 * np.sin(w * x) - 0.5 * np.cos(w * x))
+    np.testing.assert_allclose(start[0] * np.sin(w * x + start[2]), both, atol=1e-12)
+
+
+def test_frequencies_lie_close_enough_to_find_any():
+    """Half the spacing lets a wave of the whole recording slip by a quarter of a turn at either end, at most."""
+    flicker = Flicker.for_extent(Extent(10.0, 60.0, paper_plan()))
+    frequencies = flicker.bank()[:, 0, 1]
+    assert flicker.highest_hz == pytest.approx(0.5 / 1.2)
+    assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
 
 
 def test_gain_drift_scales_the_signal_and_fades():
@@ -104,10 +278,19 @@ def test_gain_drift_scales_the_signal_and_fades():
     np.testing.assert_allclose(out[0], 50 * (1 + 0.1 * np.exp(-plan.time_s / 20)))
 
 
-def test_stray_light_adds_a_plane_over_the_table():
-    plan = there_and_back()
-    out = AmbientGradient().apply(np.full((1, 6), 20.0), np.array([[0.5, 3.0]]), plan)
-    np.testing.assert_allclose(out[0], 20 + 0.5 * plan.x_mm)
+def test_lag_is_the_recursion_in_every_scan():
+    """v_k = a v_(k-1) + (1 - a) y_k, reading by reading."""
+    rng = np.random.default_rng(3)
+    plan, taus = PLAN.take(np.arange(90, 320)), np.array([[0.3], [1.7], [12.0]])
+    values = rng.normal(size=(3, len(plan)))
+    found = Lag().apply(values, taus, plan)
+    for tau, y, v in zip(taus[:, 0], values, found, strict=True):
+        held = y.copy()
+        for k in range(1, len(plan)):
+            if plan.scan[k] == plan.scan[k - 1]:
+                a = np.exp(-(plan.time_s[k] - plan.time_s[k - 1]) / tau)
+                held[k] = a * held[k - 1] + (1 - a) * y[k]
+        np.testing.assert_allclose(v, held, atol=1e-12)
 
 
 def test_saturation_is_a_hard_limit_as_its_softness_goes_to_zero():
@@ -131,9 +314,20 @@ def test_correlated_noise_sets_the_memory_and_not_the_sd():
     assert out.sd[0, 0] == 0.6
 
 
+def test_a_battery_that_is_not_known_changes_nothing():
+    effect = VOCABULARY["battery_sag"].for_extent(EXTENT)
+    plan = replace(PLAN, covariates={"battery_mv": np.where(np.arange(len(PLAN)) % 2, np.nan, 7500.0)})
+    out = effect.apply(np.full((1, len(PLAN)), 40.0), np.array([[0.1]]), plan)
+    np.testing.assert_allclose(out[0, :4], [38.0, 40.0, 38.0, 40.0])
+    bare = replace(PLAN, covariates={})
+    np.testing.assert_allclose(effect.apply(np.full((1, len(PLAN)), 40.0), np.array([[0.1]]), bare), 40.0)
+
+
 def test_the_extent_of_a_recording_is_its_range_length_and_duration():
     plan = there_and_back()
     extent = Extent.of(Recording(plan, [1.0, 2.0, 5.0, np.nan, 3.0, 2.0]))
-    assert (extent.low, extent.high, extent.length_mm, extent.duration_s) == (1.0, 5.0, 2.0, 50.0)
+    assert (extent.low, extent.high, extent.length_mm, extent.duration_s, extent.gap_s) == (1.0, 5.0, 2.0, 50.0, 10.0)
     with pytest.raises(ParameterError, match="usable readings"):
         Extent.of(Recording(plan, np.full(6, np.nan)))
+    with pytest.raises(ParameterError, match="low < high"):
+        Extent(2.0, 2.0, plan)

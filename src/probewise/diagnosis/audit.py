@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -210,33 +210,36 @@ def next_measurement(
     return None if best is None else best[1]
 
 
-def settle(pair: Alias, found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float) -> Alias:
-    """Say which candidate plan tells two aliased effects apart, and by how many readings.
+def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float) -> list[Alias]:
+    """Say which candidate plan tells aliased effects apart, pair by pair, and by how many readings.
 
     Each effect is taken at the size at which 400 readings would show it at lambda 8; the plan of the
     most expected nats a reading is advised, as many readings of it as three nats take.
     """
-    best: tuple[float, str, int] = (0.0, "", 0)
-    shapes = []
-    for name in pair.effects:
-        effect = effects[name]
-        model = found.model.with_effect(effect)
-        shapes.append((model, np.concatenate([found.z, model.scores_of(effect.bank()[0][:1])[0]])))
+    names = sorted({name for pair in pairs for name in pair.effects})
+    null = found.model.predict(found.z[None, :])[0]
+    shapes = {}
+    for name in names:
+        model = found.model.with_effect(effects[name])
+        z = np.concatenate([found.z, model.scores_of(effects[name].bank()[0][:1])[0]])
+        here = model.predict(z[None, :])[0] - null
+        shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
+    best = {pair.effects: (0.0, pair) for pair in pairs}
     for description, plan in candidate_plans(found.model.plan):
-        looks = []
-        for model, z in shapes:
-            here = model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0]
-            moved, null = replace_plan(model, plan), replace_plan(found.model, plan)
-            there = moved.predict(z[None, :])[0] - null.predict(found.z[None, :])[0]
-            looks.append((here, there / max(float(np.sqrt(np.mean(here**2))), 1e-12) * 0.4 * sd))
-        sign = np.sign(float(looks[0][0] @ looks[1][0])) or 1.0
-        nats = 0.5 * float(np.sum((looks[0][1] - sign * looks[1][1]) ** 2)) / sd**2
-        per_reading = nats / len(plan)
-        if per_reading > best[0]:
-            best = (per_reading, description, min(max(math.ceil(3.0 / per_reading), 1), _MOST_READINGS))
-    if not best[1]:
-        return pair
-    return replace(pair, settle_by=best[1], readings=best[2])
+        null = replace_plan(found.model, plan).predict(found.z[None, :])[0]
+        there = {
+            name: (replace_plan(model, plan).predict(z[None, :])[0] - null) * scale
+            for name, (model, z, _, scale) in shapes.items()
+        }
+        for first, second in best:
+            sign = np.sign(float(shapes[first][2] @ shapes[second][2])) or 1.0
+            nats = 0.5 * float(np.sum((there[first] - sign * there[second]) ** 2)) / sd**2
+            per_reading = nats / len(plan)
+            if per_reading > best[first, second][0]:
+                readings = min(max(math.ceil(3.0 / per_reading), 1), _MOST_READINGS)
+                advised = replace(best[first, second][1], settle_by=description, readings=readings)
+                best[first, second] = (per_reading, advised)
+    return [alias for _, alias in best.values()]
 
 
 def covariance_of(found: Fit) -> FloatArray:

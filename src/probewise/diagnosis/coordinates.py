@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, frozen
 from probewise.effects import Extent, NamedEffect
@@ -143,12 +143,5 @@ def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
 
 
 def effect_scores(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
-    """Invert `effect_values` within the bounds, by bisection on each independent parameter."""
-    low = np.full(values.shape, -FARTHEST + 0.5)
-    high = -low
-    rising = effect_values(effect, high) > effect_values(effect, low)
-    for _ in range(40):
-        middle = (low + high) / 2
-        below = (effect_values(effect, middle) < values) == rising
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.asarray((low + high) / 2)
+    """Invert `effect_values`, within the bounds."""
+    return np.clip(ndtri(effect.prior.to_unit_cube(values)), -FARTHEST + 0.5, FARTHEST - 0.5)

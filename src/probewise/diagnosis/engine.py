@@ -20,7 +20,7 @@ from probewise.diagnosis.audit import (
     settle,
 )
 from probewise.diagnosis.coordinates import SensorCoordinates, sensor_from_posterior
-from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.evidence import Blocks, Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
 from probewise.diagnosis.gain import held_out_gain
 from probewise.diagnosis.joining import join
@@ -28,7 +28,6 @@ from probewise.diagnosis.locate import families_of, global_p_value, places
 from probewise.diagnosis.noise import noise_statistics, steps_within_scans
 from probewise.diagnosis.repaired import ModelSamples, sample_model
 from probewise.diagnosis.search import Candidate, Search, search
-from probewise.diagnosis.templates import effect_templates
 from probewise.diagnosis.unknown import correct
 from probewise.diagnosis.verdict import (
     Diagnosis,
@@ -43,7 +42,7 @@ from probewise.diagnosis.verdict import (
 )
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.inference import sd_floor
-from probewise.recordings.plan import Recording
+from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
 
 __all__ = ["SensorPrior", "diagnose"]
@@ -100,7 +99,8 @@ def diagnose(
     """
     recording = join([recordings] if isinstance(recordings, Recording) else list(recordings))
     extent = Extent.of(recording)
-    built = {name: kind.for_extent(extent) for name, kind in effects.items()}
+    fitted = {name: kind.for_extent(extent) for name, kind in effects.items()}
+    built = {name: effect for name, effect in fitted.items() if effect is not None}
     floor = sd_floor(recording)
     known = None
     if sensor is not None:
@@ -151,8 +151,8 @@ class _Diagnoser:
             () if verdict in ("named", "noise", "clean") else noise
         )
         best = self.search.best(mean_names, noise_of) or null
-        samples = sample_model(best.found, best.evidence[noise_of], self.recording, rng=self.rng)
-        null_samples = sample_model(null.found, null.evidence[noise_of], self.recording, rng=self.rng)
+        samples = self._sample(best, noise_of)
+        null_samples = self._sample(null, noise_of)
         effects = self._effects(hypotheses, best, samples, noise_of)
         after = Linearised.of(best.found, best.evidence[noise_of].whitener)
         favoured = [c for name in combination if name in self.built for c in self.built[name].covariates]
@@ -198,6 +198,10 @@ class _Diagnoser:
             unknown_shares=dict(self.search.unknown_shares),
         )
 
+    def _sample(self, candidate: Candidate, noise: tuple[str, ...]) -> ModelSamples:
+        evidence = candidate.evidence[noise]
+        return sample_model(candidate.found, evidence, self.recording, weights=candidate.weights, rng=self.rng)
+
     def _spread(self, values: FloatArray) -> FloatArray:
         out = np.full(len(self.recording), np.nan)
         out[self.usable] = values
@@ -206,7 +210,7 @@ class _Diagnoser:
     def _looks(self, found: Fit) -> tuple[list[FloatArray], list[str]]:
         """List every template that a test looks at about a fit, with its family."""
         missing = [e for k, e in self.built.items() if k not in self.noise_names and k not in found.model.names]
-        named = {e.name: effect_templates(found, e, self.usable).columns for e in missing}
+        named = {e.name: self.search.templates.of(found, e).columns for e in missing}
         columns, families = families_of(named)
         bases = self.search.unknown_bases
         return [*columns, *bases.columns], [*families, *(f"unknown in {f}" for f in bases.families)]
@@ -214,18 +218,16 @@ class _Diagnoser:
     def _aliases(self, problem: Linearised, found: Fit) -> list[Alias]:
         """Compare what survives of the effects, each by the entry of its bank that fits best here."""
         telling: dict[str, FloatArray] = {}
+        chosen: dict[str, NamedEffect[Any]] = {}
         for name, effect in self.built.items():
             if name in self.noise_names:
                 continue
-            entries = effect_templates(found, effect, self.usable).columns
-            scores = []
-            for entry in entries:
-                projected = problem.project(entry)
-                u, lengths, _ = np.linalg.svd(projected, full_matrices=False)
-                scores.append(float(np.sum((u[:, lengths > 1e-9].T @ problem.residual) ** 2)))
-            telling[name] = entries[int(np.argmax(scores))]
-        found_pairs = aliases(problem, telling, {})
-        return [settle(pair, found, self.built, problem.sd) for pair in found_pairs]
+            templates = self.search.templates.of(found, effect)
+            blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
+            scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
+            best = int(np.argmax(scores))
+            telling[name], chosen[name] = templates.columns[best], templates.variant(best)
+        return settle(aliases(problem, telling, {}), found, chosen, problem.sd)
 
     def _effects(
         self,
@@ -234,27 +236,27 @@ class _Diagnoser:
         samples: ModelSamples,
         noise_of: tuple[str, ...],
     ) -> tuple[EffectFound, ...]:
-        out = []
+        out, unit = [], self.recording.plan.instrumentation.unit
         for name, effect in self.built.items():
             p = sum(h.probability for h in hypotheses if name in h.effects)
             if p <= _LEAST_PROBABILITY:
                 continue
-            if name in samples.effects:
-                values, size = samples.columns(name), self._size(best, name, noise_of)
+            holder, noise = (best, noise_of) if name in samples.effects else self._holder(name)
+            if holder is None:
+                effect, values, size = self._too_small(effect)
             else:
-                holder, noise = self._holder(name)
-                if holder is None:
-                    values, size = self._too_small(effect)
-                else:
-                    own = sample_model(holder.found, holder.evidence[noise], self.recording, rng=self.rng)
-                    values, size = own.columns(name), self._size(holder, name, noise)
+                effect = next((e for e in holder.found.model.effects if e.name == name), effect)
+                own = samples
+                if name not in samples.effects:
+                    own = self._sample(holder, noise)
+                values, size = own.columns(name), self._size(holder, name, noise)
             out.append(
                 EffectFound(
                     name,
                     min(p, 1.0),
                     size,
                     effect.sentence(values.mean(axis=0), values.std(axis=0)),
-                    _parameters(effect, values, self.recording.plan.instrumentation.unit),
+                    (*_parameters(effect, values, unit), *_scans(effect, self.recording.plan)),
                 )
             )
         return tuple(sorted(out, key=lambda e: -e.probability))
@@ -269,16 +271,20 @@ class _Diagnoser:
                     return candidate, noise
         return None, ()
 
-    def _too_small(self, effect: NamedEffect[Any]) -> tuple[FloatArray, float]:
-        """Bound an effect that is not felt: amplitudes by the linearised null, the rest as the prior has it."""
+    def _too_small(self, effect: NamedEffect[Any]) -> tuple[NamedEffect[Any], FloatArray, float]:
+        """Bound an effect that is not felt: amplitudes by the linearised null, the rest as the prior has it.
+
+        Of its variants the one is taken that stands in the middle.
+        """
         null = self.search.candidates[self.search.order, ()]
         best = max(null.evidence.values(), key=lambda e: e.log_z)
         problem = Linearised.of(null.found, best.whitener)
-        templates = effect_templates(null.found, effect, self.usable)
+        templates = self.search.templates.of(null.found, effect)
+        middle = len(templates.columns) // 2
+        effect = templates.variant(middle)
         values = effect.prior.from_unit_cube(self.rng.random((N_DRAWS, len(effect.prior.names))))
         if not effect.amplitudes:
-            return values, 0.0
-        middle = len(templates.columns) // 2
+            return effect, values, 0.0
         projected = problem.project(templates.columns[middle])
         # A ridge of one prior scale keeps amplitudes that the plan cannot see from running off.
         precision = projected.T @ projected + np.eye(projected.shape[1])
@@ -290,7 +296,7 @@ class _Diagnoser:
         # Signs that the prior rules out are folded back.
         inside = np.isfinite(effect.prior.log_prob(values))
         values[~inside] = np.abs(values[~inside])
-        return values, float(np.linalg.norm(projected @ amount))
+        return effect, values, float(np.linalg.norm(projected @ amount))
 
     def _size(self, holder: Candidate, name: str, noise: tuple[str, ...]) -> float:
         """Measure lambda: what is left on noise-free readings after a full refit without the effect."""
@@ -396,13 +402,13 @@ class _Diagnoser:
         effect, found = self.built[name], leader.found
         best = max(leader.evidence.values(), key=lambda e: e.log_z)
         problem = Linearised.of(found, best.whitener)
-        templates = effect_templates(found, effect, self.usable)
+        templates = self.search.templates.of(found, effect)
         sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
         at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / 3.0))))
         setting = templates.settings[at][0].copy()
         for k in effect.amplitudes:
             setting[k] *= min(3.0 / max(sizes[at], 1e-9), 50.0)
-        model = found.model.with_effect(effect)
+        model = found.model.with_effect(templates.variant(at))
         z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
         covariance = np.zeros((len(z), len(z)))
         covariance[: len(found.z), : len(found.z)] = covariance_of(found)
@@ -458,6 +464,12 @@ def _parameters(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tupl
         _parameter(name, _unit(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
     )
+
+
+def _scans(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
+    """Give the numbers of the scans that an effect is bound to, from 0 in order of taking; its sentence names them."""
+    numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
+    return (_parameter("scans", "scan", numbers),) if numbers.size else ()
 
 
 def _unit(own: str, unit: str) -> str:

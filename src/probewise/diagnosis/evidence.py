@@ -98,9 +98,13 @@ class Linearised:
 
     def project(self, columns: FloatArray) -> FloatArray:
         """Whiten columns of readings (n_points, k) and project the fit's parameters out: (n_rows, k)."""
-        turned = np.zeros((self.n_rows, columns.shape[1]))
-        turned[: self.n_points] = self.whitener(columns) / self.sd
-        return turned - self.basis @ (self.basis.T @ turned)
+        return self.without_fit(self.whitener(columns) / self.sd)
+
+    def without_fit(self, whitened: FloatArray) -> FloatArray:
+        """Project the fit's parameters out of columns in units of the noise sd: (n_points, k) -> (n_rows, k)."""
+        out = -self.basis @ (self.basis[: self.n_points].T @ whitened)
+        out[: self.n_points] += whitened
+        return out
 
     def absorbed(self, found: Fit, change: FloatArray) -> FloatArray:
         """Move the fit's coordinates so that a change of the readings (n_points,) is taken up, (n_params,)."""
@@ -132,34 +136,30 @@ class Blocks:
     def of(cls, problem: Linearised, templates: Sequence[FloatArray], labels: Sequence[str]) -> Blocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
         widths = [t.shape[1] for t in templates]
-        joined = np.concatenate(templates, axis=1)
-        whitened = problem.whitener(joined) / problem.sd
+        whitened = problem.whitener(np.concatenate(templates, axis=1))
         per_column = np.repeat(widths, widths)
-        norms = np.sqrt(np.sum(whitened**2, axis=0))
-        scaled = joined / np.where(norms > 0, norms, 1.0) * np.sqrt(problem.n_points / per_column)
-        projected = problem.project(scaled)
-        us, gains, starts, shares, at, column = [], [], [], [], 0, 0
-        for width in widths:
-            part = projected[:, column : column + width]
-            column += width
-            starts.append(at)
-            if width == 1:
-                length = float(np.linalg.norm(part))
-                us.append(part / length if length > 1e-9 else part * 0)
-                gains.append(np.array([length**2]))
-            else:
-                u, lengths, _ = np.linalg.svd(part, full_matrices=False)
-                us.append(u * (lengths > 1e-9))
-                gains.append(lengths**2)
-            shares.append(math.sqrt(float(gains[-1].sum()) / problem.n_points))
-            at += us[-1].shape[1]
-        return cls(
-            np.concatenate(us, axis=1),
-            np.concatenate(gains),
-            np.array(starts, dtype=np.int64),
-            tuple(labels),
-            np.array(shares),
-        )
+        norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+        whitened *= np.sqrt(problem.n_points / per_column) / np.where(norms > 0, norms, 1.0)
+        projected = problem.without_fit(whitened)
+        starts = np.concatenate([[0], np.cumsum(widths)[:-1]])
+        u, gain = np.empty_like(projected), np.empty(len(per_column))
+        for width in set(widths):  # all templates of one width at a time
+            columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
+            u[:, columns], gain[columns] = _orthonormal(projected[:, columns], width)
+        shares = np.sqrt(np.add.reduceat(gain, starts) / problem.n_points)
+        return cls(u, gain, starts, tuple(labels), shares)
+
+
+def _orthonormal(columns: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """Orthonormalise neighbours, `width` at a time: (n_rows, n_columns) and squared lengths (n_columns,).
+
+    By the eigenvectors of their products. What is shorter than a millionth is not there: its column is 0.
+    """
+    blocks = columns.reshape(len(columns), -1, width)
+    squares, axes = np.linalg.eigh(np.einsum("ibj,ibk->bjk", blocks, blocks, optimize=True))
+    per_length = np.where(squares > 1e-12, 1 / np.sqrt(np.maximum(squares, 1e-12)), 0.0)
+    u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
+    return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
 
 
 def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int) -> FloatArray:

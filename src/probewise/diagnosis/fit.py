@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ class Model:
     @cached_property
     def chain(self) -> Chain:
         """The sensor model itself."""
-        scene = KnownScene(self.plan.patterns)
+        scene = _scene_of(self.plan)
         return Chain(FreeMixture(self.sensor.n_gaussians), FreeLevels(), scene, self.effects, n_nodes=FAST_NODES)
 
     @property
@@ -88,6 +88,12 @@ class Model:
     def scores_of(self, values: FloatArray) -> FloatArray:
         """Return the last effect's coordinates for its own parameters (n_samples, n_params)."""
         return effect_scores(self.effects[-1], values)
+
+
+@lru_cache(maxsize=32)
+def _scene_of(plan: Plan) -> KnownScene:
+    """Build a plan's scene once for all models that look at it."""
+    return KnownScene(plan.patterns)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
 
@@ -11,7 +12,7 @@ from probewise._arrays import FloatArray, frozen
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.diagnosis.coordinates import FARTHEST
+from probewise.diagnosis.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit
 from probewise.effects import Extent
@@ -79,7 +80,13 @@ class ModelSamples:
 
 
 def sample_model(
-    found: Fit, noise: NoiseEvidence, recording: Recording, *, rng: np.random.Generator, n_samples: int = N_SAMPLES
+    found: Fit,
+    noise: NoiseEvidence,
+    recording: Recording,
+    *,
+    weights: Mapping[str, FloatArray],
+    rng: np.random.Generator,
+    n_samples: int = N_SAMPLES,
 ) -> ModelSamples:
     """Draw from the Laplace approximation of a fit, under the noise model it was weighed with.
 
@@ -89,6 +96,8 @@ def sample_model(
         The fit and its evidence under a noise model; the model's nodes are drawn by their weight.
     recording
         What was fitted.
+    weights
+        For each effect, the probability of each of its variants.
     rng
         Source of randomness.
     n_samples
@@ -108,7 +117,13 @@ def sample_model(
     effects = (*found.model.effects, *noise.noise.effects)
     scene = KnownScene(recording.plan.patterns)
     chain = Chain(FreeMixture(found.model.sensor.n_gaussians), FreeLevels(), scene, effects)
-    theta = found.model.theta(z)
+    own = {
+        effect.name: effect.spread(
+            effect_values(effect, z[:, found.model.columns_of(effect.name)]), weights[effect.name], rng=rng
+        )
+        for effect in found.model.effects
+    }
+    theta = found.model.theta_of(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
     if noise.noise.effects:
         nodes = noise.noise.settings[rng.choice(len(noise.weights), n_samples, p=noise.weights)]
         for k in range(nodes.shape[1]):

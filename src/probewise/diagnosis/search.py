@@ -22,8 +22,8 @@ from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, 
 from probewise.diagnosis.noise import NoiseModel, Whitener, white
 from probewise.diagnosis.templates import (
     EffectTemplates,
+    TemplateMemory,
     UnknownTemplates,
-    effect_templates,
     subsets,
     unknown_templates,
 )
@@ -34,6 +34,9 @@ from probewise.sensor import Stage
 __all__ = ["Candidate", "PriorOdds", "Search", "search"]
 
 Names = tuple[str, ...]
+
+_BEST_ENTRIES = 2  # of each effect's bank, for pairs
+_STEERING = 3.0  # nats behind the best: a noise model further back does not say what to look for next
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,8 @@ class Candidate:
 
     found: Fit
     evidence: Mapping[Names, NoiseEvidence]
+    log_share: float  # in the evidence, for the discrete choices that its effects have made
+    weights: Mapping[str, FloatArray]  # of the variants among which each effect chose
 
     @property
     def names(self) -> Names:
@@ -95,6 +100,7 @@ class Search:
     covariates: tuple[Covariate, ...]
     unknown_bases: UnknownTemplates
     unknown_shares: Mapping[str, float]
+    templates: TemplateMemory
     probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)  # (mean, noise); ("unknown",)
     order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
 
@@ -153,6 +159,7 @@ class _Searcher:
     def __post_init__(self) -> None:
         self.usable: IntArray = np.flatnonzero(self.recording.usable)
         self.n_points = len(self.usable)
+        self.templates = TemplateMemory(self.usable)
         self.extent = Extent.of(self.recording)
         self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
         on_noise = [n for n, e in self.effects.items() if e.stage is Stage.NOISE]
@@ -187,6 +194,7 @@ class _Searcher:
             covariates,
             bases,
             self.unknown_shares,
+            self.templates,
         )
         self._refit_what_matters(search, screened)
         self._other_orders(search)
@@ -201,16 +209,29 @@ class _Searcher:
             starts = min(tried, key=lambda f: f.objective).z[None, :]
         return fit(model, self.recording, starts[0], whitener, sd_floor=self.sd_floor, max_steps=max_steps)
 
-    def _weighed(self, model: Model, starts: FloatArray, max_steps: int = 30) -> Candidate:
+    def _weighed(
+        self,
+        model: Model,
+        starts: FloatArray,
+        *,
+        log_share: float = 0.0,
+        weights: Mapping[str, FloatArray] | None = None,
+        max_steps: int = 30,
+    ) -> Candidate:
         """Fit with white noise, weigh under every noise model, refit where another one is more probable."""
+
+        def weighed_by_all(found: Fit) -> dict[Names, NoiseEvidence]:
+            plain = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
+            return {k: replace(evidence, log_z=evidence.log_z + log_share) for k, evidence in plain.items()}
+
         found = self._fit(model, starts, white(self.n_points), max_steps)
-        evidence = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
+        evidence = weighed_by_all(found)
         score = {k: e.log_z + self.prior.log_noise(k, len(self.noise_models)) for k, e in evidence.items()}
         best = max(score, key=lambda k: score[k])
         if best:
             found = self._fit(model, found.z[None, :], evidence[best].whitener, max_steps)
-            evidence = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
-        return Candidate(found, evidence)
+            evidence = weighed_by_all(found)
+        return Candidate(found, evidence, log_share, weights or {})
 
     def _keep(self, candidate: Candidate) -> Candidate:
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
@@ -240,27 +261,23 @@ class _Searcher:
         return max(log_z, key=lambda k: log_z[k])
 
     def _templates(self, found: Fit, names: Sequence[str]) -> dict[str, EffectTemplates]:
-        return {n: effect_templates(found, self.mean_effects[n], self.usable) for n in names}
+        return {n: self.templates.of(found, self.mean_effects[n]) for n in names}
 
     def _screen(
         self, null: Candidate, bases: UnknownTemplates
     ) -> tuple[dict[tuple[Names, Names], float], dict[Names, float]]:
         """Weigh all combinations about the null by templates, under every noise model's best node."""
         templates = self._templates(null.found, list(self.mean_effects))
-        combinations = list(subsets(list(self.mean_effects), min(self.depth, 2)))[1:]
         screened: dict[tuple[Names, Names], float] = {}
         unknown: dict[Names, float] = {}
         for noise, evidence in null.evidence.items():
             problem = Linearised.of(null.found, evidence.whitener)
-            columns, owners = [], []
-            for i, names in enumerate(combinations):
-                for entry in _products([templates[n].columns for n in names]):
-                    columns.append(np.concatenate(entry, axis=1))
-                    owners.append(i)
-            scores = _log_bayes_factors(problem, columns)
-            for i, names in enumerate(combinations):
-                of = scores[np.array(owners) == i]
-                screened[names, noise] = float(logsumexp(of)) - math.log(len(of))
+            singles = {n: _log_bayes_factors(problem, t.columns) for n, t in templates.items()}
+            for name, scores in singles.items():
+                screened[(name,), noise] = _log_mean(scores)
+            if self.depth > 1:
+                for pair, value in _screened_pairs(problem, templates, singles).items():
+                    screened[pair, noise] = value
             if not bases.columns:
                 unknown[noise] = 0.0
                 continue
@@ -311,16 +328,14 @@ class _Searcher:
             return self._keep(candidate)
         # Laplace fails where an effect is too small to be felt and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
-        null = self.candidates[parent.n_gaussians, ()]
         names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():
-            screened[names, noise] = min(value, 0.0) + parent.evidence[noise].log_z - null.evidence[noise].log_z
+            screened[names, noise] = min(value, 0.0) + screened.get((parent.names, noise), 0.0)
         self.not_felt.add(names)
         return None
 
     def _refit_what_matters(self, search: Search, screened: dict[tuple[Names, Names], float]) -> None:
         """Refit whatever the screening alone would give some probability, the most probable first."""
-        null = self.candidates[search.order, ()]
         for _ in range(6):
             merged: dict[Names, float] = {}
             for (names, _noise), p in weighed(search).probabilities.items():
@@ -336,9 +351,9 @@ class _Searcher:
                 grown = self._refit(held, added, screened)
                 if grown is None:
                     self.not_felt.add(names)
-                    for noise, evidence in held.evidence.items():
-                        gained = evidence.log_z - null.evidence[noise].log_z
-                        screened[names, noise] = min(screened.get((names, noise), np.inf), gained)
+                    for noise in held.evidence:
+                        without = screened.get((held.names, noise), 0.0)
+                        screened[names, noise] = min(screened.get((names, noise), np.inf), without)
                     break
                 held = grown
 
@@ -351,12 +366,14 @@ class _Searcher:
         """Screen every effect that a fit does not hold yet."""
         missing = [n for n in self.mean_effects if n not in parent.names]
         templates = self._templates(parent.found, missing)
+        best = max(e.log_z for e in parent.evidence.values())
         for evidence in parent.evidence.values():
+            if evidence.log_z < best - _STEERING:
+                continue
             problem = Linearised.of(parent.found, evidence.whitener)
             for name in missing:
                 scores = _log_bayes_factors(problem, templates[name].columns)
-                score = float(logsumexp(scores)) - math.log(len(scores))
-                score += evidence.log_z - max(reference.values())
+                score = _log_mean(scores) + evidence.log_z - max(reference.values())
                 names = tuple(sorted((*parent.names, name)))
                 if score > wishes.get(names, (-np.inf,))[0]:
                     wishes[names] = (score, parent, name)
@@ -364,24 +381,28 @@ class _Searcher:
     def _extend(self, parent: Candidate, name: str) -> tuple[Candidate, dict[Names, float]]:
         """Refit with one more effect, from the best entries of its bank; give the closed-form scores too."""
         effect = self.mean_effects[name]
-        templates = effect_templates(parent.found, effect, self.usable)
+        templates = self.templates.of(parent.found, effect)
         by_noise: dict[Names, float] = {}
         for noise, evidence in parent.evidence.items():
             scores = _log_bayes_factors(Linearised.of(parent.found, evidence.whitener), templates.columns)
-            by_noise[noise] = float(logsumexp(scores)) - math.log(len(scores))
+            by_noise[noise] = _log_mean(scores)
         best = max(parent.evidence.values(), key=lambda e: e.log_z)
         problem = Linearised.of(parent.found, best.whitener)
         scores = _log_bayes_factors(problem, templates.columns)
-        model = parent.found.model.with_effect(effect)
+        leader = int(np.argmax(scores))
+        log_share = parent.log_share + templates.log_share(leader, scores)
+        model = parent.found.model.with_effect(templates.variant(leader))
         starts = []
-        ranked = np.argsort(-scores)
-        for at in ranked[: 2 if scores[ranked[0]] > 5 else 1]:
+        rivals = np.flatnonzero(templates.choice == templates.choice[leader])
+        ranked = rivals[np.argsort(-scores[rivals])]
+        for at in ranked[: 2 if scores[leader] > 5 else 1]:
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(problem.project(columns), problem.residual)[0], dtype=np.float64)
-            setting = _scaled_setting(effect, templates.settings[at], amount)
+            setting = effect.start(templates.settings[at], amount)
             z = parent.found.z + problem.absorbed(parent.found, columns @ amount)
             starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
-        return self._weighed(model, np.stack(starts)), by_noise
+        weights = {**parent.weights, name: templates.weights(scores)}
+        return self._weighed(model, np.stack(starts), log_share=log_share, weights=weights), by_noise
 
     def _other_orders(self, search: Search) -> None:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
@@ -403,7 +424,10 @@ class _Searcher:
                 effects = source.found.model.effects
                 model = Model(sensor, effects, self.recording.plan)
                 own = source.found.z[source.found.model.sensor.n_params :]
-                candidate = self._weighed(model, np.concatenate([null.found.z, own])[None, :], max_steps=15)
+                start = np.concatenate([null.found.z, own])[None, :]
+                candidate = self._weighed(
+                    model, start, log_share=source.log_share, weights=source.weights, max_steps=15
+                )
                 if _acts(candidate, null):
                     self._keep(candidate)
 
@@ -424,14 +448,17 @@ def weighed(search: Search) -> Search:
             null_at.evidence[noise].log_z + log_order + search.unknown[noise] + math.log(prior.unknown) + log_noise
         )
         refitted = {names for _, names in search.candidates if names}
+        log_z: dict[Names, float] = {(): null_at.evidence[noise].log_z}
         for names in refitted:
             values = [c.evidence[noise].log_z for (_, key), c in search.candidates.items() if key == names]
-            log_p[names, noise] = float(logsumexp(values)) + log_order + prior.log_mean(names, n_effects) + log_noise
+            log_z[names] = float(logsumexp(values))
+            log_p[names, noise] = log_z[names] + log_order + prior.log_mean(names, n_effects) + log_noise
         for (names, model), value in search.screened.items():
             if model == noise and names not in refitted:
-                log_p[names, noise] = (
-                    null_at.evidence[noise].log_z + log_order + value + prior.log_mean(names, n_effects) + log_noise
-                )
+                # Screening says what is gained over the best part that was refitted.
+                part = max((part for part in subsets(names, len(names) - 1) if part in log_z), key=log_z.__getitem__)
+                gained = value - search.screened.get((part, noise), 0.0)
+                log_p[names, noise] = log_z[part] + gained + log_order + prior.log_mean(names, n_effects) + log_noise
     total = float(logsumexp(list(log_p.values())))
     clean_by_order = {
         n: float(logsumexp([search.candidates[n, ()].evidence[k].log_z for k in search.noise_models])) for n in orders
@@ -467,19 +494,25 @@ def _by_family(values: FloatArray, families: Sequence[str]) -> dict[str, float]:
     }
 
 
-def _products(banks: Sequence[Sequence[FloatArray]]) -> list[tuple[FloatArray, ...]]:
-    out: list[tuple[FloatArray, ...]] = [()]
-    for bank in banks:
-        out = [(*head, entry) for head in out for entry in bank]
+def _log_mean(scores: FloatArray) -> float:
+    return float(logsumexp(scores)) - math.log(len(scores))
+
+
+def _screened_pairs(
+    problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
+) -> dict[Names, float]:
+    """Weigh pairs: as if each effect stood alone, and what their best entries gain or lose together."""
+    best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
+    pairs = [pair for pair in subsets(list(templates), 2) if len(pair) == 2]
+    entries = [(a, b, i, j) for a, b in pairs for i in best[a] for j in best[b]]
+    columns = [np.concatenate([templates[a].columns[i], templates[b].columns[j]], axis=1) for a, b, i, j in entries]
+    together = _log_bayes_factors(problem, columns)
+    apart = np.array([singles[a][i] + singles[b][j] for a, b, i, j in entries])
+    out: dict[Names, float] = {}
+    at = 0
+    for a, b in pairs:
+        block = slice(at, at + len(best[a]) * len(best[b]))
+        at = block.stop
+        gained = float(logsumexp(together[block]) - logsumexp(apart[block]))
+        out[a, b] = _log_mean(singles[a]) + _log_mean(singles[b]) + gained
     return out
-
-
-def _scaled_setting(effect: NamedEffect[Any], setting: FloatArray, amount: FloatArray) -> FloatArray:
-    """Turn a bank entry (n_columns, n_params) and its fitted amounts (n_columns,) into one start (n_params,).
-
-    Amplitudes scale with the amounts; what is no amplitude (a level, an exponent) starts as in the bank.
-    """
-    start = setting[0].copy()
-    for k in effect.amplitudes:
-        start[k] = amount @ setting[:, k]
-    return np.asarray(start)

@@ -6,8 +6,9 @@ A template is a set of columns (n_usable, k), the change of the readings that an
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,18 +17,38 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.coordinates import effect_values
 from probewise.diagnosis.covariates import Covariate
 from probewise.diagnosis.fit import Fit
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, in_scans
+from probewise.sensor import Stage
 
-__all__ = ["EffectTemplates", "UnknownTemplates", "effect_templates", "unknown_templates"]
+__all__ = ["EffectTemplates", "TemplateMemory", "UnknownTemplates", "effect_templates", "unknown_templates"]
 
 
 @dataclass(frozen=True, eq=False)
 class EffectTemplates:
-    """An effect's bank about a fit: for each entry its columns and the setting that made it."""
+    """An effect's bank about a fit, all its variants': for each entry its columns, the setting and the variant."""
 
-    effect: NamedEffect[Any]
     columns: tuple[FloatArray, ...]  # each (n_usable, n_columns)
-    settings: FloatArray  # (n_bank, n_columns, n_params)
+    settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
+    variants: tuple[NamedEffect[Any], ...]
+    choice: IntArray  # number of each entry's variant, (n_entries,)
+
+    def variant(self, at: int) -> NamedEffect[Any]:
+        """Give the variant of one entry."""
+        variant: NamedEffect[Any] = self.variants[self.choice[at]]
+        return variant
+
+    def log_share(self, at: int, scores: FloatArray) -> float:
+        """Weigh the variant of entry `at`: log of its prior probability over its posterior one.
+
+        `scores` are the entries' log Bayes factors, (n_entries,). Added to the log evidence of that
+        variant alone it gives that of the effect, the choice among its variants summed out.
+        """
+        return -float(np.log(self.weights(scores)[self.choice[at]])) - math.log(len(self.variants))
+
+    def weights(self, scores: FloatArray) -> FloatArray:
+        """Posterior probability of each variant, (n_variants,), by the log Bayes factors of the entries."""
+        shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants))
+        return np.asarray(shares / shares.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,17 +59,58 @@ class UnknownTemplates:
     families: tuple[str, ...]  # the covariate of each
 
 
+@dataclass(eq=False)
+class TemplateMemory:
+    """The templates of effects about fits, each laid out once."""
+
+    usable: IntArray
+    known: dict[tuple[Fit, str], EffectTemplates] = field(default_factory=dict)
+
+    def of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
+        """Give the templates of one effect about one fit."""
+        key = found, effect.name
+        if key not in self.known:
+            self.known[key] = effect_templates(found, effect, self.usable)
+        return self.known[key]
+
+
 def effect_templates(found: Fit, effect: NamedEffect[Any], usable: IntArray) -> EffectTemplates:
-    """Difference the chain with and without the effect, all settings in one prediction."""
-    bank = effect.bank()
-    n_bank, n_columns, n_params = bank.shape
-    model = found.model.with_effect(effect)
-    z = np.repeat(found.z[None, :], n_bank * n_columns, axis=0)
-    own = {e.name: effect_values(e, z[:, found.model.columns_of(e.name)]) for e in found.model.effects}
-    own[effect.name] = bank.reshape(n_bank * n_columns, n_params)
-    rows = model.theta_of(model.sensor.theta(z[:, : model.sensor.n_params]), own)
-    change = (model.chain.predict(rows, model.plan)[:, usable] - found.predicted).T
-    return EffectTemplates(effect, tuple(np.split(change, n_bank, axis=1)), bank)
+    """Difference the chain with and without each variant of the effect."""
+    variants = effect.variants()
+    banks = [variant.bank() for variant in variants]
+    # Variants bound to the same scans, or to none, differ in their priors alone: one prediction does for them.
+    columns: list[FloatArray] = []
+    first = 0
+    for _, group in itertools.groupby(variants, key=lambda variant: variant.scans):
+        last = first + len(list(group))
+        columns += _columns(found, variants[first], np.concatenate(banks[first:last]), usable)
+        first = last
+    choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
+    return EffectTemplates(tuple(columns), tuple(itertools.chain(*banks)), variants, choice)
+
+
+def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
+    """Predict all settings of a bank at once, in the scans that the effect is bound to: each (n_usable, n_columns)."""
+    plain, plan = found.model, found.model.plan
+    model = plain.with_effect(effect)
+    n_rows = bank.shape[0] * bank.shape[1]
+    own = {e.name: effect_values(e, found.z[None, plain.columns_of(e.name)]) for e in plain.effects}
+    each = {name: np.repeat(values, n_rows, axis=0) for name, values in own.items()}
+    each[effect.name] = bank.reshape(n_rows, -1)
+    sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
+    theta = model.theta_of(np.repeat(sensor, n_rows, axis=0), each)
+    before = np.zeros(len(plan))
+    before[usable] = found.predicted
+    if effect.scans:
+        inside = np.flatnonzero(in_scans(plan, effect.scans))
+        change = np.zeros((n_rows, len(plan)))
+        change[:, inside] = model.chain.predict(theta, plan.take(inside)) - before[inside]
+    elif effect.stage >= Stage.SEEN:  # what acts on what has been seen needs no second look
+        view = plain.chain.look(plain.theta_of(sensor, own), plan)
+        change = model.chain.read(view, theta, plan) - before
+    else:
+        change = model.chain.predict(theta, plan) - before
+    return np.split(change[:, usable].T, len(bank), axis=1)
 
 
 def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, n_points: int) -> UnknownTemplates:

@@ -196,10 +196,8 @@ def decide(
     top = max(named, key=lambda effects: named[effects])
     if named[top] >= 0.5:
         return ("noise" if set(top) <= noise_names else "named"), top
-    swaps = {
-        pair: other for a in aliases for pair, other in ((a.effects[0], a.effects[1]), (a.effects[1], a.effects[0]))
-    }
-    of_class = {top} | {tuple(sorted({swaps.get(n, n) if n == out else n for n in top})) for out in top}
+    both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
+    of_class = {top} | {tuple(sorted({*top} - {name} | {other})) for name, other in both_ways if name in top}
     if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
         return "cannot_tell", top
     if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:

@@ -8,35 +8,109 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from probewise.effects.gain import GainDrift
+from probewise.effects.albedo import AlbedoGradient, AlbedoPatch
+from probewise.effects.angles import OrientationError, ScanAngleError
+from probewise.effects.edge_distance import edge_distance
+from probewise.effects.edges import EdgeBlur, EdgeShadow, Halo
+from probewise.effects.extent import Extent
+from probewise.effects.faults import Dropouts, Outliers
+from probewise.effects.gain import BatterySag, GainDrift
+from probewise.effects.glint import Glint
 from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
+from probewise.effects.height import HeightGradient, HeightOffset
 from probewise.effects.known import Known
-from probewise.effects.noise import CorrelatedNoise
-from probewise.effects.offsets import AmbientGradient
-from probewise.effects.pose import Backlash
+from probewise.effects.lattice import Quantisation, lattice_step
+from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
+from probewise.effects.moves import in_scans
+from probewise.effects.noise import CorrelatedNoise, SignalDependentNoise
+from probewise.effects.noise_law import NoiseRows, draw_readings, log_density
+from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
+from probewise.effects.pose import Backlash, PositionScale
+from probewise.effects.readings import Hysteresis, Lag
 from probewise.effects.response import Nonlinearity
 from probewise.effects.saturation import Saturation
-from probewise.effects.vocabulary import Extent, NamedEffect
+from probewise.effects.tilt import SensorTilt
+from probewise.effects.vocabulary import NamedEffect
+from probewise.effects.waves import Flicker, PeriodicPositionError
 
 VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
     {
         effect.name: effect
-        for effect in (Backlash, GainDrift, AmbientGradient, Saturation, Nonlinearity, CorrelatedNoise)
+        for effect in (
+            AmbientGradient,
+            AmbientStep,
+            OffsetDrift,
+            GainDrift,
+            BatterySag,
+            Flicker,
+            Saturation,
+            Nonlinearity,
+            Hysteresis,
+            Lag,
+            Backlash,
+            PositionScale,
+            PeriodicPositionError,
+            EdgeMisplacement,
+            ScanMisplacement,
+            ScanAngleError,
+            OrientationError,
+            SensorTilt,
+            HeightGradient,
+            HeightOffset,
+            AlbedoGradient,
+            AlbedoPatch,
+            EdgeBlur,
+            EdgeShadow,
+            Halo,
+            Glint,
+            CorrelatedNoise,
+        )
     }
 )
-"""Every effect that can be named, by name."""
+"""Every effect that the diagnosis weighs, by name."""
 
 __all__ = [
     "VOCABULARY",
+    "AlbedoGradient",
+    "AlbedoPatch",
     "AmbientGradient",
+    "AmbientStep",
     "Backlash",
+    "BatterySag",
     "CorrelatedNoise",
+    "Dropouts",
+    "EdgeBlur",
+    "EdgeMisplacement",
+    "EdgeShadow",
     "Extent",
+    "Flicker",
     "GainDrift",
+    "Glint",
+    "Halo",
     "HeavyTailed",
+    "HeightGradient",
+    "HeightOffset",
+    "Hysteresis",
     "Known",
+    "Lag",
     "LogHeavyTailed",
     "NamedEffect",
+    "NoiseRows",
     "Nonlinearity",
+    "OffsetDrift",
+    "OrientationError",
+    "Outliers",
+    "PeriodicPositionError",
+    "PositionScale",
+    "Quantisation",
     "Saturation",
+    "ScanAngleError",
+    "ScanMisplacement",
+    "SensorTilt",
+    "SignalDependentNoise",
+    "draw_readings",
+    "edge_distance",
+    "in_scans",
+    "lattice_step",
+    "log_density",
 ]

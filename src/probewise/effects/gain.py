@@ -9,17 +9,21 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import Extent, give_or_take
+from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["GainDrift"]
+__all__ = ["BatterySag", "GainDrift"]
+
+_BATTERY = "battery_mv"
+_REFERENCE_MV = 8000.0
 
 
 @dataclass(frozen=True)
-class GainDrift:
+class GainDrift(NamedEffect[FloatArray]):
     """Warming up of the lamp: signal x (1 + frac exp(-t / tau_s)), t as in `time_s`."""
 
     typical: float = 0.02
@@ -33,7 +37,7 @@ class GainDrift:
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
+    def for_extent(cls, extent: Extent) -> Self | None:
         """Look for time constants from a hundredth to twice the recording's duration."""
         return cls(shortest_s=0.01 * extent.duration_s, longest_s=2 * extent.duration_s)
 
@@ -60,3 +64,53 @@ class GainDrift:
             f"the signal starts {give_or_take(abs(mean[0]), sd[0], factor=100)} % {side} at time 0 and settles "
             f"with a time constant of {give_or_take(mean[1], sd[1])} s: the lamp warms up"
         )
+
+
+@dataclass(frozen=True)
+class BatterySag(NamedEffect[FloatArray]):
+    """A lamp that dims with its battery: signal x (1 + per_volt (V - V0)), V from `battery_mv`, V0 = 8 V.
+
+    Readings whose voltage is not known are taken at V0.
+    """
+
+    typical_per_volt: float = 0.05
+
+    name: ClassVar[str] = "battery_sag"
+    stage: ClassVar[Stage] = Stage.GAIN
+    units: ClassVar[tuple[str, ...]] = ("1/V",)
+    covariates: ClassVar[tuple[str, ...]] = (_BATTERY,)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take two percent of the signal over the voltages that occurred as typical, where they were recorded."""
+        above = _volts_above_reference(extent.plan)
+        fall = float(np.ptp(above))
+        return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share of the signal a volt, of either sign."""
+        return Product({"per_volt": HeavyTailed(self.typical_per_volt)})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Scale the signal, (n_samples, n_points), never the dark level."""
+        return np.asarray(value * (1 + theta[:, :1] * _volts_above_reference(plan)))
+
+    def bank(self) -> FloatArray:
+        """One setting: linear in the share."""
+        return np.full((1, 1, 1), self.typical_per_volt)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how much signal a volt is worth."""
+        way = "loses" if mean[0] > 0 else "gains"
+        return (
+            f"the signal {way} {give_or_take(abs(mean[0]), sd[0], factor=100)} % for each volt that the battery "
+            "falls: the lamp follows the battery"
+        )
+
+
+def _volts_above_reference(plan: Plan) -> FloatArray:
+    """Battery voltage less V0, 0 where it is not known, (n_points,)."""
+    millivolts = plan.covariates.get(_BATTERY, np.full(len(plan), _REFERENCE_MV))
+    return np.where(np.isfinite(millivolts), (millivolts - _REFERENCE_MV) / 1000, 0.0)

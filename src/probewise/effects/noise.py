@@ -9,16 +9,18 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.vocabulary import Extent, give_or_take
-from probewise.priors import Product, Uniform
+from probewise.effects.extent import Extent
+from probewise.effects.noise_law import NoiseRows
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["CorrelatedNoise"]
+__all__ = ["CorrelatedNoise", "SignalDependentNoise"]
 
 
 @dataclass(frozen=True)
-class CorrelatedNoise:
+class CorrelatedNoise(NamedEffect[NoiseLevel]):
     """Noise with a memory, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
 
     lowest: float = -0.5
@@ -31,7 +33,7 @@ class CorrelatedNoise:
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
+    def for_extent(cls, extent: Extent) -> Self | None:
         """Need no scale: a correlation is a pure number."""
         return cls()
 
@@ -49,9 +51,63 @@ class CorrelatedNoise:
         n_nodes = 36
         return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Correlation of neighbours, of either sign: residuals (n_points, n_draws) -> (n_draws,)."""
+        later = np.flatnonzero(rows.steps == 1)
+        if later.size == 0:
+            return np.zeros(residuals.shape[1])
+        return np.asarray(
+            np.abs(np.mean(residuals[later] * residuals[later - 1], axis=0)) / np.mean(residuals**2, axis=0)
+        )
+
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how alike neighbours are."""
         return (
             f"the noise of neighbouring readings of a scan correlates by {give_or_take(mean[0], sd[0])}: "
             "readings repeat each other's errors"
+        )
+
+
+@dataclass(frozen=True)
+class SignalDependentNoise(NamedEffect[NoiseLevel]):
+    """Noise that grows with the light: variance x (1 + ratio u), u the seen white fraction."""
+
+    least: float = 0.05
+    most: float = 50.0
+
+    name: ClassVar[str] = "signal_dependent_noise"
+    stage: ClassVar[Stage] = Stage.NOISE
+    units: ClassVar[tuple[str, ...]] = ("1",)
+    covariates: ClassVar[tuple[str, ...]] = ("level",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Need no scale: a ratio is a pure number."""
+        return cls()
+
+    @cached_property
+    def prior(self) -> Product:
+        """How much more variance on white, over its orders of magnitude."""
+        return Product({"ratio": LogUniform(self.least, self.most)})
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Widen the noise of each reading by what it sees."""
+        return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
+
+    def bank(self) -> FloatArray:
+        """Equally weighted nodes of the prior."""
+        n_nodes = 16
+        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
+
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Correlation of the squares with what is seen: residuals (n_points, n_draws) -> (n_draws,)."""
+        tilt = rows.seen - rows.seen.mean()
+        return np.asarray(tilt @ residuals**2 / np.mean(residuals**2, axis=0) / max(np.linalg.norm(tilt), 1e-300))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how much louder white is than black."""
+        return (
+            f"the variance of the noise on white is {give_or_take(1 + mean[0], sd[0])} times that on black: "
+            "the noise grows with the light"
         )

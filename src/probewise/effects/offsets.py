@@ -2,36 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import Extent, give_or_take
-from probewise.priors import Product
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["AmbientGradient"]
+__all__ = ["AmbientGradient", "AmbientStep", "OffsetDrift"]
+
+_MOST_MOMENTS = 512
 
 
 @dataclass(frozen=True)
-class AmbientGradient:
+class AmbientGradient(NamedEffect[FloatArray]):
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame."""
 
     typical_per_mm: float = 0.005
 
     name: ClassVar[str] = "ambient_gradient"
     stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("1/mm", "1/mm")
+    units: ClassVar[tuple[str, ...]] = ("reading/mm", "reading/mm")
     covariates: ClassVar[tuple[str, ...]] = ("place",)
     amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
+    def for_extent(cls, extent: Extent) -> Self | None:
         """Take a hundredth of the readings' range over the longest scan as typical."""
         return cls(typical_per_mm=0.01 * extent.span / extent.length_mm)
 
@@ -54,4 +58,106 @@ class AmbientGradient:
         return (
             f"the reading rises by {give_or_take(mean[0], sd[0], factor=100)} per 100 mm along X and by "
             f"{give_or_take(mean[1], sd[1], factor=100)} per 100 mm along Y, black or white: stray light from one side"
+        )
+
+
+@dataclass(frozen=True)
+class OffsetDrift(NamedEffect[FloatArray]):
+    """A slow drift: reading + per_hour t, t as in `time_s`."""
+
+    typical_per_hour: float = 1.0
+
+    name: ClassVar[str] = "offset_drift"
+    stage: ClassVar[Stage] = Stage.OFFSET
+    units: ClassVar[tuple[str, ...]] = ("reading/h",)
+    covariates: ClassVar[tuple[str, ...]] = ("time",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take a hundredth of the readings' range over the whole recording as typical."""
+        return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Rise an hour, of either sign."""
+        return Product({"per_hour": HeavyTailed(self.typical_per_hour)})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Add the drift to the readings, (n_samples, n_points)."""
+        return np.asarray(value + theta[:, :1] * (plan.time_s / 3600))
+
+    def bank(self) -> FloatArray:
+        """One setting: linear in the drift."""
+        return np.full((1, 1, 1), self.typical_per_hour)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how much the reading drifts in an hour."""
+        way = "rises" if mean[0] > 0 else "falls"
+        return (
+            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0])} an hour, black or white: "
+            "the electronics or the light in the room drift"
+        )
+
+
+@dataclass(frozen=True)
+class AmbientStep(NamedEffect[FloatArray]):
+    """Light switched on or off in the room: reading + amp 1(t > at_s).
+
+    `moments_s` are the times between which a change is told from the next one: those of the
+    readings. Which two it happened between is a discrete choice; within them no reading tells.
+    """
+
+    typical: float = 0.5
+    moments_s: tuple[float, ...] = (0.0, 1e5)
+    between_s: tuple[float, float] | None = None
+
+    name: ClassVar[str] = "ambient_step"
+    stage: ClassVar[Stage] = Stage.OFFSET
+    units: ClassVar[tuple[str, ...]] = ("reading", "s")
+    covariates: ClassVar[tuple[str, ...]] = ("time",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take a hundredth of the readings' range as typical; look between any two readings of the recording."""
+        moments = np.unique(extent.plan.time_s)
+        if len(moments) < 2:
+            return None
+        stride = -(-(len(moments) - 1) // _MOST_MOMENTS)
+        kept = np.append(moments[:-1:stride], moments[-1])
+        return cls(typical=0.01 * extent.span, moments_s=tuple(kept.tolist()))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Size, of either sign, and time: even over the recording, or between two readings where that is chosen."""
+        first, last = self.between_s or (self.moments_s[0], self.moments_s[-1])
+        return Product({"amp": HeavyTailed(self.typical), "at_s": Uniform(first, last)})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Add the step to the readings taken after it, (n_samples, n_points)."""
+        return np.asarray(value + theta[:, :1] * (plan.time_s > theta[:, 1:2]))
+
+    def variants(self) -> tuple[Self, ...]:
+        """Choose the two readings between which it happened."""
+        return tuple(replace(self, between_s=pair) for pair in pairwise(self.moments_s))
+
+    def bank(self) -> FloatArray:
+        """One setting, in the middle of the time left open."""
+        at = self.between_s or (self.moments_s[0], self.moments_s[-1])
+        return np.array([[[self.typical, sum(at) / 2]]])
+
+    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw the time from all intervals by their weight."""
+        moments = np.array(self.moments_s)
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        at_s = moments[chosen] + np.diff(moments)[chosen] * rng.random(len(theta))
+        return np.stack([theta[:, 0], at_s], axis=-1)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say when the reading jumped, and how far."""
+        way = "jumps up" if mean[0] > 0 else "drops"
+        return (
+            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0])} at {give_or_take(mean[1], sd[1])} s and stays "
+            "there, black or white: the light in the room changed"
         )

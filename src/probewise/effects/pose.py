@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import Extent, give_or_take
+from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["Backlash"]
+__all__ = ["Backlash", "PositionScale"]
 
 
 @dataclass(frozen=True)
-class Backlash:
+class Backlash(NamedEffect[Poses]):
     """Play in the gears: place = commanded place - (width_mm / 2) direction, on each axis."""
 
     typical_mm: float = 0.5
@@ -31,7 +32,7 @@ class Backlash:
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
+    def for_extent(cls, extent: Extent) -> Self | None:
         """Take half a percent of the longest scan as typical."""
         return cls(typical_mm=0.005 * extent.length_mm)
 
@@ -43,10 +44,10 @@ class Backlash:
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         """Shift the poses against the direction of the last commanded move."""
         half_mm = theta[:, :1] / 2
-        return Poses(
+        return replace(
+            value,
             x_mm=value.x_mm - half_mm * plan.direction[:, 0],
             y_mm=value.y_mm - half_mm * plan.direction[:, 1],
-            orientation_rad=value.orientation_rad,
         )
 
     def bank(self) -> FloatArray:
@@ -58,4 +59,43 @@ class Backlash:
         return (
             f"the arm comes to rest {give_or_take(mean[0], sd[0], factor=0.5)} mm short of where it was sent, "
             f"on the side it came from: gear play of {give_or_take(mean[0], sd[0])} mm"
+        )
+
+
+@dataclass(frozen=True)
+class PositionScale(NamedEffect[Poses]):
+    """Steps that are not as long as they should be: X (1 + x), Y (1 + y)."""
+
+    typical: float = 0.002
+
+    name: ClassVar[str] = "position_scale"
+    stage: ClassVar[Stage] = Stage.POSE
+    units: ClassVar[tuple[str, ...]] = ("1", "1")
+    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
+    amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Need no scale: two thousandths are typical of a drive that was calibrated by a ruler."""
+        return cls()
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share too long, along X and along Y."""
+        share = HeavyTailed(self.typical)
+        return Product({"x": share, "y": share})
+
+    def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        """Stretch the places about the origin of the lab frame."""
+        return replace(value, x_mm=value.x_mm * (1 + theta[:, :1]), y_mm=value.y_mm * (1 + theta[:, 1:2]))
+
+    def bank(self) -> FloatArray:
+        """One setting of two columns: linear in both."""
+        return self.typical * np.eye(2)[None, :, :]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how many percent the arm moves too far."""
+        return (
+            f"the arm moves {give_or_take(mean[0], sd[0], factor=100)} % too far along X and "
+            f"{give_or_take(mean[1], sd[1], factor=100)} % along Y: its scale is off"
         )

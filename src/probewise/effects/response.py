@@ -9,8 +9,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import LogHeavyTailed
-from probewise.effects.vocabulary import Extent, give_or_take
+from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -19,7 +20,7 @@ __all__ = ["Nonlinearity"]
 
 
 @dataclass(frozen=True)
-class Nonlinearity:
+class Nonlinearity(NamedEffect[FloatArray]):
     """A bent response curve: u -> u^gamma, u the seen white fraction held within 0 and 1."""
 
     typical_log: float = 0.1
@@ -31,7 +32,7 @@ class Nonlinearity:
     amplitudes: ClassVar[tuple[int, ...]] = ()
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
+    def for_extent(cls, extent: Extent) -> Self | None:
         """Need no scale: the exponent is a pure number."""
         return cls()
 

@@ -9,7 +9,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.vocabulary import Extent, give_or_take
+from probewise.effects.extent import Extent
+from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -18,7 +19,7 @@ __all__ = ["Saturation"]
 
 
 @dataclass(frozen=True)
-class Saturation:
+class Saturation(NamedEffect[FloatArray]):
     """Run out of range: reading = level - softness log(1 + exp((level - reading) / softness)).
 
     As the softness goes to zero this is min(reading, level).
@@ -36,7 +37,7 @@ class Saturation:
     amplitudes: ClassVar[tuple[int, ...]] = ()
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
+    def for_extent(cls, extent: Extent) -> Self | None:
         """Look among the levels that were reached; a soft limit may lie some way above them."""
         return cls(
             lowest=extent.low + 0.2 * extent.span,

@@ -1,63 +1,18 @@
-"""What every named effect offers besides its function, and the scale that its prior hangs on."""
+"""What every named effect offers besides its function."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError
-from probewise.recordings.plan import Recording
+from probewise.effects.extent import Extent
 from probewise.sensor.stages import Effect
 
-__all__ = ["Extent", "NamedEffect", "give_or_take"]
+__all__ = ["NamedEffect", "give_or_take"]
 
 V = TypeVar("V")
-
-
-@dataclass(frozen=True)
-class Extent:
-    """How far a recording reaches: what makes an effect's typical size a number in its unit."""
-
-    low: float
-    high: float
-    length_mm: float
-    duration_s: float
-
-    def __post_init__(self) -> None:
-        if not (self.low < self.high and self.length_mm > 0 and self.duration_s > 0):
-            raise ParameterError(
-                "Extent", (self.low, self.high, self.length_mm, self.duration_s), "low < high, length and duration > 0"
-            )
-
-    @property
-    def span(self) -> float:
-        """Range of the readings, in their unit."""
-        return self.high - self.low
-
-    @classmethod
-    def of(cls, recording: Recording) -> Self:
-        """Measure the extent of a recording: range of its usable readings, longest scan, last time.
-
-        Raises
-        ------
-        ParameterError
-            If there is no usable reading.
-        """
-        readings, plan = recording.readings[recording.usable], recording.plan
-        if readings.size == 0:
-            raise ParameterError("usable readings", 0, "at least one; the recording holds none")
-        low, high = float(readings.min()), float(readings.max())
-        tiny = max(abs(low), abs(high), 1.0) * 1e-6
-        lengths = [
-            float(np.hypot(np.ptp(plan.x_mm[rows]), np.ptp(plan.y_mm[rows])))
-            for rows in plan.rows_by_scan()
-            if rows.size
-        ]
-        duration_s = float(np.ptp(plan.time_s))
-        return cls(low, max(high, low + tiny), max(*lengths, 0.0) or 1.0, duration_s or 1.0)
 
 
 class NamedEffect(Effect[V], Protocol[V]):
@@ -82,8 +37,11 @@ class NamedEffect(Effect[V], Protocol[V]):
         ...
 
     @classmethod
-    def for_extent(cls, extent: Extent) -> Self:
-        """Build it with a prior fit for a recording of this extent."""
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Build it with a prior fit for a recording of this extent; None where it could not show there.
+
+        An effect of the battery needs the battery's voltage, one of the direction a scan that turns back.
+        """
         ...
 
     def bank(self) -> FloatArray:
@@ -97,6 +55,36 @@ class NamedEffect(Effect[V], Protocol[V]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say in plain words what it does, with its numbers, each of shape (n_params,)."""
         ...
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """Names of the scans that it is bound to; () where it acts in all."""
+        return ()
+
+    def variants(self) -> tuple[Self, ...]:
+        """List the discrete choices that it leaves open, all as probable: itself with each of them made.
+
+        Which scan, which mounting, between which two readings: what no fit finds by small steps.
+        Variants differ in their `scans`, or in their priors alone.
+        """
+        return (self,)
+
+    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Spread samples of one variant's parameters, (n_samples, n_params), over all variants by their weight.
+
+        As they are, unless a parameter says which variant it is.
+        """
+        return theta
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Turn an entry of the bank (n_columns, n_params) and its columns' fitted amounts into a setting (n_params,).
+
+        Amplitudes scale with the amounts; what is no amplitude (a level, an exponent) stays as in the bank.
+        """
+        setting = entry[0].copy()
+        for k in self.amplitudes:
+            setting[k] = amounts @ entry[:, k]
+        return np.asarray(setting)
 
 
 def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:

@@ -248,15 +248,15 @@ class _Spans:
 
     def ring(self, theta: FloatArray) -> _Ring:
         """Pairs of hypothesis and place in the ring about the edge."""
-        some = self.inner_first <= self.inner_last
-        left_last = np.where(some, self.inner_first - 1, self.last)
-        right_first = np.where(some, self.inner_last + 1, self.last + 1)
-        first = np.concatenate([self.first.ravel(), right_first.ravel()])
-        count = np.maximum(np.concatenate([left_last.ravel(), self.last.ravel()]) - first + 1, 0)
-        origin = np.tile(np.arange(self.first.size), 2)
-        used = np.flatnonzero(count)
-        first, count, origin = first[used], count[used], origin[used]
-        hypothesis, row = np.divmod(origin, self.grid.n_y)
+        used = np.flatnonzero(self.first <= self.last)
+        first, last = self.first.ravel()[used], self.last.ravel()[used]
+        inner_first, inner_last = self.inner_first.ravel()[used], self.inner_last.ravel()[used]
+        some = inner_first <= inner_last
+        left_last = np.where(some, inner_first - 1, last)
+        right_first = np.where(some, inner_last + 1, last + 1)
+        first = np.concatenate([first, right_first])
+        count = np.concatenate([left_last, last]) - first + 1
+        hypothesis, row = np.divmod(np.tile(used, 2), self.grid.n_y)
         first = first - (np.cumsum(count) - count)
         running = np.arange(int(count.sum()), dtype=np.int32)
         column = np.repeat(first.astype(np.int32), count) + running

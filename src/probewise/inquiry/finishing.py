@@ -77,7 +77,7 @@ def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
     levels = spread_levels(float(answers.min()), float(answers.max()), sd / _PER_SD)
     index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
     key = (index + np.arange(n) * len(levels)).ravel()
-    chance = prospect.readout.probability(levels)
+    chance = prospect.readout.probability(levels, fine=1.0)
 
     def given_cell(values: FloatArray) -> FloatArray:
         by_level = np.bincount(key, np.repeat(share * values, n), minlength=n * len(levels))

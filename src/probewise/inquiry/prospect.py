@@ -16,6 +16,7 @@ from probewise.recordings.plan import Plan
 
 __all__ = ["Goal", "Prospect"]
 
+_CELL = 0.75  # width of a cell, in sds of noise, of readings that are not rounded: hides 2 % of a nat, everywhere alike
 _BLOCK = 512  # designs whose readings are weighed at a time: they stay in the cache
 
 
@@ -124,7 +125,7 @@ class Prospect:
         return [
             (
                 np.flatnonzero(repeats == n),
-                self.readout.probability(self.outlook.levels, repeats=int(n)).astype(np.float32),
+                self.readout.probability(self.outlook.levels, repeats=int(n), fine=_CELL).astype(np.float32),
             )
             for n in np.unique(repeats)
         ]

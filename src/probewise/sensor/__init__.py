@@ -30,6 +30,7 @@ from probewise.sensor.stages import (
     SceneView,
     SensorModel,
     Stage,
+    View,
 )
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "SceneView",
     "SensorModel",
     "Stage",
+    "View",
     "field_of",
     "footprint_of",
     "mean_mixture",

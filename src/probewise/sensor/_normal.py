@@ -58,7 +58,7 @@ def normal_cdf(z: FloatArray) -> FloatArray:
     z = np.asarray(z, dtype=np.float64)
     if z.size < 1000:  # the calls cost more than the function
         return np.asarray(ndtr(z))
-    out = z * PER_SD
+    out = np.multiply(z, PER_SD, order="C")  # so that the flat view below is no copy
     out += CENTRE
     flat = out.reshape(-1)
     for start in range(0, flat.size, _BLOCK):

@@ -24,6 +24,7 @@ from probewise.sensor.stages import (
     Poses,
     SceneView,
     Stage,
+    View,
     require_columns,
 )
 from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
@@ -85,7 +86,7 @@ class Chain:
 
     M = I_min + (I_max - I_min) R (paper, eq. modelI), with R what the SSF sees of the scene and
     any number of effects, each one function at one stage. Effects are held in the order of the
-    stages, whatever the order in which they are given; those of one stage keep theirs. Columns
+    stages, those of one stage by name, whatever the order in which they are given. Columns
     of theta: the SSF's, the levels', the scene's, then the effects' as "effect.parameter".
 
     `n_nodes` is the number of quadrature nodes over curved edges (the default holds 1e-8 of the
@@ -105,7 +106,7 @@ class Chain:
         labels = [effect.name for effect in self.effects]
         if len(set(labels)) < len(labels):
             raise ParameterError("effects", labels, "each name once")
-        object.__setattr__(self, "effects", tuple(sorted(self.effects, key=lambda effect: effect.stage)))
+        object.__setattr__(self, "effects", tuple(sorted(self.effects, key=lambda e: (e.stage, e.name))))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -138,13 +139,18 @@ class Chain:
         ParameterError
             If the plan has a pattern that the scene lacks, or theta names no proper SSF.
         """
-        seen = self.seen(theta, plan)
-        if not self.effects:
-            return self._read(seen, theta)
+        view = self.look(theta, plan)
+        return self.read(view, theta, plan) if self.effects else self._scaled(view.seen, theta)
+
+    def read(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Turn what is seen into readings, (n_samples, n_points): the way from SEEN on, as `predict` goes it.
+
+        `view` may be of one hypothesis, where all those of theta look alike and differ in what follows.
+        """
         apply = self._applier(theta, plan)
-        seen = apply(Stage.RESPONSE, apply(Stage.SEEN, seen))
+        seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
         i_min, i_max = self._levels(theta)
-        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * seen)
+        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * view.brightness * seen)
         for stage in (Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             reading = apply(stage, reading)
         shape = (len(theta), len(plan))
@@ -154,7 +160,7 @@ class Chain:
         n_ssf = len(self.ssf.names)
         return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
 
-    def _read(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
+    def _scaled(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
         """Turn R into readings where no effect acts, in place: `seen` is this call's own."""
         i_min, i_max = self._levels(theta)
         reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)
@@ -164,13 +170,18 @@ class Chain:
 
     def seen(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Seen white fraction R before any effect on it, shape (n_samples or 1, n_points)."""
+        return self.look(theta, plan).seen
+
+    def look(self, theta: FloatArray, plan: Plan) -> View:
+        """Look at the scene: the way up to SEEN, as `predict` goes it."""
         require_columns(theta, self.names)
-        apply = self._applier(theta, plan)
         layout = self._layout_of(theta, plan)
         if isinstance(self.ssf, FieldSSF):
-            return _discrete_response(layout, self.ssf)
-        footprint = apply(Stage.FOOTPRINT, self.ssf.footprint(theta[:, : len(self.ssf.names)]))
-        return response(layout, footprint, n_nodes=self.n_nodes)
+            return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
+        plain = self.ssf.footprint(theta[:, : len(self.ssf.names)])
+        footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
+        seen = response(layout, footprint, n_nodes=self.n_nodes)
+        return View(seen, layout.poses, layout.regions, footprint.brightness)
 
     def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
         """Lay out the scene under the poses; where no hypothesis changes either, once for a plan."""
@@ -182,7 +193,9 @@ class Chain:
         start = len(self.ssf.names) + len(self.levels.names)
         regions = self.scene.regions(theta[:, start : start + len(self.scene.names)])
         poses = apply(Stage.POSE, Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]))
-        layout = Layout(apply(Stage.SCENE, SceneView(regions)).regions, poses, plan)
+        view: SceneView = apply(Stage.SCENE, SceneView(regions))
+        x_mm, y_mm = poses.x_mm - view.dx_mm, poses.y_mm - view.dy_mm
+        layout = Layout(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)
         if fixed:
             self._last_layout.clear()
             self._last_layout[plan] = layout
@@ -197,6 +210,9 @@ class Chain:
         """Noise of each reading: `sd` broadcasting to (n_samples, n_points), then the effects on it."""
         require_columns(theta, self.names)
         start = NoiseLevel(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
+        if not any(effect.stage == Stage.NOISE for effect in self.effects):
+            return start
+        start = replace(start, seen=self.seen(theta, plan))
         level: NoiseLevel = self._applier(theta, plan)(Stage.NOISE, start)
         return level
 
@@ -231,7 +247,7 @@ class Layout:
     regions
         Region by pattern name.
     poses
-        Where the sensor stands, arrays broadcasting to (n_samples, n_points).
+        Where the sensor stands above the patterns as described, arrays broadcasting to (n_samples, n_points).
     plan
         Which pattern lies under each reading.
 

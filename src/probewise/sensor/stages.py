@@ -8,9 +8,11 @@ of each stage in the order of stages, whatever the order in which they were foun
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ShapeError
@@ -18,7 +20,17 @@ from probewise.priors import Prior
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 
-__all__ = ["Effect", "Footprint", "NoiseLevel", "Poses", "SceneView", "SensorModel", "Stage", "require_columns"]
+__all__ = [
+    "Effect",
+    "Footprint",
+    "NoiseLevel",
+    "Poses",
+    "SceneView",
+    "SensorModel",
+    "Stage",
+    "View",
+    "require_columns",
+]
 
 
 class Stage(IntEnum):
@@ -47,9 +59,14 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """What lies under it: region by pattern name."""
+    """What lies under it: region by pattern name, and how far each reading's pattern lies from where it should.
+
+    `dx_mm`, `dy_mm` broadcast to (n_samples, n_points).
+    """
 
     regions: Mapping[str, Region]
+    dx_mm: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    dy_mm: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +75,7 @@ class Footprint:
 
     Arrays broadcast to (n_samples, n_points, n_gaussians): `weight` (sums to one over the
     last axis), mean `u_mm`, `v_mm`, covariance `var_u`, `var_v`, `cov_uv` in mm^2.
+    `brightness` (n_samples, n_points) is how strong the signal is of what it was calibrated at.
     """
 
     weight: FloatArray
@@ -66,14 +84,39 @@ class Footprint:
     var_u: FloatArray
     var_v: FloatArray
     cov_uv: FloatArray
+    brightness: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the sensor sees: white fraction `seen` (n_samples, n_points), from which place of which regions.
+
+    `poses` are relative to the patterns as they are described; `brightness` is the footprint's.
+    """
+
+    seen: FloatArray
+    poses: Poses
+    regions: Mapping[str, Region]
+    brightness: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevel:
-    """Noise of one reading: `sd` broadcasts to (n_samples, n_points); `rho`, AR(1) within a scan, (n_samples, 1)."""
+    """Noise of one reading: `sd` broadcasts to (n_samples, n_points); the rest are (n_samples, 1).
+
+    `rho` is AR(1) within a scan. With the share `wide_share` a reading's noise is `wide_times` as wide;
+    with the share `lost_share` a reading is lost to `lost_value`; what is left is rounded to `step`,
+    0 for none. `seen` (n_samples, n_points) is the white fraction that was seen, for what goes with it.
+    """
 
     sd: FloatArray
     rho: FloatArray
+    seen: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    wide_share: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    wide_times: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    lost_share: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    lost_value: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    step: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
 
 
 V = TypeVar("V")
@@ -82,9 +125,9 @@ V = TypeVar("V")
 class Effect(Protocol[V]):
     """Physics that a model may leave out: one function at one stage.
 
-    `apply` takes and returns that stage's value: Poses, SceneView, Footprint, an array
-    (n_samples, n_points) of seen fraction u (SEEN, RESPONSE), signal (GAIN), reading
-    (OFFSET, LAG, SATURATION), or NoiseLevel (NOISE).
+    `apply` takes and returns that stage's value: Poses, SceneView, Footprint, View (SEEN), an
+    array (n_samples, n_points) of seen fraction u (RESPONSE), signal (GAIN), reading (OFFSET,
+    LAG, SATURATION), or NoiseLevel (NOISE).
     """
 
     @property

@@ -1,0 +1,203 @@
+"""Surfaces that are not as white or black as they should be: effects on the scene.
+
+Both change every pattern's albedo S, and what a Gaussian footprint N(m, C) sees of the change has a
+closed form. Of S times a linear field t.p, by parts (Stein's lemma):
+E[S t.p] = t.m E[S] + (C t) . dE[S]/dm; of a Gaussian patch, a product of two Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.spots import ALONG_X, Line, SpotPrior, bell, scanned_lines, spot_bank
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import Product
+from probewise.recordings.plan import Plan
+from probewise.scene.albedo import Region
+from probewise.sensor.gaussian import Spot, seen_by_one
+from probewise.sensor.stages import SceneView, Stage
+
+__all__ = ["AlbedoGradient", "AlbedoPatch", "GradedRegion", "PatchedRegion"]
+
+_STEP = 1e-3  # of a standard deviation, for the central difference: its error is a millionth of this
+
+
+@dataclass(frozen=True)
+class AlbedoGradient(NamedEffect[SceneView]):
+    """Paper or light that fades across the table: S (1 + per_mm_x X + per_mm_y Y), lab frame."""
+
+    typical_per_mm: float = 2e-4
+
+    name: ClassVar[str] = "albedo_gradient"
+    stage: ClassVar[Stage] = Stage.SCENE
+    units: ClassVar[tuple[str, ...]] = ("1/mm", "1/mm")
+    covariates: ClassVar[tuple[str, ...]] = ("place",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take two hundredths over the longest scan as typical."""
+        return cls(typical_per_mm=0.02 / extent.length_mm)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share gained a millimetre, along X and along Y."""
+        slope = HeavyTailed(self.typical_per_mm)
+        return Product({"per_mm_x": slope, "per_mm_y": slope})
+
+    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        """Grade every pattern."""
+        return replace(value, regions={name: GradedRegion(r, theta) for name, r in _under(value, plan).items()})
+
+    def bank(self) -> FloatArray:
+        """One setting of two columns: linear in both slopes."""
+        return self.typical_per_mm * np.eye(2)[None, :, :]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how many percent the white fades over 100 mm."""
+        return (
+            f"white grows whiter by {give_or_take(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
+            f"{give_or_take(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, black stays: the paper or its "
+            "illumination is uneven"
+        )
+
+
+@dataclass(frozen=True)
+class AlbedoPatch(NamedEffect[SceneView]):
+    """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y).
+
+    `line` is the scanned line that it is seen from, `lines` are all that it might be.
+    """
+
+    typical: float = 0.05
+    line: Line = ALONG_X
+    lines: tuple[Line, ...] = ()
+
+    name: ClassVar[str] = "albedo_patch"
+    stage: ClassVar[Stage] = Stage.SCENE
+    units: ClassVar[tuple[str, ...]] = ("1", "mm", "mm", "mm")
+    covariates: ClassVar[tuple[str, ...]] = ("place",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look along straight scans, where there are any."""
+        lines = scanned_lines(extent.plan)
+        return cls(line=lines[0], lines=lines) if lines else None
+
+    @cached_property
+    def prior(self) -> SpotPrior:
+        """Albedo at the middle, place and radius."""
+        return SpotPrior("albedo", self.typical, self.line)
+
+    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        """Lay the patch on every pattern."""
+        return replace(value, regions={name: PatchedRegion(r, theta) for name, r in _under(value, plan).items()})
+
+    def variants(self) -> tuple[Self, ...]:
+        """Choose the line."""
+        return tuple(replace(self, line=line) for line in self.lines)
+
+    def bank(self) -> FloatArray:
+        """Places and radii."""
+        return spot_bank(self.typical, self.line)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say where, how large and how much whiter."""
+        kind = "whiter" if mean[0] > 0 else "darker"
+        return (
+            f"around ({give_or_take(mean[1], sd[1])}, {give_or_take(mean[2], sd[2])}) mm, within about "
+            f"{give_or_take(mean[3], sd[3])} mm, every pattern is "
+            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn spot"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GradedRegion:
+    """A region times 1 + per_mm . (X, Y); `per_mm` has shape (n_samples, 2)."""
+
+    region: Region
+    per_mm: FloatArray
+
+    @property
+    def n_regions(self) -> int:
+        """How many hypotheses it holds, or 1."""
+        return max(self.region.n_regions, len(self.per_mm))
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        return self.region.albedo(points_mm) * self._factor(points_mm)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over pixels, the gradient taken at their centres: (n_regions, n_points)."""
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._factor(centers_mm)
+
+    def _factor(self, points_mm: FloatArray) -> FloatArray:
+        return np.asarray(1 + self.per_mm @ points_mm.T)
+
+
+@seen_by_one.register
+def _(region: GradedRegion, spot: Spot, n_nodes: int) -> FloatArray:
+    """By parts: the response times the field at the footprint's centre, and a central difference of the response."""
+    a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
+    x, y = a * spot.var_x + b * spot.cov_xy, a * spot.cov_xy + b * spot.var_y  # C t
+    rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
+    x, y = x / rise * _STEP, y / rise * _STEP
+
+    def shifted(sign: float) -> FloatArray:
+        moved = replace(spot, dx_mm=spot.dx_mm + sign * x, dy_mm=spot.dy_mm + sign * y)
+        return seen_by_one(region.region, moved, n_nodes)
+
+    ahead, behind = shifted(1.0), shifted(-1.0)
+    field = 1 + a * (spot.x_mm + spot.dx_mm) + b * (spot.y_mm + spot.dy_mm)
+    return np.asarray(field * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
+
+
+@dataclass(frozen=True, eq=False)
+class PatchedRegion:
+    """A region and a bell-shaped patch on it; `patch` holds albedo, x, y, r, (n_samples, 4)."""
+
+    region: Region
+    patch: FloatArray
+
+    @property
+    def n_regions(self) -> int:
+        """How many hypotheses it holds, or 1."""
+        return max(self.region.n_regions, len(self.patch))
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        return self.region.albedo(points_mm) + self._added(points_mm)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over pixels, the patch taken at their centres: (n_regions, n_points)."""
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added(centers_mm)
+
+    def _added(self, points_mm: FloatArray) -> FloatArray:
+        albedo, x, y, r = (self.patch[:, k : k + 1] for k in range(4))
+        return albedo * bell((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
+
+
+@seen_by_one.register
+def _(region: PatchedRegion, spot: Spot, n_nodes: int) -> FloatArray:
+    """By the product of two Gaussians: N(m, C) over the patch is a bell of covariance C + r^2."""
+    albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
+    from_x, from_y = spot.x_mm + spot.dx_mm - x, spot.y_mm + spot.dy_mm - y
+    var_x, var_y = spot.var_x + r**2, spot.var_y + r**2
+    det = var_x * var_y - spot.cov_xy**2
+    distance = (var_y * from_x**2 + var_x * from_y**2 - 2 * spot.cov_xy * from_x * from_y) / det
+    added = albedo * r**2 / np.sqrt(det) * np.exp(-0.5 * distance)
+    return seen_by_one(region.region, spot, n_nodes) + added
+
+
+def _under(view: SceneView, plan: Plan) -> Mapping[str, Region]:
+    """Name the regions that lie under some reading."""
+    return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}

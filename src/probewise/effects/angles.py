@@ -1,0 +1,106 @@
+"""How the sensor is really turned: effects on its orientation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.moves import in_scans, mountings
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import Product
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Poses, Stage
+
+__all__ = ["OrientationError", "ScanAngleError"]
+
+
+@dataclass(frozen=True)
+class OrientationError(NamedEffect[Poses]):
+    """The sensor is turned by deg more than was commanded, in all scans, anticlockwise."""
+
+    typical_deg: float = 3.0
+
+    name: ClassVar[str] = "orientation_error"
+    stage: ClassVar[Stage] = Stage.POSE
+    units: ClassVar[tuple[str, ...]] = ("deg",)
+    covariates: ClassVar[tuple[str, ...]] = ("orientation",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Need no scale: three degrees are typical of a mount set by eye."""
+        return cls()
+
+    @cached_property
+    def prior(self) -> Product:
+        """The angle, to either side."""
+        return Product({"deg": HeavyTailed(self.typical_deg)})
+
+    def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        """Turn the poses."""
+        return replace(value, orientation_rad=value.orientation_rad + np.radians(theta))
+
+    def bank(self) -> FloatArray:
+        """One setting: linear in a small angle."""
+        return np.full((1, 1, 1), self.typical_deg)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how many degrees."""
+        return (
+            f"the sensor is turned {give_or_take(mean[0], sd[0])} degrees further anticlockwise than was commanded, "
+            "in all scans"
+        )
+
+
+@dataclass(frozen=True)
+class ScanAngleError(NamedEffect[Poses]):
+    """The same in every scan of one mounting (scans that share an orientation), or in one scan.
+
+    `scans` names those scans, `choices` are all that they might be.
+    """
+
+    typical_deg: float = 3.0
+    scans: tuple[str, ...] = ()
+    choices: tuple[tuple[str, ...], ...] = ()
+
+    name: ClassVar[str] = "scan_angle_error"
+    stage: ClassVar[Stage] = Stage.POSE
+    units: ClassVar[tuple[str, ...]] = ("deg",)
+    covariates: ClassVar[tuple[str, ...]] = ("scan", "orientation")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """List the mountings and scans, where there is more than one."""
+        choices = mountings(extent.plan)
+        return cls(choices=choices) if choices else None
+
+    @cached_property
+    def prior(self) -> Product:
+        """The angle, to either side."""
+        return Product({"deg": HeavyTailed(self.typical_deg)})
+
+    def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        """Turn the poses of those scans."""
+        return replace(value, orientation_rad=value.orientation_rad + np.radians(theta) * in_scans(plan, self.scans))
+
+    def variants(self) -> tuple[Self, ...]:
+        """Choose the mounting or the scan."""
+        return tuple(replace(self, scans=choice) for choice in self.choices)
+
+    def bank(self) -> FloatArray:
+        """Lay out a small angle and large ones to either side."""
+        return self.typical_deg * np.array([1.0, -8.0, 8.0])[:, None, None]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how many degrees, and in which scans."""
+        return (
+            f"in {', '.join(self.scans)} the sensor is turned {give_or_take(mean[0], sd[0])} degrees further "
+            "anticlockwise than was commanded"
+        )

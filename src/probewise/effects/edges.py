@@ -1,0 +1,183 @@
+"""What happens where black meets white, and what a wide skirt of the sensor sees of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.edge_distance import edge_distance
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.spots import bell
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import LogUniform, Product
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Footprint, Stage, View
+
+__all__ = ["EdgeBlur", "EdgeShadow", "Halo"]
+
+
+@dataclass(frozen=True)
+class EdgeBlur(NamedEffect[Footprint]):
+    """Printed edges blurred by a Gaussian of sd_mm: a Gaussian footprint sees them as a wider one sees sharp ones.
+
+    Its covariance grows by sd_mm^2 along each axis, however the sensor is turned.
+    """
+
+    typical_mm: float = 2.0
+
+    name: ClassVar[str] = "edge_blur"
+    stage: ClassVar[Stage] = Stage.FOOTPRINT
+    units: ClassVar[tuple[str, ...]] = ("mm",)
+    covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take two hundredths of the longest scan as typical."""
+        return cls(typical_mm=0.02 * extent.length_mm)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Width of the blur."""
+        return Product({"sd_mm": HeavyTailed(self.typical_mm, positive=True)})
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        """Widen the footprint."""
+        wider = theta[:, :, None] ** 2
+        return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
+
+    def bank(self) -> FloatArray:
+        """One setting: the change goes with the square of the width."""
+        return np.full((1, 1, 1), self.typical_mm)
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Scale the square of the width."""
+        return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how soft."""
+        return f"the printed edges are soft: blurred by {give_or_take(mean[0], sd[0])} mm"
+
+
+@dataclass(frozen=True)
+class Halo(NamedEffect[Footprint]):
+    """Light scattered in the lens: (1 - share) u + share u(skirt), the skirt a Gaussian of sd r_mm about the footprint.
+
+    That is one more Gaussian in the mixture.
+    """
+
+    least_share: float = 1e-3
+    narrowest_mm: float = 10.0
+    widest_mm: float = 100.0
+
+    name: ClassVar[str] = "halo"
+    stage: ClassVar[Stage] = Stage.FOOTPRINT
+    units: ClassVar[tuple[str, ...]] = ("1", "mm")
+    covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look for skirts from a tenth of the longest scan to its whole length."""
+        return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share and radius, over their orders of magnitude."""
+        return Product(
+            {"share": LogUniform(self.least_share, 0.7), "r_mm": LogUniform(self.narrowest_mm, self.widest_mm)}
+        )
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        """Add the skirt to the mixture."""
+        share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
+
+        def joined(own: FloatArray, skirt: FloatArray) -> FloatArray:
+            n_gaussians = max(own.shape[2], value.weight.shape[2])
+            shape = (*np.broadcast_shapes(own.shape[:2], skirt.shape[:2]), n_gaussians)
+            return np.concatenate([np.broadcast_to(own, shape), np.broadcast_to(skirt, (*shape[:2], 1))], axis=2)
+
+        def middle(mean: FloatArray) -> FloatArray:
+            return np.asarray(np.sum(value.weight * mean, axis=2, keepdims=True))
+
+        return replace(
+            value,
+            weight=joined((1 - share) * value.weight, share),
+            u_mm=joined(value.u_mm, middle(value.u_mm)),
+            v_mm=joined(value.v_mm, middle(value.v_mm)),
+            var_u=joined(value.var_u, variance),
+            var_v=joined(value.var_v, variance),
+            cov_uv=joined(value.cov_uv, np.zeros((1, 1, 1))),
+        )
+
+    def bank(self) -> FloatArray:
+        """One column each for five radii."""
+        radii = np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5)
+        return np.stack([np.full(5, 0.02), radii], axis=-1)[:, None, :]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how much light comes from how far."""
+        return (
+            f"a wide halo of {give_or_take(mean[1], sd[1])} mm around the footprint adds "
+            f"{give_or_take(mean[0], sd[0], factor=100)} % of the light: it is scattered in the lens"
+        )
+
+
+@dataclass(frozen=True)
+class EdgeShadow(NamedEffect[View]):
+    """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge."""
+
+    typical: float = 0.01
+    narrowest_mm: float = 1.0
+    widest_mm: float = 30.0
+
+    name: ClassVar[str] = "edge_shadow"
+    stage: ClassVar[Stage] = Stage.SEEN
+    units: ClassVar[tuple[str, ...]] = ("1", "mm")
+    covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look for widths from a hundredth to a third of the longest scan."""
+        return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Depth, of either sign, and width."""
+        return Product({"amp": HeavyTailed(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
+
+    def apply(self, value: View, theta: FloatArray, plan: Plan) -> View:
+        """Darken what is seen near an edge."""
+        everywhere = (1, len(plan))
+        x_mm, y_mm = (
+            np.broadcast_to(place, np.broadcast_shapes(place.shape, everywhere))
+            for place in (value.poses.x_mm, value.poses.y_mm)
+        )
+        parts = [
+            (rows, edge_distance(value.regions[name], x_mm[:, rows], y_mm[:, rows]))
+            for name, rows in plan.rows_by_pattern()
+        ]
+        distance = np.empty((max(len(part) for _, part in parts), len(plan)))
+        for rows, part in parts:
+            distance[:, rows] = part
+        return replace(value, seen=value.seen - theta[:, :1] * bell(distance**2, theta[:, 1:2]))
+
+    def bank(self) -> FloatArray:
+        """One column each for six widths."""
+        widths = np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6)
+        return np.stack([np.full(6, self.typical), widths], axis=-1)[:, None, :]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how deep and how wide."""
+        kind = "darker" if mean[0] > 0 else "brighter"
+        return (
+            f"within about {give_or_take(mean[1], sd[1])} mm of an edge it is "
+            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: "
+            "the edge casts a shadow"
+        )

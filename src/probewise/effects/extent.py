@@ -1,0 +1,75 @@
+"""How far a recording reaches, in readings, place and time: what effects take their scales and their banks from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from probewise.errors import ParameterError
+from probewise.recordings.plan import Plan, Recording
+
+__all__ = ["Extent"]
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """The range of a recording's readings, and its plan.
+
+    Parameters
+    ----------
+    low, high
+        Least and largest usable reading.
+    plan
+        Where, when and over what was read.
+    """
+
+    low: float
+    high: float
+    plan: Plan
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ParameterError("Extent(low, high)", (self.low, self.high), "low < high")
+
+    @classmethod
+    def of(cls, recording: Recording) -> Self:
+        """Measure the extent of a recording.
+
+        Raises
+        ------
+        ParameterError
+            If there is no usable reading.
+        """
+        readings = recording.readings[recording.usable]
+        if readings.size == 0:
+            raise ParameterError("usable readings", 0, "at least one; the recording holds none")
+        low, high = float(readings.min()), float(readings.max())
+        tiny = max(abs(low), abs(high), 1.0) * 1e-6
+        return cls(low, max(high, low + tiny), recording.plan)
+
+    @property
+    def span(self) -> float:
+        """Range of the readings, in their unit."""
+        return self.high - self.low
+
+    @cached_property
+    def length_mm(self) -> float:
+        """Length of the longest scan; 1 where nothing moves."""
+        plan = self.plan
+        ends = [(plan.x_mm[rows], plan.y_mm[rows]) for rows in plan.rows_by_scan() if rows.size]
+        return max(float(np.hypot(np.ptp(x), np.ptp(y))) for x, y in ends) or 1.0
+
+    @cached_property
+    def duration_s(self) -> float:
+        """Time from the first reading to the last; 1 where there is none."""
+        return float(np.ptp(self.plan.time_s)) or 1.0
+
+    @cached_property
+    def gap_s(self) -> float:
+        """Time from one reading of a scan to the next, the median; 1 where there is none."""
+        gaps = np.diff(self.plan.time_s)[np.diff(self.plan.scan) == 0]
+        gaps = gaps[gaps > 0]
+        return float(np.median(gaps)) if gaps.size else 1.0

@@ -1,0 +1,118 @@
+"""Single readings that went wrong: heavy tails, and readings lost to one value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.noise_law import NoiseRows
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import LogUniform, Product, Uniform
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import NoiseLevel, Stage
+
+__all__ = ["Dropouts", "Outliers"]
+
+_FAR = 4.0  # noise sd beyond which a reading may be lost rather than noisy
+_RIVAL = (0.02, 6.0)  # share and size of the heavy tail that the test of it is sharpest for
+
+
+@dataclass(frozen=True)
+class Outliers(NamedEffect[NoiseLevel]):
+    """A heavy tail: with probability `share` a reading's noise is `size` times as wide."""
+
+    name: ClassVar[str] = "outliers"
+    stage: ClassVar[Stage] = Stage.NOISE
+    units: ClassVar[tuple[str, ...]] = ("1", "noise sd")
+    covariates: ClassVar[tuple[str, ...]] = ("level", "time")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Need no scale: share and size are pure numbers."""
+        return cls()
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share and size, over their orders of magnitude."""
+        return Product({"share": LogUniform(2e-3, 0.2), "size": LogUniform(2.5, 40.0)})
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Set the tail."""
+        return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
+
+    def bank(self) -> FloatArray:
+        """Equally weighted nodes of the prior, four of each parameter."""
+        u = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) + 0.5) / 4
+        return self.prior.from_unit_cube(u)[:, None, :]
+
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Log likelihood ratio of one tail to none: residuals (n_points, n_draws) -> (n_draws,).
+
+        The sd is taken from the middle half, which the tail leaves alone.
+        """
+        z = residuals / np.maximum(np.median(np.abs(residuals), axis=0) / 0.6745, 1e-300)
+        share, size = _RIVAL
+        wide = np.exp(np.minimum(0.5 * z * z * (1 - size**-2), 600.0)) / size
+        return np.asarray(np.sum(np.log1p(share * (wide - 1)), axis=0))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how many readings are far off, and how far."""
+        return (
+            f"{give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
+            f"{give_or_take(mean[1], sd[1])} times as wide as the others: outliers"
+        )
+
+
+@dataclass(frozen=True)
+class Dropouts(NamedEffect[NoiseLevel]):
+    """Readings lost: with probability `share` a reading is `value`, whatever lies under the sensor."""
+
+    lowest: float = -50.0
+    highest: float = 150.0
+
+    name: ClassVar[str] = "dropouts"
+    stage: ClassVar[Stage] = Stage.NOISE
+    units: ClassVar[tuple[str, ...]] = ("1", "reading")
+    covariates: ClassVar[tuple[str, ...]] = ("level", "time")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take any value within the range of the readings, or a little outside."""
+        return cls(extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share, over its orders of magnitude, and value."""
+        return Product({"share": LogUniform(2e-3, 0.2), "value": Uniform(self.lowest, self.highest)})
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Set the share that is lost, and the value."""
+        return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
+
+    def bank(self) -> FloatArray:
+        """Both ends of the range, where readings are lost to, at two shares."""
+        ends = (self.lowest + 0.01, self.highest - 0.01)
+        return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
+
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Count the readings far from their prediction that are all equal: (n_points, n_draws) -> (n_draws,)."""
+        readings = rows.predicted[:, None] + rows.sd * residuals
+        counts = []
+        for reading, z in zip(readings.T, residuals.T, strict=True):
+            far = np.round(reading[np.abs(z) > _FAR] / (1e-6 * rows.sd))
+            counts.append(max(np.unique(far, return_counts=True)[1], default=0))
+        return np.array(counts, dtype=np.float64)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how many readings are lost, and to which value."""
+        return (
+            f"{give_or_take(mean[0], sd[0], factor=100)} % of the readings are lost: they read "
+            f"{give_or_take(mean[1], sd[1])} whatever lies under the sensor"
+        )

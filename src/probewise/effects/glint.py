@@ -1,0 +1,68 @@
+"""Light that the surface throws back at one place, black or white: an effect on the offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.spots import ALONG_X, Line, SpotPrior, bell, scanned_lines, spot_bank
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Stage
+
+__all__ = ["Glint"]
+
+
+@dataclass(frozen=True)
+class Glint(NamedEffect[FloatArray]):
+    """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y).
+
+    `line` is the scanned line that it is seen from, `lines` are all that it might be.
+    """
+
+    typical: float = 1.0
+    line: Line = ALONG_X
+    lines: tuple[Line, ...] = ()
+
+    name: ClassVar[str] = "glint"
+    stage: ClassVar[Stage] = Stage.OFFSET
+    units: ClassVar[tuple[str, ...]] = ("reading", "mm", "mm", "mm")
+    covariates: ClassVar[tuple[str, ...]] = ("place",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take two hundredths of the readings' range as typical; look along straight scans, where there are any."""
+        lines = scanned_lines(extent.plan)
+        return cls(0.02 * extent.span, lines[0], lines) if lines else None
+
+    @cached_property
+    def prior(self) -> SpotPrior:
+        """Height, place and radius."""
+        return SpotPrior("amp", self.typical, self.line)
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Add the reflection to the readings, (n_samples, n_points)."""
+        amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
+        return np.asarray(value + amp * bell((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r))
+
+    def variants(self) -> tuple[Self, ...]:
+        """Choose the line."""
+        return tuple(replace(self, line=line) for line in self.lines)
+
+    def bank(self) -> FloatArray:
+        """Places and radii."""
+        return spot_bank(self.typical, self.line)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say where, how large and how bright."""
+        return (
+            f"around ({give_or_take(mean[1], sd[1])}, {give_or_take(mean[2], sd[2])}) mm, within about "
+            f"{give_or_take(mean[3], sd[3])} mm, readings are off by {give_or_take(mean[0], sd[0])}, black or white: "
+            "a reflection"
+        )

@@ -1,0 +1,87 @@
+"""Readings on a lattice: rounding that nobody declared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.noise_law import NoiseRows
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import LogUniform, Product
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import NoiseLevel, Stage
+
+__all__ = ["Quantisation", "lattice_step"]
+
+_SEEN_ABOVE = 0.3  # noise sd: a finer lattice, as of printing, is no effect
+
+
+@dataclass(frozen=True)
+class Quantisation(NamedEffect[NoiseLevel]):
+    """Rounded readings: step round(reading / step), after the noise."""
+
+    smallest: float = 0.05
+    largest: float = 20.0
+
+    name: ClassVar[str] = "quantisation"
+    stage: ClassVar[Stage] = Stage.NOISE
+    units: ClassVar[tuple[str, ...]] = ("reading",)
+    covariates: ClassVar[tuple[str, ...]] = ("lattice",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look from a thousandth of the readings' range to a fifth, where no step is declared."""
+        if extent.plan.instrumentation.step is not None:
+            return None
+        return cls(1e-3 * extent.span, 0.2 * extent.span)
+
+    @cached_property
+    def prior(self) -> Product:
+        """The step, over its orders of magnitude."""
+        return Product({"step": LogUniform(self.smallest, self.largest)})
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Set the step."""
+        return replace(value, step=theta[:, :1])
+
+    def bank(self) -> FloatArray:
+        """Equally weighted nodes of the prior."""
+        n_nodes = 16
+        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
+
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Step of the readings' lattice in noise sd, 0 where it is too fine to matter: -> (n_draws,)."""
+        readings = rows.predicted[:, None] + rows.sd * residuals
+        steps = np.array([lattice_step(column) for column in readings.T]) / rows.sd
+        return np.where(steps > _SEEN_ABOVE, steps, 0.0)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how coarse the readings are."""
+        return f"the readings come in steps of {give_or_take(mean[0], sd[0])}, which nobody declared: they are rounded"
+
+
+def lattice_step(readings: FloatArray) -> float:
+    """Find the step of a lattice that holds all readings, 0 where there is none coarser than a millionth of the range.
+
+    Euclid's algorithm on their differences, each remainder below the tolerance taken for rounding.
+    """
+    values = np.unique(readings[np.isfinite(readings)])
+    if len(values) < 3:
+        return 0.0
+    tolerance = 1e-6 * float(values[-1] - values[0])
+    step = 0.0
+    for gap in np.diff(values):
+        larger, smaller = max(step, float(gap)), min(step, float(gap))
+        while smaller > tolerance:
+            rest = larger - smaller * round(larger / smaller)
+            larger, smaller = smaller, abs(rest)
+        step = larger
+        if step <= 10 * tolerance:
+            return 0.0
+    return step

@@ -1,0 +1,114 @@
+"""What the readings themselves remember: effects of the way and the time between one and the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.moves import sign_of_move, turns_back
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import LogUniform, Product
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Stage
+
+__all__ = ["Hysteresis", "Lag"]
+
+
+@dataclass(frozen=True)
+class Hysteresis(NamedEffect[FloatArray]):
+    """A reading that depends on the way: reading + amp d, d the sign of the move along X, or along Y."""
+
+    typical: float = 0.5
+
+    name: ClassVar[str] = "hysteresis"
+    stage: ClassVar[Stage] = Stage.OFFSET
+    units: ClassVar[tuple[str, ...]] = ("reading",)
+    covariates: ClassVar[tuple[str, ...]] = ("direction",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take a hundredth of the readings' range as typical, where scans go both ways."""
+        return cls(typical=0.01 * extent.span) if turns_back(extent.plan) else None
+
+    @cached_property
+    def prior(self) -> Product:
+        """Half the difference between the ways, of either sign."""
+        return Product({"amp": HeavyTailed(self.typical)})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Add it to the readings, (n_samples, n_points)."""
+        return np.asarray(value + theta[:, :1] * sign_of_move(plan))
+
+    def bank(self) -> FloatArray:
+        """One setting: linear in the amplitude."""
+        return np.full((1, 1, 1), self.typical)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how much the two ways differ."""
+        way = "higher" if mean[0] > 0 else "lower"
+        return (
+            f"readings on the way forth are {give_or_take(abs(mean[0]), sd[0], factor=2)} {way} than on the way back, "
+            "black or white: hysteresis"
+        )
+
+
+@dataclass(frozen=True)
+class Lag(NamedEffect[FloatArray]):
+    """Electronics that follow slowly: v_k = a v_(k-1) + (1 - a) y_k with a = exp(-(t_k - t_(k-1)) / tau_s).
+
+    The first reading of a scan is not held back.
+    """
+
+    shortest_s: float = 0.2
+    longest_s: float = 20.0
+
+    name: ClassVar[str] = "lag"
+    stage: ClassVar[Stage] = Stage.LAG
+    units: ClassVar[tuple[str, ...]] = ("s",)
+    covariates: ClassVar[tuple[str, ...]] = ("slope", "direction")
+    amplitudes: ClassVar[tuple[int, ...]] = ()
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look from a sixth of the time between readings, which keeps a four-hundredth, to thirty times it."""
+        return cls(shortest_s=extent.gap_s / 6, longest_s=30 * extent.gap_s)
+
+    @cached_property
+    def prior(self) -> Product:
+        """The time constant, over its orders of magnitude."""
+        return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Hold the readings back, (n_samples, n_points).
+
+        Each reading maps the one before affinely; maps are joined in pairs, then pairs of pairs, until
+        each holds its whole scan up to there.
+        """
+        same = np.diff(plan.scan, prepend=-1) == 0
+        waited = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
+        carry = np.exp(-waited / theta)  # 0 at the first reading of a scan
+        held = (1 - carry) * value
+        reach, longest = 1, int(np.bincount(plan.scan).max(initial=1))
+        while reach < longest:
+            held[:, reach:] = held[:, reach:] + carry[:, reach:] * held[:, :-reach]
+            carry[:, reach:] = carry[:, reach:] * carry[:, :-reach]
+            reach *= 2
+        return held
+
+    def bank(self) -> FloatArray:
+        """One column each for seven time constants."""
+        return np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7)[:, None, None]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how long the sensor takes to follow."""
+        return (
+            f"each reading still holds some of the one before, with a time constant of {give_or_take(mean[0], sd[0])} "
+            "s: the electronics lag behind"
+        )

@@ -1,0 +1,144 @@
+"""What comes back again and again: sine waves in time and in place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import LogUniform, Product, Uniform
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Poses, Stage
+
+__all__ = ["Flicker", "PeriodicPositionError"]
+
+# Two turns: whatever the phase, one of its names lies far from both ends.
+_PHASE = Uniform(-2 * np.pi, 2 * np.pi)
+_MOST_FREQUENCIES = 1024
+
+
+@dataclass(frozen=True)
+class Flicker(NamedEffect[FloatArray]):
+    """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase).
+
+    The mains as the sampling shows them, or a slow lamp: any frequency up to half the rate of readings.
+    """
+
+    typical: float = 0.5
+    lowest_hz: float = 0.01
+    highest_hz: float = 0.5
+    n_frequencies: int = 128
+
+    name: ClassVar[str] = "flicker"
+    stage: ClassVar[Stage] = Stage.OFFSET
+    units: ClassVar[tuple[str, ...]] = ("reading", "Hz", "rad")
+    covariates: ClassVar[tuple[str, ...]] = ("time",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look from 0.01 Hz to half the median rate, twice for each frequency that the duration tells apart."""
+        highest = 0.5 / extent.gap_s
+        if highest <= cls.lowest_hz:
+            return None
+        wanted = 2 * (highest - cls.lowest_hz) * extent.duration_s
+        return cls(0.01 * extent.span, cls.lowest_hz, highest, int(np.clip(np.ceil(wanted), 8, _MOST_FREQUENCIES)))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Amplitude, frequency and phase."""
+        frequency = Uniform(self.lowest_hz, self.highest_hz)
+        return Product({"amp": HeavyTailed(self.typical, positive=True), "alias_hz": frequency, "phase": _PHASE})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Add the wave to the readings, (n_samples, n_points)."""
+        wave = np.sin(2 * np.pi * theta[:, 1:2] * plan.time_s + theta[:, 2:3])
+        return np.asarray(value + theta[:, :1] * wave)
+
+    def bank(self) -> FloatArray:
+        """Sine and cosine at each frequency."""
+        frequencies = np.linspace(self.lowest_hz, self.highest_hz, self.n_frequencies + 2)[1:-1]
+        return _sine_and_cosine(self.typical, frequencies)
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Join the amounts of sine and cosine into amplitude and phase."""
+        return _joined(entry, amounts)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how far the reading swings, and how fast."""
+        return (
+            f"the reading swings by {give_or_take(mean[0], sd[0])} either way at {give_or_take(mean[1], sd[1])} Hz, "
+            f"a period of {1 / mean[1]:.4g} s, black or white: a lamp that flickers"
+        )
+
+
+@dataclass(frozen=True)
+class PeriodicPositionError(NamedEffect[Poses]):
+    """A gear or lead screw that is not round: X + amp_mm sin(2 pi X / period_mm + phase)."""
+
+    typical_mm: float = 0.3
+    shortest_mm: float = 3.0
+    longest_mm: float = 200.0
+    n_periods: int = 48
+
+    name: ClassVar[str] = "periodic_position_error"
+    stage: ClassVar[Stage] = Stage.POSE
+    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "rad")
+    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look from three steps of X to twice its range, where X moves."""
+        x_mm = np.unique(extent.plan.x_mm)
+        if len(x_mm) < 8:
+            return None
+        shortest, longest = 3 * float(np.median(np.diff(x_mm))), 2 * float(np.ptp(x_mm))
+        return cls(0.003 * extent.length_mm, shortest, longest)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Amplitude, period over its orders of magnitude, and phase."""
+        amp = HeavyTailed(self.typical_mm, positive=True)
+        return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": _PHASE})
+
+    def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        """Shift the poses along X, (n_samples, n_points)."""
+        wave = np.sin(2 * np.pi / theta[:, 1:2] * value.x_mm + theta[:, 2:3])
+        return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
+
+    def bank(self) -> FloatArray:
+        """Sine and cosine of periods, evenly spaced in waves over the range, then in their logarithm."""
+        n_even = self.n_periods - 8
+        waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
+        periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
+        return _sine_and_cosine(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Join the amounts of sine and cosine into amplitude and phase."""
+        return _joined(entry, amounts)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how far the arm is off, and after which way it repeats."""
+        return (
+            f"the arm swings by {give_or_take(mean[0], sd[0])} mm about the place it was sent to, again every "
+            f"{give_or_take(mean[1], sd[1])} mm of X: a gear or lead screw that is not round"
+        )
+
+
+def _sine_and_cosine(amplitude: float, rates: FloatArray) -> FloatArray:
+    """Lay out both phases at each rate, (n_rates, 2, 3)."""
+    bank = np.empty((len(rates), 2, 3))
+    bank[..., 0], bank[..., 1], bank[..., 2] = amplitude, rates[:, None], (0.0, np.pi / 2)
+    return bank
+
+
+def _joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
+    sine, cosine = amounts * entry[:, 0]
+    return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])

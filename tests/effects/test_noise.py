@@ -1,0 +1,130 @@
+"""Effects on the noise: what they do to single readings, and the statistics that show them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.effects import (
+    CorrelatedNoise,
+    Dropouts,
+    Extent,
+    NoiseRows,
+    Outliers,
+    Quantisation,
+    SignalDependentNoise,
+    draw_readings,
+    lattice_step,
+    log_density,
+)
+from probewise.recordings import paper_plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel
+
+SD = 0.6
+N = 408
+PLAN = paper_plan()
+CHAIN = Chain(
+    FixedMixture([1.0], [[0.5, 1.5]], [[[16.0, 1.0], [1.0, 9.0]]]), FixedLevels(10, 60), KnownScene(PLAN.patterns)
+)
+NOISES = {
+    "correlated_noise": (CorrelatedNoise(), [0.5]),
+    "signal_dependent_noise": (SignalDependentNoise(), [4.0]),
+    "outliers": (Outliers(), [0.05, 8.0]),
+    "dropouts": (Dropouts(), [0.03, 12.5]),
+    "quantisation": (Quantisation(), [0.9]),
+}
+
+
+def level_of(name: str) -> NoiseLevel:
+    effect, values = NOISES[name]
+    return CHAIN.with_effects(effect).noise_level(np.array([values]), PLAN, np.full((1, 1), SD))
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_a_noise_keeps_the_contract(name):
+    kind = type(NOISES[name][0])
+    effect = kind.for_extent(Extent(10.0, 60.0, PLAN))
+    names = effect.prior.names
+    assert (effect.name, len(effect.units)) == (name, len(names))
+    bank = effect.bank()
+    assert bank.shape[1:] == (1, len(names))
+    assert np.isfinite(effect.prior.log_prob(bank[:, 0])).all()
+    said = effect.sentence(bank[0, 0], np.abs(bank[0, 0]) / 10 + 1e-6)
+    assert any(c.isdigit() for c in said)
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_draws_follow_the_density(name):
+    """Shares of many draws in bins against the density summed over them; one reading on white, others on the edge."""
+    level = level_of(name)
+    rows = np.array([0, 51, 99])
+    level = replace(level, sd=np.broadcast_to(level.sd, (1, N))[:, rows])
+    predicted = np.array([[10.0, 35.0, 60.0]])
+    n_draws = 40_000
+    drawn = draw_readings(
+        level,
+        np.repeat(predicted, n_draws, axis=0),
+        np.arange(3),
+        rng=np.random.default_rng(4),
+    )
+    step = float(level.step[0, 0]) or 0.01
+    fine = step * np.arange(0, round(72 / step) + 1)
+    density = np.exp(np.stack([log_density(level, np.full(3, x), predicted)[0] for x in fine]))
+    bins = step * (np.arange(0, round(72 / step), max(round(0.5 / step), 1)) - 0.5)
+    for k in range(3):
+        found = np.histogram(drawn[:, k], bins)[0] / n_draws
+        wanted = np.histogram(fine, bins, weights=density[:, k] * step)[0]
+        if name == "dropouts":  # a point mass, narrower than the grid of this test
+            at = np.digitize(12.5, bins) - 1
+            assert found[at] == pytest.approx(0.03, abs=0.004 + (0.02 if k == 0 else 0))
+            found, wanted = np.delete(found, at), np.delete(wanted, at)
+        np.testing.assert_allclose(found, wanted, atol=0.012)
+
+
+def test_noise_that_grows_with_the_light_does_so():
+    level = level_of("signal_dependent_noise")
+    np.testing.assert_allclose(level.sd[0, [0, 100]], [SD, SD * np.sqrt(5)], rtol=1e-3)
+
+
+def test_memory_stays_within_a_scan():
+    scan = np.repeat([0, 1], 2)
+    level = NoiseLevel(np.ones((1, 1)), np.full((1, 1), 0.8))
+    drawn = draw_readings(level, np.zeros((50_000, 4)), scan, rng=np.random.default_rng(0))
+    found = np.corrcoef(drawn.T)
+    wanted = np.array([[1, 0.8, 0, 0], [0.8, 1, 0, 0], [0, 0, 1, 0.8], [0, 0, 0.8, 1]])
+    np.testing.assert_allclose(found, wanted, atol=0.02)
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_a_statistic_tells_its_noise_from_white_noise(name):
+    """Of 200 white recordings none comes as high as the middle one of 41 with the effect."""
+    rng = np.random.default_rng(7)
+    predicted = CHAIN.predict(np.zeros((1, 0)), PLAN)
+    steps = np.concatenate([[0], (np.diff(PLAN.scan) == 0).astype(np.int64)])
+    rows = NoiseRows(predicted[0], (predicted[0] - 10) / 50, SD, steps)
+    drawn = draw_readings(level_of(name), np.repeat(predicted, 41, axis=0), PLAN.scan, rng=rng)
+    effect = NOISES[name][0]
+    with_it = effect.statistic(((drawn - predicted) / SD).T, rows)
+    without = effect.statistic(rng.standard_normal((N, 200)), rows)
+    assert with_it.shape == (41,)
+    assert without.max() < np.median(with_it)
+
+
+def test_the_step_of_a_lattice_is_found():
+    rng = np.random.default_rng(2)
+    values = rng.normal(30, 8, 300)
+    assert lattice_step(0.37 * np.round(values / 0.37)) == pytest.approx(0.37)
+    assert lattice_step(np.round(values, 3)) == pytest.approx(0.001)
+    assert lattice_step(values) == 0.0
+    assert lattice_step(np.array([1.0, 1.0, 2.0])) == 0.0
+
+
+def test_a_printing_lattice_and_a_declared_one_are_no_effect():
+    rows = NoiseRows(np.zeros(300), np.zeros(300), SD, np.zeros(300, dtype=np.int64))
+    printed = np.round(np.random.default_rng(2).normal(0, 1, (300, 2)) * SD, 2) / SD
+    np.testing.assert_array_equal(Quantisation().statistic(printed, rows), 0.0)
+    declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))
+    assert Quantisation.for_extent(Extent(10.0, 60.0, declared)) is None

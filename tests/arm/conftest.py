@@ -94,10 +94,12 @@ class PaperMotor:
     began_at: int = 0
     coast: float = 0.25  # counts by unit of power
     blocked_at: int | None = None
+    is_faint: bool = False  # too little power to turn it
 
-    def command(self, now_s, power, run_state, limit):
+    def command(self, now_s, power, run_state, limit, *, regulated=True):
         self.look(now_s)
         self.power, self.run_state, self.limit = power, run_state, limit
+        self.is_faint = abs(power) < 8 and not regulated
         self.since_s, self.began_at = now_s, self.position
         if limit:
             self.target += limit if power > 0 else -limit
@@ -107,7 +109,7 @@ class PaperMotor:
         if self.run_state != 0x20 or not self.power:
             return
         side = 1 if self.power > 0 else -1
-        position = self.began_at + round(10 * self.power * (now_s - self.since_s))
+        position = self.began_at + (0 if self.is_faint else 1) * round(10 * self.power * (now_s - self.since_s))
         if self.blocked_at is not None and side * (position - self.blocked_at) > 0:
             self.position = self.blocked_at
             return
@@ -157,7 +159,8 @@ class PaperBrick:
         if opcode == 0x04:
             power = body[1] - 256 if body[1] > 127 else body[1]
             for motor in self.motors if body[0] == 255 else [self.motors[body[0]]]:
-                motor.command(now_s, power, body[5], int.from_bytes(body[6:10], "little"))
+                limit = int.from_bytes(body[6:10], "little")
+                motor.command(now_s, power, body[5], limit, regulated=bool(body[2] & 4))
             return b""
         if opcode == 0x06:
             motor = self.motors[body[0]]
@@ -195,12 +198,17 @@ class PaperBrick:
         self.is_open = False
 
     def drives(self):
-        """Every command that drives a motor: port, power, limit."""
-        sent = [body for body in self.commands if body[1] == 0x04 and body[3]]
+        """Every command that turns a motor: port, power, limit."""
+        sent = [body for body in self.commands if body[1] == 0x04 and abs(body[3] - 256 * (body[3] > 127)) > 1]
         return [
             (body[2], body[3] - 256 if body[3] > 127 else body[3], int.from_bytes(body[8:12], "little"))
             for body in sent
         ]
+
+    @property
+    def n_sought(self):
+        """How often a motor's target was sought, by driving it without a limit."""
+        return sum(body[1] == 0x04 and body[3] == 1 and not any(body[8:12]) for body in self.commands)
 
     @property
     def at_rest(self):

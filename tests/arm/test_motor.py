@@ -32,13 +32,21 @@ def test_a_motor_that_is_there_already_is_left_alone(motor, paper_brick):
     assert len(paper_brick.drives()) > before
 
 
-def test_every_move_has_a_limit_but_the_one_that_finds_the_target(motor, paper_brick):
+def test_every_move_has_a_limit(motor, paper_brick):
+    """The firmware's target is found without one: no dead line leaves a motor running."""
     paper_brick.motors[0].target = 5000  # as a program that ran before may have left it
     for goal in (300, -300, 0):
         motor.move_to(goal, 1)
-    endless = [drive for drive in paper_brick.drives() if not drive[2]]
-    assert endless == [(0, 15, 0)]
-    assert all(limit < 1000 for _, _, limit in paper_brick.drives())
+    assert all(0 < limit < 1000 for _, _, limit in paper_brick.drives())
+
+
+def test_the_target_is_found_where_the_motor_stands(motor, paper_brick):
+    paper_brick.motors[0].target = -3000
+    paper_brick.motors[0].position = 70
+    assert motor.move_near(71) == 70
+    assert not paper_brick.drives()
+    assert paper_brick.motors[0].target == 70
+    assert abs(motor.move_to(90, 1) - 90) <= 1
 
 
 def test_the_coast_is_learned_whatever_it_is(motor, paper_brick):
@@ -86,17 +94,17 @@ def test_a_reset_makes_the_place_zero_and_the_target_is_still_known(motor, paper
     motor.move_to(500, 1)
     motor.reset()
     assert abs(motor.counts()) == 0
-    before = len([drive for drive in paper_brick.drives() if not drive[2]])
+    before = paper_brick.n_sought
     assert abs(motor.move_to(100, 1) - 100) <= 1
     assert paper_brick.motors[0].position == pytest.approx(600, abs=2)
-    assert len([drive for drive in paper_brick.drives() if not drive[2]]) == before
+    assert paper_brick.n_sought == before == 1
 
 
 def test_counters_that_somebody_else_set_back_are_noticed(motor, paper_brick):
     motor.move_to(500, 1)
     paper_brick.motors[0].zero = 400
     assert abs(motor.move_to(300, 1) - 300) <= 1
-    assert len([drive for drive in paper_brick.drives() if not drive[2]]) == 2
+    assert paper_brick.n_sought == 2
 
 
 def test_a_motor_in_whose_way_something_is_is_held_and_told_of(motor, paper_brick):
@@ -111,7 +119,7 @@ def test_a_motor_in_whose_way_something_is_is_held_and_told_of(motor, paper_bric
 
 def test_a_motor_that_does_not_turn_at_all_is_told_of(motor, paper_brick):
     paper_brick.motors[0].blocked_at = 0
-    with pytest.raises(MotorError, match="motor A does not turn as it is told"):
+    with pytest.raises(MotorError, match="motor A is stuck at 0 counts"):
         motor.move_to(100, 1)
     assert paper_brick.at_rest
 
@@ -152,13 +160,18 @@ def test_the_guard_is_asked_before_every_command_that_turns(clock, paper_brick):
     assert abs(paper_brick.motors[0].position) <= 401
 
 
-def test_the_target_is_sought_on_the_side_where_there_is_room(clock, paper_brick):
-    def guard(here, to):
-        if to < -20:
-            raise ReachError("motor", to, "-20 or more")
+def test_a_motor_that_a_program_drives_is_told_of(motor, paper_brick):
+    carry_out = paper_brick.carry_out
 
-    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock, guard=guard)
-    assert abs(motor.move_to(150, -1) - 150) <= 1
+    def meddled(opcode, body):
+        answer = carry_out(opcode, body)
+        if opcode == 0x04 and body[1] == 1:
+            paper_brick.motors[0].command(paper_brick.clock.now_s, 50, 0x20, 0)
+        return answer
+
+    paper_brick.carry_out = meddled
+    with pytest.raises(MotorError, match="does a program run on the brick"):
+        motor.move_to(100, 1)
 
 
 def test_hold_and_release_are_what_the_firmware_calls_so(motor, paper_brick):

@@ -97,7 +97,7 @@ def test_the_readings_become_a_recording(found):
 def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
     naive = run(small.arm(sensor=small.sensor(0.0)), small.experiment(blur_mm=0.0), rng=rng(), max_readings=60)
     assert naive.reached
-    assert all(info.map.highest <= 1.0 + 1e-12 for info in naive.steps)
+    assert all(info.map.highest <= 1.0 + 1e-5 for info in naive.steps)  # single precision
     assert len(naive.steps) > len(found[0].steps)
 
 
@@ -399,7 +399,7 @@ def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
         small.arm(sensor=small.sensor(0.0)), small.experiment(shape=circle, model=model), rng=rng(), max_readings=3
     )
     assert isinstance(result, Exploration)
-    assert all(info.map.highest <= 1.0 + 1e-12 for info in result.steps)
+    assert all(info.map.highest <= 1.0 + 1e-5 for info in result.steps)
     assert Pose(result.readings[0].pose.x_mm, result.readings[0].pose.y_mm) == result.readings[0].pose
 
 

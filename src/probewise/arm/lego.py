@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.basics import Clock, Side
-from probewise.arm.geometry import Geometry, wrapped
+from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped
 from probewise.arm.instrument import Pose, Reading
 from probewise.arm.machine import Machine
 from probewise.arm.scale import LegoScale
@@ -291,8 +291,12 @@ class LegoArm:
         high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)
         if not high_enough.size:
             return None
-        goal = mechanics.counts_at(float(angles[high_enough[0], joint]), self._arrived[joint])
-        return abs(goal - self._machine.limits.counts[joint]), joint, goal
+        here = self._machine.limits.counts[joint]
+        way = mechanics.counts_at(float(angles[high_enough[0], joint]), self._arrived[joint]) - here
+        # A rough move shorter than a motor runs on would not be made.
+        far = int(math.copysign(max(abs(way), ROOM_COUNTS), way))
+        end = sorted(mechanics.counts_at(angle) - here for angle in (mechanics.low_rad, mechanics.high_rad))
+        return abs(way), joint, here + min(max(far, end[0]), end[1])
 
     def _arrive(self, joint: int, goal: Goal) -> None:
         with_gears = self.geometry.joints[joint].gear_ratio > 0

@@ -79,6 +79,6 @@ class Rounded:
 
 
 def _log_between(away: FloatArray, half: float) -> FloatArray:
-    """Log probability that a standard normal lies within `half` of `away`; by the upper tail, which keeps its digits."""
+    """Log probability that a standard normal is within `half` of `away`, by the upper tail, which keeps its digits."""
     upper, lower = log_ndtr(half - away), log_ndtr(-half - away)
     return np.asarray(upper + np.log1p(-np.exp(lower - upper)))

@@ -58,9 +58,10 @@ class Finishing:
 
 
 def _is_near(prospect: Prospect, goal: Goal) -> bool:
+    """Whether one more reading may end the run, and none has yet."""
     lengths = prospect.theta[:, goal.columns]
     spread = prospect.weight @ (lengths - prospect.weight @ lengths) ** 2
-    return bool(np.sqrt(spread.max()) < _NEAR * goal.sd)
+    return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
 
 
 def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:

@@ -40,7 +40,8 @@ class BrickMachine:
         self.brick.__enter__()
         try:
             for joint, motor in enumerate(self._motors):
-                self.limits.stands(joint, motor.counts())
+                # A session that a dead line ended may have left it turning.
+                self.limits.stands(joint, motor.rest())
             self._light.light_up()
         except BaseException as error:
             self.brick.__exit__(type(error), error, error.__traceback__)

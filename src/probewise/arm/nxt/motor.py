@@ -34,10 +34,9 @@ Guard: TypeAlias = Callable[[int, int], None]
 """Raises ReachError where the motor may not go from one rotation count to another."""
 
 COUNTS_S = 10.0  # that one unit of power stands for
-START_S = 0.2  # two turns of the firmware's regulation: until a motor surely turns
-N_TRIES = 4  # to find the firmware's target
-MOVED_COUNTS = 5  # a motor that moved less did not turn
-DRIVEN = OutputMode.ON | OutputMode.BRAKE | OutputMode.REGULATED
+FAINT_POWER = 1  # a motor needs some 8 to overcome its own friction
+BRAKED = OutputMode.ON | OutputMode.BRAKE
+DRIVEN = BRAKED | OutputMode.REGULATED
 
 
 class MotorError(LinkError):
@@ -147,6 +146,12 @@ class Motor:
         """Keep it where it is, against a load."""
         self._link.ask(self._command(0, 0))
 
+    def rest(self) -> int:
+        """Stop and hold it, and read the count once it has settled."""
+        self.hold()
+        self._clock.sleep(self.drive.settle_s)
+        return self.counts()
+
     def release(self) -> None:
         """Let it turn freely."""
         self._link.ask(SetOutputState(self.port, 0, OutputMode.IDLE, Regulation.IDLE, 0, RunState.IDLE, 0))
@@ -168,7 +173,7 @@ class Motor:
         """
         here = self.counts()
         if self._target is None:
-            here = self._synchronise(side, here)
+            here = self._synchronise()
         for _ in range(self.drive.n_moves):
             ahead = side * (goal - here)
             if abs(ahead) <= self.drive.tolerance_counts and self._arrived == side:
@@ -188,7 +193,7 @@ class Motor:
         here = self.counts()
         side: Side = 1 if goal >= here else -1
         if self._target is None:
-            here = self._synchronise(side, here)
+            here = self._synchronise()
         target = goal - side * self._coasts(self.drive.fast_power, side)
         if min(side * (target - here), side * (target - self._known_target)) > 0:
             here = self._go(target, side, self.drive.fast_power, here)
@@ -236,12 +241,12 @@ class Motor:
         except (NoAnswerError, TelegramError):
             # Sent once and no more: the brick itself says whether it took it.
             if self._state().limit_counts != limit:
-                return self._rest()
+                return self.rest()
         self._target = target
         self._arrived = side
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
         trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, power)
-        here = self._rest()
+        here = self.rest()
         if trouble:
             self._target = None
             raise MotorError(f"motor {self.letter} {trouble}; is it plugged in, and its way free?")
@@ -250,39 +255,20 @@ class Motor:
         self._coast[power, side] = (learned + ran_on) / 2
         return here
 
-    def _synchronise(self, side: Side, here: int) -> int:
-        """Learn the firmware's target: it follows the motor while that turns without a limit.
+    def _synchronise(self) -> int:
+        """Stop the motor and learn the firmware's target, which follows a motor that is driven without a limit.
 
-        A limit soon puts an end to that. It is sent twice and without waiting for answers, so that a
-        telegram that gets lost does not leave the motor running; what then happened tells which were lost.
+        It is driven with a power that does not turn it, so that nothing happens if the line dies here, and
+        that sending it twice does no harm.
         """
-        slow, lead = self.drive.slow_power, self.drive.lead_counts
-        room = round(COUNTS_S * slow * START_S) + 2 * lead + self._coasts(slow, side)
-        for _ in range(N_TRIES):
-            side, start = self._free_side(here, room, side), here
-            self._link.tell(self._command(side * slow, 0))
-            self._clock.sleep(START_S)
-            self._link.tell(self._command(side * slow, lead))
-            self._link.tell(self._command(side * slow, lead))
-            trouble = self._await_idle(here, side * room, slow)
-            here = self._rest()
-            if not trouble and side * (here - start) >= MOVED_COUNTS:  # it stopped at its target
-                self._target = here - side * self._coasts(slow, side)
-                self._arrived = side
-                return here
-        raise MotorError(f"motor {self.letter} does not turn as it is told; is it plugged in, and its way free?")
-
-    def _free_side(self, here: int, room: int, side: Side) -> Side:
-        """Choose the side with room to turn a little; the guard's refusal where neither has."""
-        if self._guard is None:
-            return side
-        other: Side = 1 if side == -1 else -1
-        try:
-            self._guard(here, here + side * room)
-        except ParameterError:
-            self._guard(here, here + other * room)
-            return other
-        return side
+        faint = SetOutputState(self.port, FAINT_POWER, BRAKED, Regulation.IDLE, 0, RunState.RUNNING, 0)
+        self._link.ask(faint)
+        self._clock.sleep(self.drive.settle_s)
+        state = self._state()
+        if (state.power, state.run_state, state.limit_counts) != (FAINT_POWER, RunState.RUNNING, 0):
+            raise MotorError(f"motor {self.letter} is not driven as it was told; does a program run on the brick?")
+        self._target = state.rotation_counts
+        return self.rest()
 
     def _await_idle(self, start: int, farthest: int, power: int) -> str:
         """Wait for a limited move to end; say what is wrong where it sticks, or goes farther than it may."""
@@ -296,12 +282,6 @@ class Motor:
             if now - changed_at > self.drive.stuck_s:
                 return f"is stuck at {here} counts at power {power}"
         return ""
-
-    def _rest(self) -> int:
-        """Hold, and read the count once it has settled."""
-        self.hold()
-        self._clock.sleep(self.drive.settle_s)
-        return self.counts()
 
     def _state(self) -> OutputState:
         state = self._link.ask(GetOutputState(self.port))

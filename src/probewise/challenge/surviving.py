@@ -1,0 +1,83 @@
+"""What a null model leaves of noise-free readings: the lambda of the diagnosis is its norm in units of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.coordinates import default_sensor
+from probewise.diagnosis.evidence import weigh
+from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.noise import NoiseModel, white
+from probewise.effects import Extent
+from probewise.recordings.plan import Recording
+
+__all__ = ["NullRefit"]
+
+_NOISE_SD = 0.6  # the middle of a challenge's noise levels: weighs the readings against the priors
+_MOST_GAUSSIANS = 4
+_BEHIND = 3.0  # nats; an SSF order so far behind the best has no better one beyond it
+
+
+@dataclass(eq=False)
+class NullRefit:
+    """Fit the null to clean readings once, then refit it to readings with an effect, as often as asked.
+
+    The order of the SSF is the one of most evidence on the clean readings, as a diagnosis chooses it. What the
+    null leaves of those, because no mixture of Gaussians has the true SSF's shape, is taken off before a refit.
+    """
+
+    def __post_init__(self) -> None:
+        self._clean: Recording | None = None
+
+    def __call__(self, clean: Recording, changed: Recording) -> float:
+        """Return the root of the sum of squares that a full refit leaves of an effect, in units of the reading."""
+        return float(np.linalg.norm(self.left(clean, changed)))
+
+    def left(self, clean: Recording, changed: Recording) -> FloatArray:
+        """Return the residuals of that refit, (n_usable,)."""
+        return self.refit(clean, changed).residuals
+
+    def refit(self, clean: Recording, changed: Recording) -> Fit:
+        """Refit the null to what an effect makes of a sensor that the null takes exactly."""
+        null = self.null(clean)
+        return _fit(null.model, self.exact(clean, changed), null.z)
+
+    def exact(self, clean: Recording, changed: Recording) -> Recording:
+        """Take off `changed` what the null leaves of `clean`."""
+        readings = changed.readings.copy()
+        readings[clean.usable] -= self.null(clean).residuals
+        return Recording(changed.plan, readings)
+
+    def null(self, clean: Recording) -> Fit:
+        """Fit the null to the clean readings; asked about the same ones again, it remembers."""
+        if self._clean is not clean:
+            self._clean, self._null = clean, _best_order(clean)
+        return self._null
+
+
+def _best_order(clean: Recording) -> Fit:
+    extent, noise = Extent.of(clean), NoiseModel.of((), clean)
+    sensor = default_sensor(extent, 1)
+    found = min(
+        (_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),
+        key=lambda f: f.objective,
+    )
+    best, best_log_z = found, weigh(found, noise, sd_floor=_NOISE_SD).log_z
+    for n in range(2, _MOST_GAUSSIANS + 1):
+        wanted = default_sensor(extent, n)
+        starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
+        found = min((_fit(Model(wanted, (), clean.plan), clean, z) for z in starts), key=lambda f: f.objective)
+        log_z = weigh(found, noise, sd_floor=_NOISE_SD).log_z
+        if log_z > best_log_z:
+            best, best_log_z = found, log_z
+        elif log_z < best_log_z - _BEHIND:
+            break
+    return best
+
+
+def _fit(model: Model, recording: Recording, start: FloatArray) -> Fit:
+    whitener = white(int(recording.usable.sum()))
+    return fit(model, recording, start, whitener, sd_floor=_NOISE_SD, tolerance=0.02)

@@ -33,21 +33,22 @@ from probewise.sensor import field_of, footprint_of
 
 FAULTS = {
     "fragment": Faults(fragment=0.5),
-    "late": Faults(late=0.02, late_s=2.5),
-    "drop": Faults(drop=0.002),
-    "silence": Faults(silence=0.02),
-    "deaf": Faults(deaf=0.02),
+    "late": Faults(late=0.03, late_s=2.5),
+    "drop": Faults(drop=0.003),
+    "silence": Faults(silence=0.03),
+    "deaf": Faults(deaf=0.03),
     "unasked": Faults(unasked=0.2),
-    "disconnect": Faults(disconnect=0.005),
+    "disconnect": Faults(disconnect=0.01),
     "sag": Faults(sag=300.0),
 }
 """More often than on a bad day; the battery is empty after six minutes."""
 
-TRUTH = (600.0, 250.0, 80.0)
+TRUTH = (600.0, 250.0, 120.0)
 GEOMETRY = read_geometry(shipped_geometry())
-MAX_READINGS = 40
+MAX_READINGS = 60
 MAX_SESSIONS = 200
 QUIET_S = 10.0  # the longest limited move, with its run-on
+MISSED_MM = 16.0  # four times the sd at which a run stops
 PLACE_MM = 2.0  # a motor's count, play and the way that a count makes at the far end of the arm
 
 
@@ -189,7 +190,9 @@ def violations(run: Run) -> list[str]:
         wrong.append(f"a question took {run.longest_s:.1f} s")
     if run.n_left_running:
         wrong.append(f"motors left running after {run.n_left_running} sessions")
-    if run.found_mm > max(4.0, 4 * float(run.steps[-1].sd.max())):
+    if "is known" not in str(run.steps[-1].stop_reason):
+        wrong.append(f"the run ended with: {run.steps[-1].stop_reason}")
+    if run.found_mm > MISSED_MM:
         wrong.append(f"the circle missed by {run.found_mm:.1f} mm")
     return wrong
 

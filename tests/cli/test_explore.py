@@ -35,7 +35,7 @@ def test_the_sensor_may_be_learnt_along(explore, capsys):
     [
         ((), "Finishing(of=InformationGain(), least=0.25)"),
         (("--utility", "entropy"), "ReadingEntropy(bin_width=1.0)"),
-        (("--utility", "about:radius_mm"), "InformationAbout(label=ParameterValue(name='radius_mm', n_bins=16))"),
+        (("--utility", "about:radius_mm"), "InformationAbout(of=ParameterValue(name='radius_mm', n_bins=16))"),
     ],
 )
 def test_the_journal_names_the_utility(explore, options, utility):

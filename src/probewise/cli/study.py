@@ -32,9 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     one = parser.add_argument_group("one row instead of the table's", "what is not given is as in the reference row")
     one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, wholly in the field) or anywhere")
     one.add_argument("--model", metavar="NAME", help="what the robot takes its sensor for: ssf or naive")
-    one.add_argument(
-        "--utility", metavar="NAME", help="worth of a reading: information, entropy, per-second, about:..."
-    )
+    one.add_argument("--utility", metavar="NAME", help="worth of a reading: finishing, information, entropy, ...")
     one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
     one.add_argument("--width", type=float, metavar="F", help="believed width of the SSF over the true one")
     one.add_argument("--batch", type=positive_int, metavar="N", help="readings that are chosen together")

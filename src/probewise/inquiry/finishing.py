@@ -43,6 +43,11 @@ class Finishing:
         if not 0 < self.least <= 1:
             raise ParameterError("least", self.least, "greater than 0, up to 1")
 
+    @property
+    def label(self) -> str:
+        """The other's, and what stands in its place near the end."""
+        return f"{self.of.label}, or chance to finish"
+
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Value every design that can be taken, (n,): all by the one measure or all by the other."""
         worth = self.of(prospect)

@@ -32,6 +32,9 @@ class ParameterValue:
     def __post_init__(self) -> None:
         _require_bins(self.n_bins)
 
+    def __str__(self) -> str:
+        return self.name
+
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """See `Label`."""
         if self.name not in names:
@@ -49,6 +52,9 @@ class FunctionValue:
     def __post_init__(self) -> None:
         _require_bins(self.n_bins)
 
+    def __str__(self) -> str:
+        return "a function of the parameters"
+
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """See `Label`."""
         return _evenly_binned(np.asarray(self.function(theta)), weight, self.n_bins)
@@ -57,6 +63,9 @@ class FunctionValue:
 @dataclass(frozen=True)
 class WhichShape:
     """Tell apart which shape of a set lies there."""
+
+    def __str__(self) -> str:
+        return "the shape"
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """See `Label`."""

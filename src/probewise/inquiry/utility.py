@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -17,6 +17,11 @@ __all__ = ["InformationAbout", "InformationGain", "PerSecond", "ReadingEntropy",
 
 class Utility(Protocol):
     """Worth of a reading at each design; more is better. A frozen dataclass, so that a journal can name it."""
+
+    @property
+    def label(self) -> str:
+        """What the worth is, with its unit, for a colour bar."""
+        ...
 
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Value every design that can be taken, (n,)."""
@@ -35,6 +40,8 @@ class ReadingEntropy:
 
     bin_width: float = 1.0
 
+    label: ClassVar[str] = "entropy (bits)"
+
     def __post_init__(self) -> None:
         if not (0 < self.bin_width < np.inf):
             raise ParameterError("bin_width", self.bin_width, "finite, greater than 0")
@@ -52,6 +59,8 @@ class InformationGain:
     the entropy of the noise, which is all that would be left if the parameters were known.
     """
 
+    label: ClassVar[str] = "expected information (bits)"
+
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Bits at every design, (n,)."""
         return prospect.information(prospect.weight)
@@ -65,11 +74,16 @@ class InformationAbout:
     hypotheses of one label disagree on among themselves is of no interest.
     """
 
-    label: Label
+    of: Label
+
+    @property
+    def label(self) -> str:
+        """Information, and what about."""
+        return f"information about {self.of} (bits)"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Bits at every design, (n,)."""
-        labels = self.label(prospect.names, prospect.theta, prospect.weight)
+        labels = self.of(prospect.names, prospect.theta, prospect.weight)
         bits = prospect.reading_entropy(prospect.outlook.mass(prospect.weight))
         for value in np.unique(labels):
             weight = np.where(labels == value, prospect.weight, 0.0)
@@ -83,6 +97,11 @@ class PerSecond:
     """Worth of a reading over the seconds that it takes, travel included."""
 
     of: Utility = field(default_factory=InformationGain)
+
+    @property
+    def label(self) -> str:
+        """The other's, per second."""
+        return f"{self.of.label} per second"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Worth a second at every design, (n,)."""

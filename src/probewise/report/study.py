@@ -11,7 +11,7 @@ import numpy as np
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import png, readings_needed, widths_of_runs
 from probewise.report.words import count, number
-from probewise.study import Estimate, Row, Study, Summary
+from probewise.study import REFERENCE, Estimate, Row, Study, Summary
 
 __all__ = ["answer", "table_csv", "table_of_rows", "write_page"]
 
@@ -75,7 +75,7 @@ def write_page(study: Study, *, command: str) -> str:
     curves = {
         row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]
         for row in summaries
-        if row.utility == "information" and row.noise_sd == 1.0 and row.width == 1.0 and row.batch == 1
+        if row.utility == REFERENCE.utility and row.noise_sd == 1.0 and row.width == 1.0 and row.batch == 1
     }
     needed = figure(
         png(readings_needed({row.name: found for row, found in summaries.items()})),

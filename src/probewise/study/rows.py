@@ -38,7 +38,7 @@ class Row:
 
     population: str = "inside"
     model: str = "ssf"
-    utility: str = "information"
+    utility: str = "finishing"
     noise_sd: float = 1.0
     width: float = 1.0
     learn_sensor: bool = False
@@ -85,6 +85,7 @@ def standard_rows() -> tuple[Row, ...]:
         {"model": "naive"},
         {"population": "anywhere"},
         {"population": "anywhere", "model": "naive"},
+        {"utility": "information"},
         {"utility": "entropy"},
         {"utility": "per-second"},
         {"utility": "about:radius_mm"},

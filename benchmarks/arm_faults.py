@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.arm import LegoArm, Reading, read_geometry, shipped_geometry
+from probewise.arm import LegoArm, Pose, Reading, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link, Timing
 from probewise.calibration import FittedSensor
 from probewise.emulator import Bench, Faults, Stand, VirtualClock, VirtualLine, set_up
@@ -91,19 +91,28 @@ class TimedLink(Link):
 
 
 class WatchedArm(LegoArm):
-    """An arm that remembers, for each reading that it gave, where the sensor truly stood when it was taken."""
+    """An arm that remembers each reading that it gave, and where the sensor truly stood when it was taken."""
 
     def __init__(self, machine, geometry, *, taken, stand, clock, start_s):
         super().__init__(machine, geometry, clock=clock, start_s=start_s)
-        self._taken, stands = taken, []
+        self.link = machine.brick.link
+        self._taken, self._stands = taken, []
         read = machine.read_percent
-        machine.read_percent = lambda: (stands.append(stand()), read())[1]
-        self._stands = stands
+        machine.read_percent = lambda: (self._stands.append(stand()), read())[1]
 
     def measure(self, pose):
         reading = super().measure(pose)
-        self._taken.append((reading, self._stands[-1]))
+        self._taken.append(Taken(pose, reading, self._stands[-1]))
         return reading
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A reading, the pose that was asked for, and where the sensor truly stood."""
+
+    asked: Pose
+    reading: Reading
+    stand: Stand
 
 
 @dataclass
@@ -111,7 +120,7 @@ class Run:
     """What happened in one run, over all its sessions."""
 
     steps: list[Step] = field(default_factory=list)
-    taken: list[tuple[Reading, Stand]] = field(default_factory=list)
+    taken: list[Taken] = field(default_factory=list)
     journal: tuple[Reading, ...] = ()
     mishaps: Counter[str] = field(default_factory=Counter)
     endings: list[str] = field(default_factory=list)
@@ -124,10 +133,22 @@ class Run:
         return float(np.abs(self.steps[-1].mean - TRUTH).max())
 
 
+def bench_with(faults: Faults, clock: VirtualClock, *, seed: int) -> Bench:
+    """Set up the arm over the circle."""
+    circle = Disc(TRUTH[:2], TRUTH[2])
+    return set_up(read_numbers(shipped_geometry()), WORLD, circle, clock, seed=seed, faults=faults)
+
+
+def connected(bench: Bench, clock: VirtualClock, taken: list[Taken], *, start_s: float = 0.0) -> WatchedArm:
+    """Open the line to it; what is measured is added to `taken`."""
+    machine = BrickMachine(Brick(TimedLink(VirtualLine(bench.radio, clock), clock=clock), clock=clock), GEOMETRY)
+    return WatchedArm(machine, GEOMETRY, taken=taken, stand=bench.arm.stand, clock=clock, start_s=start_s)
+
+
 def explored(asked: Experiment, faults: Faults, *, seed: int, journal: Path) -> Run:
     """Let the robot find the circle, opening the line again and going on from the journal whenever it ends."""
     clock, run = VirtualClock(), Run()
-    bench = set_up(read_numbers(shipped_geometry()), WORLD, Disc(TRUTH[:2], TRUTH[2]), clock, seed=seed, faults=faults)
+    bench = bench_with(faults, clock, seed=seed)
     for _ in range(MAX_SESSIONS):
         ended = _session(run, bench, clock, asked, seed=seed, journal=journal)
         run.n_left_running += not _comes_to_rest(bench, clock)
@@ -138,14 +159,10 @@ def explored(asked: Experiment, faults: Faults, *, seed: int, journal: Path) -> 
     return run
 
 
-def _session(
-    run: Run, bench: Bench, clock: VirtualClock, asked: Experiment, *, seed: int, journal: Path
-) -> str | None:
+def _session(run: Run, bench: Bench, clock: VirtualClock, asked: Experiment, *, seed: int, journal: Path) -> str | None:
     """Go on until the run or the line ends; say how the line did."""
     start_s = read_journal(journal).readings[-1].time_s if run.taken else 0.0
-    link = TimedLink(VirtualLine(bench.radio, clock), clock=clock)
-    machine = BrickMachine(Brick(link, clock=clock), GEOMETRY)
-    arm = WatchedArm(machine, GEOMETRY, taken=run.taken, stand=bench.arm.stand, clock=clock, start_s=start_s)
+    arm = connected(bench, clock, run.taken, start_s=start_s)
     try:
         with arm:
             rng = np.random.default_rng(seed)
@@ -153,7 +170,7 @@ def _session(
     except LinkError as error:
         return f"{type(error).__name__}: {error}"
     finally:
-        run.longest_s = max(run.longest_s, link.longest_s)
+        run.longest_s = max(run.longest_s, arm.link.longest_s)
     return None
 
 
@@ -172,14 +189,15 @@ def violations(run: Run) -> list[str]:
     wrong = []
     if not run.steps:
         return [f"no end after {len(run.endings)} sessions: {run.endings[-1]}"]
-    given = [reading for reading, _ in run.taken]
+    given = [taken.reading for taken in run.taken]
     if [(r.value, r.pose, r.time_s) for r in run.journal] != [(r.value, r.pose, r.time_s) for r in given]:
         wrong.append(f"the journal's {len(run.journal)} readings are not the {len(given)} that were taken")
     if len(run.steps) != len(given):
         wrong.append(f"{len(run.steps)} steps from {len(given)} readings")
     if any(after <= before for before, after in zip(*[[r.time_s for r in given[k:]] for k in (0, 1)], strict=False)):
         wrong.append("times that do not grow")
-    for number, (reading, stand) in enumerate(run.taken, start=1):
+    for number, taken in enumerate(run.taken, start=1):
+        reading, stand = taken.reading, taken.stand
         away_mm = math.dist((reading.pose.x_mm, reading.pose.y_mm), (stand.x_mm, stand.y_mm))
         if away_mm > PLACE_MM:
             wrong.append(f"reading {number} was taken {away_mm:.1f} mm from where it says")

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise.arm.basics import Side
 from probewise.errors import ParameterError, ShapeError
 
 __all__ = ["JOINTS", "ROOM_COUNTS", "Geometry", "Joint", "wrapped"]
@@ -41,6 +42,8 @@ class Joint:
         As far as it may ever go.
     play_rad
         How far it can be moved while the motor holds; 0 where its weight keeps it on one side.
+    stop_rad
+        Where a mechanical stop ends its way, at or beyond a limit; None where there is none to find home by.
     """
 
     port: int
@@ -49,6 +52,7 @@ class Joint:
     low_rad: float
     high_rad: float
     play_rad: float = 0.0
+    stop_rad: float | None = None
 
     def __post_init__(self) -> None:
         if self.port not in (0, 1, 2):
@@ -66,11 +70,37 @@ class Joint:
             raise ParameterError("home_deg", math.degrees(self.home_rad), allowed)
         if not 0 <= self.play_rad < self.high_rad - self.low_rad:
             raise ParameterError("play_deg", math.degrees(self.play_rad), "0 or more, less than the joint's range")
+        if self.stop_rad is not None and not (
+            -2 * math.pi <= self.stop_rad <= self.low_rad or self.high_rad <= self.stop_rad <= 2 * math.pi
+        ):
+            raise ParameterError(
+                "stop_deg", math.degrees(self.stop_rad), "low_deg or less, or high_deg or more, within -360 to 360"
+            )
 
     @property
     def counts_per_rad(self) -> float:
         """Counts of the motor, degrees of its shaft, for one radian of the joint."""
         return math.degrees(self.gear_ratio)
+
+    @property
+    def stop_side(self) -> Side | None:
+        """Direction in which its stop lies; None where it has none."""
+        if self.stop_rad is None:
+            return None
+        return 1 if self.stop_rad >= self.high_rad else -1
+
+    @property
+    def stop_counts(self) -> int:
+        """Count of a motor that holds the joint against its stop.
+
+        Raises
+        ------
+        ParameterError
+            If it has none.
+        """
+        if self.stop_rad is None or self.stop_side is None:
+            raise ParameterError("stop_deg", None, "an angle: without one the joint has no stop to be found")
+        return self.counts_at(self.stop_rad, self.stop_side)
 
     def counts_at(self, angle_rad: float, side: int = 0) -> int:
         """Count to which the motor must turn, arriving upwards (1) or downwards (-1), for the joint to be at an angle.
@@ -147,6 +177,16 @@ class Geometry:
             raise ParameterError("sensor port", self.sensor_port, "0 to 3, for 1 to 4")
         if len({joint.port for joint in self.joints}) < len(self.joints):
             raise ParameterError("ports", tuple("ABC"[j.port] for j in self.joints), "a port of its own for each joint")
+        if any(joint.stop_rad is not None for joint in (self.shoulder, self.elbow)):
+            ends = [[joint.home_rad if joint.stop_rad is None else joint.stop_rad for joint in self.joints]]
+            height_mm = float(self.position_mm(np.array(ends))[0, 2])
+            if height_mm < self.travel_height_mm:
+                raise ParameterError(
+                    "stop_deg",
+                    _degrees(*ends[0]),
+                    f"stops of the links at which the sensor is {self.travel_height_mm:g} mm up or more, "
+                    f"not {height_mm:.0f} mm: on the way there nothing else guards it",
+                )
 
     @property
     def joints(self) -> tuple[Joint, Joint, Joint]:

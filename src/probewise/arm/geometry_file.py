@@ -120,8 +120,10 @@ def _joint(table: _Table) -> Joint:
     port = table.take("port")
     if port not in ("A", "B", "C"):
         raise table.fail("port", '"A", "B" or "C"')
-    ratio, *degrees = (table.number(f) for f in ("gear_ratio", "home_deg", "low_deg", "high_deg", "play_deg"))
+    ratio = table.number("gear_ratio")
+    home, low, high, play = (math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play"))
+    stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
     try:
-        return Joint("ABC".index(port), ratio, *(math.radians(angle) for angle in degrees))
+        return Joint("ABC".index(port), ratio, home, low, high, play, stop)
     except ParameterError as error:
         raise FileError(table.path, f"{table.where}{error.name} is {error.value!r}", error.allowed) from error

@@ -197,16 +197,33 @@ class LegoArm:
         self._is_down = False
 
     def home(self) -> None:
-        """Bring all joints to where their counters are 0."""
+        """Bring all joints to where their counters are 0; those that have a stop find it first, and count from it.
+
+        The links go to their stops before the base does, so that the sensor is up when that turns.
+
+        Raises
+        ------
+        LinkError
+            If a joint meets no stop, or the brick does not answer.
+        """
+        stopped = []
+        for joint in (ELBOW, SHOULDER, BASE):
+            side = self.geometry.joints[joint].stop_side
+            if side is not None:
+                self._machine.find_stop(joint, side)
+                self._arrived[joint] = side
+                stopped.append(joint)
         self.rise()
         goals = [Goal(0, side) for side in self._sides(np.array([joint.home_rad for joint in self.geometry.joints]))]
         self._arrive(BASE, goals[BASE])
         for joint in self._order(goals):
             self._arrive(joint, goals[joint])
+        if stopped:
+            self._machine.reset(stopped)
 
     def set_home(self) -> None:
         """Take where the arm stands for home: a person has brought it there."""
-        self._machine.reset()
+        self._machine.reset((BASE, SHOULDER, ELBOW))
 
     def release(self) -> None:
         """Let all joints move freely."""

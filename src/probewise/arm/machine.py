@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -37,8 +37,12 @@ class Machine(Protocol):
         """Let all motors turn freely."""
         ...
 
-    def reset(self) -> None:
-        """Take where all motors stand for 0."""
+    def find_stop(self, joint: int, side: Side) -> None:
+        """Turn a joint gently in direction `side` until it meets its stop, and take its counts from there."""
+        ...
+
+    def reset(self, joints: Sequence[int]) -> None:
+        """Take where these joints' motors stand for 0."""
         ...
 
     def read_percent(self) -> float:
@@ -89,11 +93,16 @@ class Rehearsal:
         """Say it."""
         self._say("release all motors")
 
-    def reset(self) -> None:
-        """Take where all stand for 0."""
-        for joint in range(3):
+    def find_stop(self, joint: int, side: Side) -> None:
+        """Say it."""
+        self.limits.stands(joint, self._geometry.joints[joint].stop_counts)
+        self._say(f"{JOINTS[joint]:<8} {'up' if side > 0 else 'down'} to its stop")
+
+    def reset(self, joints: Sequence[int]) -> None:
+        """Take where these stand for 0."""
+        for joint in joints:
             self.limits.stands(joint, 0)
-        self._say("set all counters to 0")
+        self._say(f"set to 0 the counters of {', '.join(JOINTS[joint] for joint in joints)}")
 
     def read_percent(self) -> float:
         """Say it; nothing is read."""

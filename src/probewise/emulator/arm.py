@@ -39,7 +39,9 @@ class Joint:
             for angle_deg in (numbers.low_deg - _BEYOND_LIMITS_DEG, numbers.high_deg + _BEYOND_LIMITS_DEG)
         )
         play_deg = numbers.play_deg * abs(numbers.gear_ratio)
-        return cls(numbers, Motor(MotorNature(stops_deg=(ends[0], ends[1]), play_deg=play_deg)))
+        # The stops are the joint's: its motor gets there half the play later.
+        stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
+        return cls(numbers, Motor(MotorNature(stops_deg=stops_deg, play_deg=play_deg)))
 
     @property
     def angle_rad(self) -> float:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from types import TracebackType
 from typing import Self
 
 from probewise.arm.basics import Side
-from probewise.arm.geometry import Geometry
+from probewise.arm.geometry import ROOM_COUNTS, Geometry
 from probewise.arm.limits import SoftLimits
 from probewise.arm.nxt.brick import Brick
 from probewise.arm.nxt.motor import Motor
@@ -31,9 +31,9 @@ class BrickMachine:
     def __init__(self, brick: Brick, geometry: Geometry) -> None:
         self.brick = brick
         self.limits = SoftLimits(geometry)
-        self._motors = [
-            brick.motor(joint.port, guard=partial(self.limits.check, k)) for k, joint in enumerate(geometry.joints)
-        ]
+        self._joints = geometry.joints
+        self._zeros = [0, 0, 0]  # counts at which the joints are at home; not 0 from a stop found to the next reset
+        self._motors = [brick.motor(joint.port, guard=partial(self._check, k)) for k, joint in enumerate(self._joints)]
         self._light = brick.light(geometry.sensor_port)
 
     def __enter__(self) -> Self:
@@ -57,22 +57,34 @@ class BrickMachine:
     def move_to(self, joint: int, goal: int, side: Side) -> None:
         """Turn a joint's motor to a count, arriving in direction `side`, and hold it; see `Motor.move_to`."""
         with self._watched(joint) as motor:
-            motor.move_to(goal, side)
+            motor.move_to(goal + self._zeros[joint], side)
 
     def move_near(self, joint: int, goal: int) -> None:
         """Turn a joint's motor to about a count, and hold it; see `Motor.move_near`."""
         with self._watched(joint) as motor:
-            motor.move_near(goal)
+            motor.move_near(goal + self._zeros[joint])
 
     def release(self) -> None:
         """Let all motors turn freely; where they are turned to by hand shows at the next move."""
         for motor in self._motors:
             motor.release()
 
-    def reset(self) -> None:
-        """Take where all motors stand for 0."""
-        for joint, motor in enumerate(self._motors):
-            motor.reset()
+    def find_stop(self, joint: int, side: Side) -> None:
+        """Turn a joint against its stop; from then on its counts are those of the geometry."""
+        mechanics = self._joints[joint]
+        motor = self._motors[joint]
+        with_gears: Side = side if mechanics.gear_ratio > 0 else -side
+        range_counts = (mechanics.high_rad - mechanics.low_rad) * abs(mechanics.counts_per_rad)
+        found = motor.find_stop(with_gears, round(range_counts) + 2 * ROOM_COUNTS)
+        at_stop = mechanics.stop_counts
+        self._zeros[joint] = found - at_stop
+        self.limits.stands(joint, at_stop)
+
+    def reset(self, joints: Sequence[int]) -> None:
+        """Take where these joints' motors stand for 0."""
+        for joint in joints:
+            self._motors[joint].reset()
+            self._zeros[joint] = 0
             self.limits.stands(joint, 0)
 
     def read_percent(self) -> float:
@@ -94,4 +106,8 @@ class BrickMachine:
         try:
             yield motor
         finally:
-            self.limits.stands(joint, motor.last_counts)
+            self.limits.stands(joint, motor.last_counts - self._zeros[joint])
+
+    def _check(self, joint: int, here: int, to: int) -> None:
+        """Ask the guard, which counts from home."""
+        self.limits.check(joint, here - self._zeros[joint], to - self._zeros[joint])

@@ -34,6 +34,7 @@ Guard: TypeAlias = Callable[[int, int], None]
 """Raises ReachError where the motor may not go from one rotation count to another."""
 
 COUNTS_S = 10.0  # that one unit of power stands for
+STUCK, BEYOND = "is stuck at", "runs on beyond its goal, to"
 FAINT_POWER = 1  # a motor needs some 8 to overcome its own friction
 BRAKED = OutputMode.ON | OutputMode.BRAKE
 DRIVEN = BRAKED | OutputMode.REGULATED
@@ -51,6 +52,8 @@ class Drive:
     ----------
     fast_power, slow_power
         Power of the way, and of the last counts, 1 to 100: about 10 counts/s each.
+    seek_power
+        Power, unregulated, with which it turns towards a mechanical stop: no more than that presses on it.
     coast_counts
         First guess of how far it runs on after a fast move; slow ones in proportion.
     tolerance_counts
@@ -69,6 +72,7 @@ class Drive:
 
     fast_power: int = 60
     slow_power: int = 15
+    seek_power: int = 30
     coast_counts: int = 60
     tolerance_counts: int = 1
     lead_counts: int = 30
@@ -84,6 +88,8 @@ class Drive:
                 (self.slow_power, self.fast_power),
                 "1 to 100, the fast one not below the slow",
             )
+        if not FAINT_POWER < self.seek_power <= 100:
+            raise ParameterError("seek_power", self.seek_power, f"{FAINT_POWER + 1} to 100, enough to turn the motor")
         for name in ("coast_counts", "tolerance_counts", "lead_counts", "runaway_counts", "settle_s"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
@@ -199,6 +205,39 @@ class Motor:
             here = self._go(target, side, self.drive.fast_power, here)
         return here
 
+    def find_stop(self, side: Side, farthest: int) -> int:
+        """Turn in a direction until something stops it, gently, and hold it there; no guard is asked.
+
+        Parameters
+        ----------
+        side
+            The direction.
+        farthest
+            It must be stopped within so many counts.
+
+        Returns
+        -------
+        The count at the stop.
+
+        Raises
+        ------
+        MotorError
+            If nothing stops it.
+        """
+        start = self._synchronise()
+        power = side * self.drive.seek_power
+        gently = SetOutputState(self.port, power, BRAKED, Regulation.IDLE, 0, RunState.RUNNING, farthest)
+        while not self._start(start + side * farthest, side, gently):
+            start = self._synchronise()
+        trouble = self._await_idle(start, side * (farthest + self.drive.runaway_counts))
+        here = self.rest()
+        self._target = None  # it lies behind the stop
+        if trouble != STUCK:
+            raise MotorError(
+                f"motor {self.letter} met no stop within {farthest} counts; is it plugged in, its gear whole?"
+            )
+        return here
+
     @property
     def _known_target(self) -> int:
         if self._target is None:
@@ -235,25 +274,31 @@ class Motor:
         stop = target + side * self._coasts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
-        limit = side * (target - self._known_target)
-        try:
-            self._link.ask(self._command(side * power, limit))
-        except (NoAnswerError, TelegramError):
-            # Sent once and no more: the brick itself says whether it took it.
-            if self._state().limit_counts != limit:
-                return self.rest()
-        self._target = target
-        self._arrived = side
+        if not self._start(target, side, self._command(side * power, side * (target - self._known_target))):
+            return self.rest()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
-        trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, power)
+        trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here)
         here = self.rest()
         if trouble:
             self._target = None
-            raise MotorError(f"motor {self.letter} {trouble}; is it plugged in, and its way free?")
+            raise MotorError(
+                f"motor {self.letter} {trouble} {here} counts at power {power}; is it plugged in, and its way free?"
+            )
         ran_on = side * (here - target)
         learned = self._coast.get((power, side), ran_on)
         self._coast[power, side] = (learned + ran_on) / 2
         return here
+
+    def _start(self, target: int, side: Side, command: SetOutputState) -> bool:
+        """Order a limited move, once and no more; tell whether the brick took it."""
+        try:
+            self._link.ask(command)
+        except (NoAnswerError, TelegramError):
+            if self._state().limit_counts != command.limit_counts:
+                return False
+        self._target = target
+        self._arrived = side
+        return True
 
     def _synchronise(self) -> int:
         """Stop the motor and learn the firmware's target, which follows a motor that is driven without a limit.
@@ -270,7 +315,7 @@ class Motor:
         self._target = state.rotation_counts
         return self.rest()
 
-    def _await_idle(self, start: int, farthest: int, power: int) -> str:
+    def _await_idle(self, start: int, farthest: int) -> str:
         """Wait for a limited move to end; say what is wrong where it sticks, or goes farther than it may."""
         here, changed_at = start, self._clock.monotonic()
         while (state := self._state()).run_state != RunState.IDLE:
@@ -278,9 +323,9 @@ class Motor:
             if state.rotation_counts != here:
                 here, changed_at = state.rotation_counts, now
             if abs(here - start) > abs(farthest):
-                return f"runs on beyond {start + farthest} counts at power {power}"
+                return BEYOND
             if now - changed_at > self.drive.stuck_s:
-                return f"is stuck at {here} counts at power {power}"
+                return STUCK
         return ""
 
     def _state(self) -> OutputState:

@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, CYCLE, axes_or_new, tidy
 
-__all__ = ["information_gained", "posterior_widths"]
+__all__ = ["information_gained", "posterior_widths", "towards_target"]
 
 
 def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
@@ -30,6 +30,12 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     for (name, sd), colour in zip(widths_mm.items(), CYCLE, strict=False):
         number = np.arange(1, len(sd) + 1)
         ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {len(sd)} readings")
+    ax.legend(frameon=False, fontsize="small")
+    return towards_target(ax, target_mm)
+
+
+def towards_target(ax: Axes, target_mm: float) -> Axes:
+    """Lay out axes for posterior sds against the number of readings, with a line at the precision asked for."""
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(f"{target_mm:g} mm", (1, target_mm), xytext=(2, -11), textcoords="offset points", fontsize="small")
     ax.set_yscale("log")
@@ -37,7 +43,6 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend(frameon=False, fontsize="small")
     return tidy(ax, x="number of readings", y="widest posterior sd (mm)")
 
 

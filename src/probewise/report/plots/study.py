@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import (
-    BLACK,
     BLUE,
     CYCLE,
     GREY,
@@ -20,6 +18,7 @@ from probewise.report.plots.canvas import (
     grid_of_axes,
     tidy,
 )
+from probewise.report.plots.progress import towards_target
 from probewise.study import Summary
 
 __all__ = ["readings_needed", "widths_of_runs"]
@@ -49,15 +48,8 @@ def widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float
         low, high = np.quantile(table, _BAND, axis=0)
         ax.fill_between(number, low, high, color=colour, alpha=0.18, linewidth=0)
         ax.plot(number, np.median(table, axis=0), color=colour, label=f"{name} ({len(widths)} runs)")
-    ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
-    ax.annotate(f"{target_mm:g} mm", (1, target_mm), xytext=(2, -11), textcoords="offset points", fontsize="small")
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
-    return tidy(ax, x="number of readings", y="widest posterior sd (mm)")
+    return towards_target(ax, target_mm)
 
 
 def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:

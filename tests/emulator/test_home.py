@@ -1,0 +1,110 @@
+"""Home found by the joints' stops, on an arm that nobody has brought there."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from probewise import arm
+from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
+from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
+from probewise.recordings import Disc
+from probewise.world.shipped import truth
+
+SHIPPED = arm.read_geometry(arm.shipped_geometry())
+STOPS_DEG = {"base": -193.0, "shoulder": 163.0, "elbow": 43.0}  # 3 degrees outside the limits, as the emulator has them
+
+
+def with_stops(*names: str) -> arm.Geometry:
+    return dataclasses.replace(
+        SHIPPED,
+        **{n: dataclasses.replace(getattr(SHIPPED, n), stop_rad=math.radians(STOPS_DEG[n])) for n in names},
+    )
+
+
+def lost(clock: VirtualClock, **turned_deg: float) -> Bench:
+    """Set up an arm whose joints were turned by hand while its counters showed 0."""
+    bench = set_up(read_geometry(shipped_geometry()), truth("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1)
+    names = ("base", "shoulder", "elbow")
+    for joint, name in zip(bench.arm.joints, names, strict=True):
+        joint.bring_to(joint.numbers.home_deg + turned_deg.get(name, 0.0))
+    clock.sleep(0.01)
+    bench.radio.brick.advance()
+    for port in bench.radio.brick.outputs.ports:
+        port.reset(block=False)
+    return bench
+
+
+def connected(bench: Bench, clock: VirtualClock, geometry: arm.Geometry) -> arm.LegoArm:
+    machine = BrickMachine(Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock), geometry)
+    return arm.LegoArm(machine, geometry, clock=clock)
+
+
+def lowest_while(bench: Bench) -> list[float]:
+    """Collect the sensor's height at each telegram from now on."""
+    heights: list[float] = []
+    answer = bench.radio.brick.answer
+
+    def watched(telegram: bytes) -> bytes | None:
+        reply = answer(telegram)
+        heights.append(bench.arm.stand().height_mm)
+        return reply
+
+    bench.radio.brick.answer = watched  # type: ignore[method-assign]
+    return heights
+
+
+@pytest.mark.parametrize(
+    "turned_deg", [{"base": 25.0, "shoulder": 20.0, "elbow": -12.0}, {"base": -60.0, "shoulder": -30.0, "elbow": 9.0}]
+)
+def test_an_arm_with_stops_comes_home_from_wherever_it_was(clock: VirtualClock, turned_deg: dict[str, float]) -> None:
+    bench = lost(clock, **turned_deg)
+    heights = lowest_while(bench)
+    geometry = with_stops("base", "shoulder", "elbow")
+    with connected(bench, clock, geometry) as lego:
+        lego.home()
+        found = [math.degrees(joint.angle_rad) for joint in bench.arm.joints]
+        # Within a count and a half; 21 and 12 counts are a degree; at home the play lies on the side of arrival.
+        np.testing.assert_allclose(found, [-90, 90, -20], atol=0.1 + 0.2)
+        np.testing.assert_allclose(np.degrees(lego.angles_rad), [-90, 90, -20], atol=0.25)
+        place = np.array([[300.0, 200.0]])
+        lego.go_down(*place[0])
+        stand = bench.arm.stand()
+        assert math.dist((stand.x_mm, stand.y_mm), place[0]) < 3.0
+        assert stand.height_mm == pytest.approx(14.0, abs=2.0)
+    assert min(heights) > geometry.lowest_mm
+    with connected(bench, clock, geometry) as lego:  # the counters on the brick are those of home
+        np.testing.assert_allclose(lego.position_mm[:2], place[0], atol=3.0)
+
+
+def test_joints_without_a_stop_keep_their_counters(clock: VirtualClock) -> None:
+    bench = lost(clock, base=30.0)
+    with connected(bench, clock, with_stops("base")) as lego:
+        lego.turn(2, math.radians(10))
+        lego.home()
+    assert [round(math.degrees(joint.angle_rad)) for joint in bench.arm.joints] == [-90, 90, -20]
+
+
+def test_a_stop_that_is_not_there_is_told_of(clock: VirtualClock) -> None:
+    bench = lost(clock)
+    base = bench.arm.joints[0].motor
+    base.nature = dataclasses.replace(base.nature, stops_deg=(-math.inf, math.inf))
+    with (
+        connected(bench, clock, with_stops("base")) as lego,
+        pytest.raises(MotorError, match="motor A met no stop within 4420 counts"),
+    ):
+        lego.home()
+    bench.radio.brick.advance()
+    assert not base.speed_deg_s
+
+
+def test_home_is_found_on_a_bad_line_too(clock: VirtualClock) -> None:
+    bench = lost(clock, base=25.0, shoulder=20.0)
+    bench.radio.faults = Faults(deaf=0.03, silence=0.03, fragment=0.3)
+    with connected(bench, clock, with_stops("base", "shoulder", "elbow")) as lego:
+        lego.home()
+    assert sum(bench.radio.mishaps.values()) > 5
+    np.testing.assert_allclose([math.degrees(j.angle_rad) for j in bench.arm.joints], [-90, 90, -20], atol=0.3)

@@ -149,6 +149,9 @@ SPOILED = [
     ("home_deg = -90", "home_deg = 90", "joints.base.home_deg is"),
     ("low_deg = -190", "low_deg = 190", "the low one below the high"),
     ("play_deg = 0.3", "play_deg = -1", "joints.base.play_deg is"),
+    ("play_deg = 0.3", "play_deg = 0.3\nstop_deg = -100", "joints.base.stop_deg is -100.0"),
+    ("home_deg = 90", "home_deg = 90\nstop_deg = -25", "not -178 mm"),
+    ("home_deg = 90", "home_deg = 90\nstop_deg = true", "joints.shoulder.stop_deg is True"),
     ("[links]", "[lines]", "links is missing"),
     ("[links]", "links = 3\n[lines]", "links is missing"),
     ("[field]", "[field", "not TOML"),
@@ -189,3 +192,21 @@ def test_the_examples_hold_the_shipped_file():
 def test_a_joint_without_sense_is_refused(wrong):
     with pytest.raises(ParameterError):
         Joint(**{"port": 0, "gear_ratio": 7.0, "home_rad": 0.0, "low_rad": -1.0, "high_rad": 1.0, **wrong})
+
+
+@pytest.mark.parametrize(("stop_rad", "side", "counts"), [(1.1, 1, 447), (-1.0, -1, -407), (None, None, None)])
+def test_the_count_at_a_stop_has_the_play_on_its_side(stop_rad, side, counts):
+    """7 turns of 180 / pi degrees for a radian: 401.07 counts, and half the play, 0.03 / 2, beyond the stop."""
+    joint = Joint(0, 7.0, 0.0, -1.0, 1.0, 0.03, stop_rad)
+    assert joint.stop_side == side
+    if counts is None:
+        with pytest.raises(ParameterError, match="no stop"):
+            _ = joint.stop_counts
+    else:
+        assert joint.stop_counts == counts
+
+
+def test_a_stop_is_read_from_the_file(tmp_path):
+    text = shipped_geometry().read_text().replace("play_deg = 0.3", "play_deg = 0.3\nstop_deg = -193")
+    (tmp_path / "mine.toml").write_text(text)
+    assert read_geometry(tmp_path / "mine.toml").base.stop_rad == pytest.approx(math.radians(-193))

@@ -176,6 +176,24 @@ def test_an_arm_can_be_brought_home_by_hand_or_by_itself(bench):
     assert [motor.position - motor.zero for motor in bench.paper.motors] == pytest.approx([0, 0, 0], abs=1)
 
 
+def test_a_rehearsal_of_homing_goes_to_the_stops_first():
+    """The links before the base, so that the sensor is up when that turns."""
+    stops = {"base": -193.0, "shoulder": 163.0, "elbow": 43.0}
+    geometry = dataclasses.replace(
+        SHIPPED, **{n: dataclasses.replace(getattr(SHIPPED, n), stop_rad=math.radians(a)) for n, a in stops.items()}
+    )
+    said = []
+    with LegoArm(Rehearsal(geometry, said.append), geometry) as arm:
+        arm.home()
+    assert [line.split()[:4] for line in said[:3]] == [
+        ["elbow", "up", "to", "its"],
+        ["shoulder", "up", "to", "its"],
+        ["base", "down", "to", "its"],
+    ]
+    assert "set to 0 the counters of elbow, shoulder, base" in said
+    assert {line.split()[0] for line in said[3:6]} == {"base", "shoulder", "elbow"}
+
+
 def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
     with bench.arm as arm:
         start = arm.angles_rad

@@ -174,6 +174,18 @@ def test_a_motor_that_a_program_drives_is_told_of(motor, paper_brick):
         motor.move_to(100, 1)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_stop_is_found_gently(motor, paper_brick, side):
+    """By one limited move without regulation, which would press with all it has."""
+    paper_brick.motors[0].blocked_at = side * 432
+    paper_brick.motors[0].target = 9999
+    assert motor.find_stop(side, 1000) == side * 432
+    assert paper_brick.drives() == [(0, side * 30, 1000)]
+    assert paper_brick.at_rest
+    paper_brick.motors[0].blocked_at = None
+    assert abs(motor.move_to(0, -side)) <= 1
+
+
 def test_hold_and_release_are_what_the_firmware_calls_so(motor, paper_brick):
     motor.hold()
     motor.release()
@@ -196,6 +208,7 @@ WRONG = [
     {"slow_power": 0},
     {"fast_power": 101},
     {"slow_power": 70},
+    {"seek_power": 1},
     {"settle_s": -1.0},
     {"n_moves": 0},
     {"stuck_s": 0.0},

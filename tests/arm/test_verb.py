@@ -58,7 +58,7 @@ def test_jog_down_asks_a_person_to_look(capsys):
 def test_home_here_sets_the_counters_where_a_person_brought_the_arm(capsys):
     out = said(capsys, "arm", "home", "--here", "--dry-run").out
     assert "base -90, shoulder 90, elbow -20 degrees" in out
-    assert "set all counters to 0" in out
+    assert "set to 0 the counters of base, shoulder, elbow" in out
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,14 @@
 """A sensor model made by hand, and recordings small enough for a test."""
 
+import io
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from probewise.calibration import FittedSensor, write_sensor
 from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
+from probewise.report import exploration
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
 
@@ -47,3 +51,11 @@ def recording_file(tmp_path):
     path = tmp_path / "small.csv"
     write_recording(small_recording(), path)
     return path
+
+
+@pytest.fixture
+def quick_frames(monkeypatch):
+    """Draw every step of a run as one black pixel."""
+    dot = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(dot, "PNG")
+    monkeypatch.setattr(exploration, "frame", lambda *_, **__: dot.getvalue())

@@ -119,7 +119,6 @@ def test_a_sensor_model_with_a_field_missing_says_which(sensor_file, recording_f
         ("--max-readings", "0"),
         ("--seed", "-1"),
         ("--seed", "x"),
-        ("--live", "1"),
         ("--model", "perfect"),
         ("--arm", "third"),
         ("--utility", "spiral"),
@@ -146,6 +145,7 @@ def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, r
         "explore": ["explore", "--sensor", sensor_file, "--out", out],
         "diagnose": ["diagnose", recording_file, "--out", out],
         "study": ["study", "--out", out],
+        "challenge": ["challenge", "--out", out],
         "arm": ["arm", "check", "--out", out / "reach.png"],
         "emulate-nxt": ["emulate-nxt", "--log", out / "log.txt"],
     }[verb]

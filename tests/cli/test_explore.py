@@ -5,13 +5,10 @@ import json
 import pytest
 
 from probewise.cli import main
-from probewise.report import exploration
 
 
 @pytest.fixture
-def explore(sensor_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(exploration, "frame", lambda *_, **__: b"png")
-
+def explore(sensor_file, tmp_path, quick_frames):
     def call(*options):
         out = tmp_path / "found"
         where = ("--sensor", sensor_file, "--truth", "500,250,90", "--out", out, "--seed", 3)

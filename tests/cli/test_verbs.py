@@ -42,9 +42,8 @@ def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, 
     assert "seed 1" in capsys.readouterr().out
 
 
-def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(exploration, "frame", lambda *_, **__: b"png")
-    options = ("--sensor", sensor_file, "--truth", "500,250,90", "--live", 30, "--quiet", "--seed", 3)
+def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, quick_frames):
+    options = ("--sensor", sensor_file, "--truth", "500,250,90", "--quiet", "--seed", 3)
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert run("explore", *options, "--out", whole, "--max-readings", 3) == 0
     assert run("explore", *options, "--out", cut, "--max-readings", 2) == 0
@@ -54,6 +53,26 @@ def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, 
         json.loads(line)["reading"] for line in lines[1][1:]
     ]
     assert (cut / "report.html").read_text().startswith("<!doctype html>")
+    assert (cut / "run.gif").read_bytes().startswith(b"GIF")
+
+
+def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quick_frames):
+    """The page loads itself anew until the run is over; it is opened once."""
+    pages, opened = [], []
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url))
+    shown = exploration.live_page
+
+    def remember(*arguments):
+        pages.append(shown(*arguments))
+        return pages[-1]
+
+    monkeypatch.setattr(exploration, "live_page", remember)
+    out = tmp_path / "out"
+    assert run("explore", "--sensor", sensor_file, "--out", out, "--live", "--quiet", "--max-readings", 2) == 0
+    assert ['http-equiv="refresh"' in page for page in pages] == [True, False]
+    assert (out / "live.html").read_text() == pages[-1]
+    assert "max_readings" in pages[-1]
+    assert opened == [(out / "live.html").as_uri()]
 
 
 def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_path, monkeypatch, capsys):
@@ -62,7 +81,7 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
 
     monkeypatch.setattr(exploration, "frame", stop)
     out = tmp_path / "out"
-    assert run("explore", "--sensor", sensor_file, "--out", out, "--live", 30, "--quiet") == 130
+    assert run("explore", "--sensor", sensor_file, "--out", out, "--quiet") == 130
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "journal.jsonl keeps 1 readings" in said

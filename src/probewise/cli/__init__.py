@@ -16,7 +16,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from probewise.cli import arm, calibrate, demo, diagnose, emulate_nxt, explore, predict, study
+from probewise.cli import arm, calibrate, challenge, demo, diagnose, emulate_nxt, explore, predict, study
 from probewise.cli._common import OneLineParser, Verb
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
@@ -29,6 +29,7 @@ VERBS: tuple[Verb, ...] = (
     explore.VERB,
     study.VERB,
     diagnose.VERB,
+    challenge.VERB,
     arm.VERB,
     emulate_nxt.VERB,
 )

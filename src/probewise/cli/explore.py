@@ -11,7 +11,6 @@ from probewise.cli._common import (
     Verb,
     add_common,
     add_out_directory,
-    check_live,
     check_out_directory,
     positive_int,
     say,
@@ -61,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-readings", type=positive_int, default=100, metavar="N", help="stop here at the latest (default 100)"
     )
     parser.add_argument(
-        "--live", type=positive_int, default=200, metavar="N", help="live points of nested sampling (default 200)"
+        "--live", action="store_true", help="show the robot's view in a browser while it works (DIR/live.html)"
     )
     parser.add_argument(
         "--utility",
@@ -83,6 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, infer, inquire; keep a journal and a picture of every step."""
+    import webbrowser
+
     import numpy as np
     from tqdm import tqdm
 
@@ -91,8 +92,9 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.cli._geometry import parse_truth
     from probewise.experiment import Exploration, explore
     from probewise.inquiry import utility_named
-    from probewise.recordings import write_bytes_atomically
+    from probewise.recordings import write_bytes_atomically, write_text_atomically
     from probewise.report import exploration as report
+    from probewise.report.animation import gif
     from probewise.scene import outlines
 
     out = check_out_directory(arguments.out)
@@ -106,12 +108,10 @@ def run(arguments: argparse.Namespace) -> int:
         posing.shape_named(arguments.shape, field),
         field,
         model=arguments.model,
-        n_live=arguments.live,
         utility=utility_named(arguments.utility),
         learn_sensor=arguments.learn_sensor,
         batch=arguments.batch,
     )
-    check_live(arguments.live, len(experiment.names))
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
     arm: Instrument
@@ -150,12 +150,17 @@ def run(arguments: argparse.Namespace) -> int:
             readings.append((pose.x_mm, pose.y_mm, step.reading.value))
             frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
             write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
+            if arguments.live:
+                write_text_atomically(out / "live.html", report.live_page(step, frames[-1]))
+                if len(frames) == 1:
+                    webbrowser.open((out / "live.html").absolute().as_uri())
             bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
             bar.update()
     result = Exploration(experiment, tuple(steps))
     with staged(out) as stage:
         page = report.write_page(result, frames, seed=arguments.seed, model=arguments.model, truth=known)
         (stage / "report.html").write_text(page, encoding="utf-8")
+        (stage / "run.gif").write_bytes(gif(frames))
     say(result.summary(), quiet=arguments.quiet)
     if known is not None:
         say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import shlex
-from collections.abc import Iterator
-from concurrent.futures import Executor
 from typing import TYPE_CHECKING, Any
 
 from probewise.cli._common import Verb, add_out_directory, add_quiet, check_out_directory, positive_int, say, staged
-from probewise.errors import LinkError, ParameterError
+from probewise.cli._executor import add_executor, executor_of
+from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     from probewise.study import Row
@@ -40,11 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-readings", type=positive_int, default=100, metavar="N", help="a run ends here as a miss (default 100)"
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=positive_int, default=1, metavar="N", help="processes here (default 1)")
-    where.add_argument(
-        "--scheduler", metavar="HOST:PORT", help="a dask scheduler whose workers do it (extra `cluster`)"
-    )
+    add_executor(parser)
     add_quiet(parser)
 
 
@@ -65,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     trials = out / "trials.jsonl"
     ended = 0
     with (
-        _executor(arguments) as executor,
+        executor_of(arguments) as executor,
         tqdm(total=sum(numbers.values()), desc="runs", unit="", disable=True if arguments.quiet else None) as bar,
     ):
 
@@ -99,35 +93,6 @@ def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
     if "noise" in given:
         given["noise_sd"] = given.pop("noise")
     return (Row(**given),)
-
-
-@contextlib.contextmanager
-def _executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield what does the runs: this process, some of its own, or a cluster's workers."""
-    if arguments.scheduler is not None:
-        with _cluster(arguments.scheduler) as executor:
-            yield executor
-    elif arguments.workers > 1:
-        from probewise.cli._workers import workers
-
-        with workers(arguments.workers) as pool:
-            yield pool
-    else:
-        yield None
-
-
-@contextlib.contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ParameterError("--scheduler", address, 'the extra: pip install "probewise[cluster]"') from error
-    try:
-        client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise LinkError(f"no scheduler answers at {address}; start one with `dask scheduler`") from error
-    with client:
-        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
 
 
 def _command(arguments: argparse.Namespace) -> str:

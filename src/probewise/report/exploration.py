@@ -14,7 +14,7 @@ from probewise.report.plots import information_gained, playing_field, png, poste
 from probewise.report.words import count, number, signed
 from probewise.scene import AnyOf, outlines
 
-__all__ = ["answer", "errors_text", "frame", "steps_table", "view", "write_page"]
+__all__ = ["answer", "errors_text", "frame", "live_page", "steps_table", "view", "write_page"]
 
 
 def view(
@@ -72,6 +72,14 @@ def frame(
 ) -> bytes:
     """Draw the picture of one step as a PNG."""
     return png(view(step, experiment, readings, levels=levels, truth_mm=truth_mm), dpi=90)
+
+
+def live_page(step: Step, picture: bytes) -> str:
+    """Write the page that shows a run while it works: it loads itself anew every second until the run is over."""
+    state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
+    found = figure(picture, f"Next, the robot reads at the green place. {step.summary()}.")
+    every_s = None if step.stop_reason else 1
+    return page("The robot's search", answer=f"{state}.", key_figure=found, sections=(), reload_s=every_s)
 
 
 def errors_text(step: Step, truth: Mapping[str, float]) -> str:

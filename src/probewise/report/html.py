@@ -66,7 +66,9 @@ def figure(png: bytes, caption: str, *, alt: str = "") -> Markup:
     return element("figure", image, element("figcaption", caption))
 
 
-def page(title: str, *, answer: str, key_figure: Markup, sections: Sequence[Section]) -> str:
+def page(
+    title: str, *, answer: str, key_figure: Markup, sections: Sequence[Section], reload_s: int | None = None
+) -> str:
     """Build a page whose first screen is the answer in one sentence and the picture that shows it.
 
     Parameters
@@ -79,13 +81,17 @@ def page(title: str, *, answer: str, key_figure: Markup, sections: Sequence[Sect
         The picture to go with it, from `figure`.
     sections
         Everything else, in reading order.
+    reload_s
+        Load the page anew after so many seconds; None: never.
     """
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
         key_figure,
         *(element("section", element("h2", s.heading), *s.body) for s in sections),
     )
+    again = () if reload_s is None else (Markup(f'<meta http-equiv="refresh" content="{reload_s}">'),)
     head = fragment(
+        *again,
         Markup('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'),
         element("title", title),
         element("style", Markup(_STYLE)),

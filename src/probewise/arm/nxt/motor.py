@@ -247,11 +247,13 @@ class Motor:
     def _approach(self, goal: int, side: Side, here: int) -> int:
         """Go on towards the goal: fast to a place well short of it, or slowly all the way."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
+        target = goal - side * self._coasts(slow, side)
+        if side * self._known_target >= side * target:
+            here = self._synchronise()  # left there by a move the other way, it would lead beyond the goal
         least = max(side * here, side * self._known_target) + 1  # a target behind this moves nothing
         short = goal - side * (2 * self.drive.lead_counts + self._coasts(fast, side))
         if side * short > least + self.drive.lead_counts:
             return self._go(short, side, fast, here)
-        target = goal - side * self._coasts(slow, side)
         return self._go(side * max(side * target, least), side, slow, here)
 
     def _back_off(self, goal: int, side: Side, here: int) -> int:

@@ -8,6 +8,7 @@ run of nested sampling.
 
 from probewise.report.plots.arm import reach_map
 from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
+from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
 from probewise.report.plots.progress import information_gained, posterior_widths
@@ -21,6 +22,7 @@ from probewise.report.plots.witness import witness
 __all__ = [
     "AxesGrid",
     "calibration_check",
+    "confusion_matrix",
     "corner_plot",
     "grid_of_axes",
     "hypothesis_probabilities",
@@ -34,6 +36,7 @@ __all__ = [
     "reach_map",
     "readings_by_orientation",
     "readings_needed",
+    "reliability_diagram",
     "residuals_against",
     "run_plot",
     "spatial_sensitivity",

@@ -1,0 +1,51 @@
+"""Who does a campaign's tasks: this process, some of its own, or the workers of a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import Executor
+
+from probewise.cli._common import positive_int
+from probewise.errors import LinkError, ParameterError
+
+__all__ = ["add_executor", "executor_of"]
+
+
+def add_executor(parser: argparse.ArgumentParser) -> None:
+    """Add --workers and --scheduler."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=positive_int, default=1, metavar="N", help="processes here (default 1)")
+    where.add_argument(
+        "--scheduler", metavar="HOST:PORT", help="a dask scheduler whose workers do it (extra `cluster`)"
+    )
+
+
+@contextlib.contextmanager
+def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
+    """Yield what does the tasks; None stands for this process."""
+    if arguments.scheduler is not None:
+        with _cluster(arguments.scheduler) as executor:
+            yield executor
+    elif arguments.workers > 1:
+        from probewise.cli._workers import workers
+
+        with workers(arguments.workers) as pool:
+            yield pool
+    else:
+        yield None
+
+
+@contextlib.contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ParameterError("--scheduler", address, 'the extra: pip install "probewise[cluster]"') from error
+    try:
+        client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise LinkError(f"no scheduler answers at {address}; start one with `dask scheduler`") from error
+    with client:
+        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]

@@ -1,0 +1,37 @@
+"""A run as a moving picture: its frames, one after another, in a GIF."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+from PIL import Image
+
+from probewise.errors import ParameterError
+
+__all__ = ["gif"]
+
+
+def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
+    """Join PNGs into a GIF that repeats for ever.
+
+    Parameters
+    ----------
+    frames
+        One PNG or more; smaller ones are set on white at the upper left.
+    frame_s, last_s
+        How long each is shown, and the last one, in seconds.
+    """
+    if not frames:
+        raise ParameterError("frames", 0, "one picture or more")
+    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
+    size = (max(p.width for p in pictures), max(p.height for p in pictures))
+    sheets = []
+    for picture in pictures:
+        sheet = Image.new("RGB", size, "white")
+        sheet.paste(picture, (0, 0))
+        sheets.append(sheet.convert("P", palette=Image.Palette.ADAPTIVE))
+    durations = [round(1000 * frame_s)] * (len(sheets) - 1) + [round(1000 * last_s)]
+    out = io.BytesIO()
+    sheets[0].save(out, "GIF", save_all=True, append_images=sheets[1:], duration=durations, loop=0)
+    return out.getvalue()

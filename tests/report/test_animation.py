@@ -1,0 +1,35 @@
+"""A GIF of a run: every frame, in order, as long as asked for."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from probewise.errors import ParameterError
+from probewise.report.animation import gif
+
+
+def png(colour, size):
+    out = io.BytesIO()
+    Image.new("RGB", size, colour).save(out, "PNG")
+    return out.getvalue()
+
+
+def test_frames_follow_each_other_and_smaller_ones_are_set_on_white():
+    moving = Image.open(io.BytesIO(gif([png("red", (8, 6)), png("blue", (4, 6))], frame_s=0.5, last_s=2.0)))
+    assert moving.n_frames == 2
+    assert moving.size == (8, 6)
+    assert moving.info["loop"] == 0
+    assert moving.info["duration"] == 500
+    assert tuple(np.asarray(moving.convert("RGB"))[3, 6]) == (255, 0, 0)
+    moving.seek(1)
+    assert moving.info["duration"] == 2000
+    second = np.asarray(moving.convert("RGB"))
+    assert tuple(second[3, 1]) == (0, 0, 255)
+    assert tuple(second[3, 6]) == (255, 255, 255)
+
+
+def test_no_frames_make_no_picture():
+    with pytest.raises(ParameterError, match="one picture or more"):
+        gif([])

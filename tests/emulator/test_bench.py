@@ -94,7 +94,7 @@ def test_a_joint_stops_beyond_its_limits(geometry: Geometry) -> None:
     motor = arm.motors()["ABC".index(base.port)]
     for _ in range(20_000):
         motor.step(1e-3, 100, brake=False, battery_mv=9000)
-    end_deg = base.home_deg + motor.angle_deg / base.gear_ratio
+    end_deg = math.degrees(arm.joints[0].angle_rad)
     assert min(abs(end_deg - base.low_deg), abs(end_deg - base.high_deg)) == pytest.approx(3.0)
 
 

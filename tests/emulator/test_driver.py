@@ -48,6 +48,7 @@ def bench_over_circle(clock: VirtualClock) -> Bench:
     return set_up(read_geometry(shipped_geometry()), WORLD, CIRCLE, clock, seed=SEED)
 
 
+@pytest.mark.slow
 def test_readings_are_those_of_the_simulated_arm_with_the_same_seed(clock: VirtualClock) -> None:
     """Up to what the motors miss: most are the same whole number, none is off by more than 5 %."""
     places = some_places(12)

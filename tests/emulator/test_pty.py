@@ -32,7 +32,7 @@ def test_the_robot_finds_the_circle_over_a_line_that_is_cut_again_and_again(
     options = ["--sensor", str(sensor), "--scene", scene, "--link", str(link)]
     arguments = ["explore", "--sensor", str(sensor), "--out", str(out), "--arm", f"nxt:{link}", "--quiet"]
     endings = []
-    with emulator(*options, "--fault", "disconnect=0.005", "--fault", "fragment=0.3"):
+    with emulator(*options, "--fault", "disconnect=0.02", "--fault", "fragment=0.3"):
         for _ in range(MAX_SESSIONS):
             resume = ["--resume"] if (out / "journal.jsonl").exists() else []
             endings.append(main([*arguments, *resume]))

@@ -38,6 +38,12 @@ def test_the_shape_of_a_tail_is_found() -> None:
         assert pareto_k(-k * np.log(u)) == pytest.approx(k, abs=0.15)
 
 
+def test_a_tail_of_equal_weights_has_a_shape_too() -> None:
+    """Then one of the tail's candidate shapes is the exponential's, where the formula is nought over nought."""
+    weights = np.concatenate([np.zeros(1890), np.full(110, np.log(2.0))])
+    assert np.isfinite(pareto_k(weights))
+
+
 def test_an_update_agrees_with_a_run_from_scratch() -> None:
     before, after = problem("Gaussian 2-D"), problem("Rosenbrock 2-D")
     fell_back = []

@@ -461,6 +461,7 @@ def pareto_k(log_weight: FloatArray) -> float:
     n_grid = 30 + int(math.sqrt(excess.size))
     quartile = excess[int(excess.size / 4 + 0.5) - 1]
     b = 1.0 / excess[-1] + (1.0 - np.sqrt(n_grid / (np.arange(1, n_grid + 1) - 0.5))) / (3.0 * quartile)
+    b[b == 0.0] = 1e-12 / quartile  # the exponential tail, whose k is 0: its neighbour stands for it
     k = np.log1p(-b[:, None] * excess).mean(axis=1)
     log_profile = excess.size * (np.log(-b / k) - k - 1.0)
     mean_b = float(np.exp(log_profile - logsumexp(log_profile)) @ b)

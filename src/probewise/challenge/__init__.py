@@ -1,0 +1,29 @@
+"""Does the diagnosis keep its promises? Recordings that conceal something, diagnosed blind and scored.
+
+The paper judges a sensor model by the inferences made with it (section "Efficacy of Sensor Model"); a diagnosis is
+judged here the same way, on recordings of another simulator whose truth it never sees.
+"""
+
+from probewise.challenge.case import Task, run_case
+from probewise.challenge.confusion import confusion
+from probewise.challenge.estimates import Estimate
+from probewise.challenge.reliability import Bin, calibration_error, reliability
+from probewise.challenge.run import run_challenge
+from probewise.challenge.surviving import NullRefit
+from probewise.challenge.table import Decision, Row, by_effect, score
+
+__all__ = [
+    "Bin",
+    "Decision",
+    "Estimate",
+    "NullRefit",
+    "Row",
+    "Task",
+    "by_effect",
+    "calibration_error",
+    "confusion",
+    "reliability",
+    "run_case",
+    "run_challenge",
+    "score",
+]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from probewise._arrays import FloatArray
@@ -21,7 +19,6 @@ _MOST_GAUSSIANS = 4
 _BEHIND = 3.0  # nats; an SSF order so far behind the best has no better one beyond it
 
 
-@dataclass(eq=False)
 class NullRefit:
     """Fit the null to clean readings once, then refit it to readings with an effect, as often as asked.
 
@@ -29,16 +26,12 @@ class NullRefit:
     null leaves of those, because no mixture of Gaussians has the true SSF's shape, is taken off before a refit.
     """
 
-    def __post_init__(self) -> None:
+    def __init__(self) -> None:
         self._clean: Recording | None = None
 
     def __call__(self, clean: Recording, changed: Recording) -> float:
         """Return the root of the sum of squares that a full refit leaves of an effect, in units of the reading."""
-        return float(np.linalg.norm(self.left(clean, changed)))
-
-    def left(self, clean: Recording, changed: Recording) -> FloatArray:
-        """Return the residuals of that refit, (n_usable,)."""
-        return self.refit(clean, changed).residuals
+        return float(np.linalg.norm(self.refit(clean, changed).residuals))
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:
         """Refit the null to what an effect makes of a sensor that the null takes exactly."""

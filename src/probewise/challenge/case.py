@@ -1,0 +1,140 @@
+"""One case of a challenge: drawn, diagnosed blind, held against the truth."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from probewise.challenge.covering import parameters_within, place_overlap, sensor_within
+from probewise.challenge.held_out import log_densities
+from probewise.challenge.likeness import cosines
+from probewise.challenge.surviving import NullRefit
+from probewise.diagnosis import Diagnosis, diagnose
+from probewise.errors import DoubtfulResultWarning, ProbewiseError
+from probewise.world.challenge import Case, Hidden, Ruler, draw_case, stratum_of
+from probewise.world.challenge.candidates import Setting
+from probewise.world.concealed import Disturbs
+
+__all__ = ["Task", "run_case"]
+
+_OWN = 1_000  # child of the case's seed sequence that the drawing has no use for
+_LEAST_PROBABILITY = 1e-3
+_LEAST_COSINE = 0.5
+
+
+@dataclass(frozen=True)
+class Task:
+    """Case `number` of the challenge of a sealed seed."""
+
+    seed: int
+    number: int
+
+    @property
+    def key(self) -> str:
+        """Its name in the campaign's file."""
+        return f"{self.seed} / {self.number}"
+
+
+def run_case(task: Task) -> dict[str, Any]:
+    """Draw a case, diagnose it from its recording alone, and say what was stated and what is true.
+
+    Returns
+    -------
+    A JSON object. A case that could not be drawn or whose diagnosis failed has "failed", the reason, and "at",
+    "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
+    """
+    stratum, _ = stratum_of(task.number)
+    result: dict[str, Any] = asdict(stratum)
+    refit = NullRefit()
+    at = "drawing"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what is doubtful is scored like the rest
+        try:
+            case = draw_case(task.seed, task.number, surviving=refit)
+            result |= _truth(case, refit)
+            at = "diagnosis"
+            result |= _diagnosed(case, task)
+        # A campaign of thousands outlives the case that breaks the diagnosis, and tells of it.
+        except (ProbewiseError, ArithmeticError, LookupError, ValueError) as error:
+            result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
+    return result
+
+
+def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
+    truth = case.truth
+    plain = replace(case.world, concealed=(), step=None)
+    ruler = Ruler(Setting(case.recording.plan, plain), refit)
+    return {
+        "plan": truth.plan,
+        "ssf": truth.ssf,
+        "noise_level": truth.noise_level,
+        "noise_model": truth.noise_model,
+        "readings": len(case.recording),
+        "truth": list(truth.combination),
+        "hidden": [_hidden(hidden, ruler, refit) for hidden in truth.hidden],
+        "alias": None if truth.alias is None else truth.alias.effect.name,
+        "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
+    }
+
+
+def _hidden(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
+    """Tell of one effect; "cosines": what else looks like it in this plan, and how much."""
+    on_noise = isinstance(hidden.effect, Disturbs)
+    like = {} if on_noise else cosines(refit, ruler.clean, ruler.recording(hidden.effect))
+    return {
+        "name": hidden.name,
+        "size_lambda": hidden.size_lambda,
+        "on_noise": on_noise,
+        "in_vocabulary": hidden.in_vocabulary,
+        "shows_in": list(hidden.shows_in),
+        "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
+    }
+
+
+def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
+    blind, later, files = (
+        np.random.default_rng(child)
+        for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(3)
+    )
+    begun_s = time.process_time()
+    diagnosis = diagnose(case.recording, rng=blind)
+    cpu_s = time.process_time() - begun_s
+    found = {effect.name: effect for effect in diagnosis.effects}
+    named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
+    region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
+    return {
+        **_said(diagnosis),
+        "where": [place.covariate for place in diagnosis.where],
+        "overlap": None if region is None else place_overlap(region, diagnosis.where),
+        "parameters": {h.name: parameters_within(h, found[h.name]) for h in named},
+        "sensor": sensor_within(case.world, diagnosis.repaired),
+        "held_out": log_densities(case, diagnosis, rng=files),
+        "settled": _settled(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
+        "cpu_s": cpu_s,
+    }
+
+
+def _said(diagnosis: Diagnosis) -> dict[str, Any]:
+    return {
+        "verdict": diagnosis.verdict,
+        "p_value": diagnosis.p_value,
+        "combination": list(diagnosis.combination),
+        "hypotheses": [
+            [list(h.effects), h.probability] for h in diagnosis.hypotheses if h.probability > _LEAST_PROBABILITY
+        ],
+        "credible_set": list(diagnosis.credible),
+    }
+
+
+def _settled(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
+    """Take the readings that the diagnosis asked for and diagnose all of them together."""
+    asked = diagnosis.next_measurement
+    if asked is None:
+        return None
+    more = case.world.simulate(asked.plan, rng=rng)
+    return {"readings": len(more), **_said(diagnose([case.recording, more], rng=rng))}

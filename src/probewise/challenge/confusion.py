@@ -1,0 +1,48 @@
+"""What is taken for what."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise.challenge.scoring import NOISE, answers, fits, leading, on_mean
+from probewise.world.challenge import SINGLES
+
+__all__ = ["confusion"]
+
+OUTSIDE, SEVERAL = "outside", "several"
+
+
+def confusion(results: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
+    """Count what was said where nothing, one effect, or something outside the vocabulary was concealed.
+
+    An alias of the truth counts as the truth. Only names that occur have a row or a column.
+
+    Returns
+    -------
+    Truths, in the order of the vocabulary; what was said; the counts, (n_truths, n_said).
+    """
+    counts: Counter[tuple[str, str]] = Counter()
+    for result in results:
+        if result["kind"] in ("clean", "single", "outside"):
+            truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
+            counts[truth, _said(result, truth)] += 1
+    order = ["clean", *SINGLES, OUTSIDE]
+    said_order = ["clean", *SINGLES, "unknown", SEVERAL]
+    said = {s for _, s in counts}
+    columns = tuple([s for s in said_order if s in said] + sorted(said - set(said_order)))
+    truths = tuple(t for t in order if any(t == found for found, _ in counts))
+    return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
+
+
+def _said(result: Mapping[str, Any], truth: str) -> str:
+    names = leading(result, clean=True)[0]
+    if on_mean(result):
+        names = tuple(name for name in names if name not in NOISE)
+    if truth not in ("clean", OUTSIDE) and fits(names, answers(result, merged=True, noise=not on_mean(result))):
+        return truth
+    return SEVERAL if len(names) > 1 else "".join(names) or "clean"

@@ -1,0 +1,62 @@
+"""Numbers with 95 % intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binomtest, t
+
+from probewise._arrays import FloatArray
+
+__all__ = ["Estimate", "mean", "resampled", "share"]
+
+_DRAWS = 400
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number, the ends of its 95 % interval, and of how many it was made; NaN of none."""
+
+    value: float
+    low: float
+    high: float
+    n: int
+
+
+_NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
+
+
+def share(hits: list[bool]) -> Estimate:
+    """Estimate a share, with Wilson's interval (Wilson 1927)."""
+    if not hits:
+        return _NOTHING
+    found = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
+    return Estimate(sum(hits) / len(hits), float(found.low), float(found.high), len(hits))
+
+
+def mean(values: list[float]) -> Estimate:
+    """Estimate a mean, with Student's interval."""
+    if not values:
+        return _NOTHING
+    center, n = float(np.mean(values)), len(values)
+    if n == 1:
+        return Estimate(center, -math.inf, math.inf, n)
+    half = float(t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
+    return Estimate(center, center - half, center + half, n)
+
+
+def resampled(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
+    """Estimate a statistic of rows (n, ...), with the basic interval of a bootstrap, the same each time.
+
+    The basic interval mirrors the draws about the value, so that a statistic that is biased by few rows is not
+    taken at its word (Davison and Hinkley 1997, section 5.2).
+    """
+    if not len(rows):
+        return _NOTHING
+    rng = np.random.default_rng(len(rows))
+    draws = [statistic(rows[rng.integers(len(rows), size=len(rows))]) for _ in range(_DRAWS)]
+    value, (low, high) = statistic(rows), np.quantile(draws, [0.025, 0.975])
+    return Estimate(value, float(2 * value - high), float(2 * value - low), len(rows))

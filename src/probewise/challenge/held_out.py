@@ -1,0 +1,47 @@
+"""What null, repaired and true model make of readings that a diagnosis never saw."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.calibration import FittedSensor, predict
+from probewise.diagnosis import Diagnosis
+from probewise.recordings.plan import Recording
+from probewise.world.challenge import Case, kept_back
+
+__all__ = ["log_densities"]
+
+
+def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator) -> dict[str, dict[str, float]]:
+    """Sum the log predictive densities of each scan kept back, in nats.
+
+    Both sensors are those that `probewise diagnose` writes. The true model knows the noise-free reading and the sd
+    of the noise's normal part; it is the truth where the noise is white.
+
+    Returns
+    -------
+    By name of the scan: "null", "repaired" and "true".
+    """
+    sensors = {
+        name: samples.fitted_sensor(diagnosis.recording, rng=child)
+        for (name, samples), child in zip(
+            (("null", diagnosis.null), ("repaired", diagnosis.repaired)), rng.spawn(2), strict=True
+        )
+    }
+    return {
+        scan: {
+            **{name: _scored(sensor, recording) for name, sensor in sensors.items()},
+            "true": _truly(case.world.expected(recording.plan), case.world.noise_sd, recording),
+        }
+        for scan, recording in kept_back(case).items()
+    }
+
+
+def _scored(sensor: FittedSensor, recording: Recording) -> float:
+    return float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
+
+
+def _truly(expected: FloatArray, sd: float, recording: Recording) -> float:
+    z = (recording.readings - expected)[recording.usable] / sd
+    return float(-0.5 * z @ z - len(z) * (np.log(sd) + 0.5 * np.log(2 * np.pi)))

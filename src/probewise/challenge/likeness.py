@@ -1,0 +1,79 @@
+"""How alike a concealed effect is to every effect that a diagnosis could name instead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.challenge.surviving import NullRefit
+from probewise.diagnosis.evidence import Blocks, Linearised
+from probewise.diagnosis.fit import Fit, fit
+from probewise.diagnosis.noise import white
+from probewise.diagnosis.templates import effect_templates
+from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
+
+__all__ = ["cosines"]
+
+_WORTH_A_REFIT = 0.8
+
+
+def cosines(
+    refit: NullRefit,
+    clean: Recording,
+    changed: Recording,
+    *,
+    vocabulary: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+) -> dict[str, float]:
+    """Compare what survives of an effect with every named effect on the mean, each at its best.
+
+    Parameters
+    ----------
+    refit
+        The null.
+    clean, changed
+        Noise-free readings without and with the effect.
+    vocabulary
+        The effects to compare with, by name.
+
+    Returns
+    -------
+    For each name rho: the square root of the share of the surviving sum of squares that the effect of that name
+    takes up together with the null. Those that take up most of it are refitted in full, the others linearised.
+    """
+    found = refit.refit(clean, changed)
+    usable = np.flatnonzero(clean.usable)
+    problem = Linearised.of(found, white(len(usable)))
+    extent = Extent.of(clean)
+    out: dict[str, float] = {}
+    for name, kind in vocabulary.items():
+        effect = kind.for_extent(extent)
+        if effect is None or effect.stage is Stage.NOISE:
+            continue
+        templates = effect_templates(found, effect, usable)
+        blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
+        taken = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
+        best = int(np.argmax(taken))
+        rho = float(np.sqrt(min(taken[best] / float(problem.residual @ problem.residual), 1.0)))
+        if rho > _WORTH_A_REFIT:
+            columns, setting = templates.columns[best], templates.settings[best]
+            amount = np.linalg.lstsq(problem.project(columns), problem.residual)[0]
+            start = effect.start(setting, np.asarray(amount, dtype=np.float64))
+            z = found.z + problem.absorbed(found, columns @ amount)
+            rho = _refitted(found, templates.variant(best), start, z, refit.exact(clean, changed))
+        out[name] = rho
+    return out
+
+
+def _refitted(found: Fit, effect: NamedEffect[Any], start: FloatArray, z: FloatArray, exact: Recording) -> float:
+    model = found.model.with_effect(effect)
+    start_z = np.concatenate([z, model.scores_of(start[None, :])[0]])
+    rss = float(found.residuals @ found.residuals)
+    # As floor of the sd a tenth of what survives: far enough below it to be seen, and no exact fit is asked for.
+    floor = 0.1 * np.sqrt(rss / len(found.residuals))
+    with_effect = fit(model, exact, start_z, white(len(found.residuals)), sd_floor=floor, tolerance=0.02)
+    return float(np.sqrt(np.clip(1 - float(with_effect.residuals @ with_effect.residuals) / rss, 0.0, 1.0)))

@@ -1,0 +1,54 @@
+"""Compare stated probabilities with the truth: of what is stated with 0.8, eight of ten cases should be right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.challenge.estimates import Estimate, resampled, share
+from probewise.challenge.scoring import stated
+
+__all__ = ["Bin", "calibration_error", "reliability"]
+
+_EDGES = np.linspace(0, 1, 11)
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Cases of about one stated probability: its mean, and the share that was right."""
+
+    stated: float
+    right: Estimate
+
+
+def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
+    """Sort cases by the probability of their leading hypothesis into ten bins, those without a case left out."""
+    said = [stated(result) for result in results]
+    of_case = _bins_of(np.array([p for p, _ in said]))
+    return tuple(
+        Bin(
+            float(np.mean([p for (p, _), at in zip(said, of_case, strict=True) if at == k])),
+            share([right for (_, right), at in zip(said, of_case, strict=True) if at == k]),
+        )
+        for k in np.unique(of_case)
+    )
+
+
+def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
+    """Return the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
+    found = resampled(np.array([stated(result) for result in results], dtype=np.float64).reshape(-1, 2), _error)
+    return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
+
+
+def _error(said: FloatArray) -> float:
+    """Average over rows of probability and right or not, (n, 2)."""
+    off = np.bincount(_bins_of(said[:, 0]), said[:, 0] - said[:, 1])
+    return float(np.abs(off).sum()) / len(said)
+
+
+def _bins_of(probability: FloatArray) -> IntArray:
+    return np.clip(np.searchsorted(_EDGES, probability, side="right") - 1, 0, len(_EDGES) - 2)

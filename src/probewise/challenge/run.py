@@ -1,0 +1,61 @@
+"""A challenge: its cases, done as a campaign that can be stopped at any moment."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from typing import Any
+
+from probewise._version import __version__
+from probewise.campaign import run_campaign
+from probewise.challenge.case import Task, run_case
+from probewise.errors import ParameterError
+
+__all__ = ["run_challenge"]
+
+
+def run_challenge(
+    n_cases: int,
+    *,
+    seed: int,
+    path: str | os.PathLike[str],
+    executor: Executor | None = None,
+    progress: Callable[[str, Mapping[str, Any]], None] | None = None,
+) -> tuple[Mapping[str, Any], ...]:
+    """Run the first cases of a challenge, or go on with one that was stopped.
+
+    Parameters
+    ----------
+    n_cases
+        How many, from case 0 on. More may be asked for later: what the file holds is not done again.
+    seed
+        The sealed seed: with the number of a case it decides all about it.
+    path
+        The campaign's file.
+    executor
+        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
+    progress
+        Called with key and result of every case that ends.
+
+    Returns
+    -------
+    Results of `run_case` in the order of the cases.
+
+    Raises
+    ------
+    FileError, NotConvergedError
+        See `run_campaign`.
+    """
+    if n_cases < 1:
+        raise ParameterError("n_cases", n_cases, "1 or more")
+    tasks = [Task(seed, number) for number in range(n_cases)]
+    results = run_campaign(
+        run_case,
+        {task.key: task for task in tasks},
+        path=path,
+        settings={"challenge": __version__, "seed": seed},
+        executor=executor,
+        progress=progress,
+    )
+    return tuple(results[task.key] for task in tasks)

@@ -1,0 +1,117 @@
+"""Was what a diagnosis said right? One case at a time, from the result of `run_case`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from probewise.world.challenge import NO_PHYSICS, NOISE_NAMES
+
+__all__ = [
+    "NOISE",
+    "accepted",
+    "answers",
+    "extras",
+    "fits",
+    "is_outside",
+    "leading",
+    "leading_name_right",
+    "names_of",
+    "on_mean",
+    "stated",
+]
+
+NOISE = frozenset(NOISE_NAMES.values())
+"""Effects on the noise."""
+
+_HONEST_NATS = 3.0  # below it two effects cannot be told apart (diagnosis, section 3)
+_LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
+
+Result = Mapping[str, Any]
+Names = tuple[str, ...]
+
+
+def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:
+    """Name all that is right for one concealed effect, its aliases merged."""
+    cosines: Mapping[str, float] = hidden["cosines"]
+    if hidden["in_vocabulary"]:
+        squared = hidden["size_lambda"] ** 2 / 2
+        return frozenset({hidden["name"], *(n for n, rho in cosines.items() if squared * (1 - rho**2) < _HONEST_NATS)})
+    return frozenset(n for n, rho in cosines.items() if rho >= _LIKE) or frozenset({"unknown"})
+
+
+def answers(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
+    """List what has to be named, one set of right names for each thing.
+
+    Parameters
+    ----------
+    result
+        A case.
+    merged
+        Whether an effect's aliases are right too; those of what has no name are always.
+    noise
+        Whether what is wrong with the noise has to be named.
+    """
+    physics = [h for h in result["hidden"] if not h["on_noise"] and h["name"] not in NO_PHYSICS]
+    mean = [accepted(h) if merged or not h["in_vocabulary"] else frozenset({h["name"]}) for h in physics]
+    return mean + [frozenset({name}) for name in result["truth"] if noise and name in NOISE]
+
+
+def fits(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
+    """Tell whether names stand one to one for what is wanted."""
+    return len(names) == len(wanted) and any(
+        all(name in right for name, right in zip(order, wanted, strict=True)) for order in itertools.permutations(names)
+    )
+
+
+def extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
+    """Count the names that stand for nothing that is wanted."""
+    most = max(
+        sum(name in right for name, right in zip(order, wanted, strict=False))
+        for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
+    )
+    return len(names) - most
+
+
+def is_outside(result: Result) -> bool:
+    """Tell whether something is concealed that no name of the vocabulary stands for, not even as an alias."""
+    return frozenset({"unknown"}) in answers(result, merged=True)
+
+
+def on_mean(result: Result) -> bool:
+    """Tell whether all that is concealed, if anything, changes the mean of the readings."""
+    return not any(h["on_noise"] for h in result["hidden"])
+
+
+def leading(result: Result, *, clean: bool) -> tuple[Names, float]:
+    """Return the most probable hypothesis and its probability, `clean` among them or not."""
+    options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
+    return max(options, key=lambda option: option[1], default=((), 0.0))
+
+
+def leading_name_right(result: Result) -> bool:
+    """Tell whether the right names come first of all that are not clean, aliases merged.
+
+    Where the mean is changed, what is said of the noise beside it is left out.
+    """
+    if not on_mean(result):
+        return fits(leading(result, clean=False)[0], answers(result, merged=True))
+    joined: dict[Names, float] = {}
+    for names, p in result["hypotheses"]:
+        key = tuple(name for name in names if name not in NOISE)
+        if key:
+            joined[key] = joined.get(key, 0.0) + p
+    first = max(joined, key=lambda key: joined[key], default=())
+    return fits(first, answers(result, merged=True, noise=False))
+
+
+def stated(result: Result) -> tuple[float, bool]:
+    """Return the probability of the most probable hypothesis, clean among them, and whether it is exactly the truth."""
+    names, probability = leading(result, clean=True)
+    return probability, fits(names, answers(result, merged=False))
+
+
+def names_of(label: str) -> Names:
+    """Take a label of a credible set apart."""
+    return () if label == "clean" else tuple(label.split("+"))

@@ -1,0 +1,277 @@
+"""The table of a challenge: each row what was aimed at, what was found, and whether that decides it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.challenge.estimates import Estimate, mean, resampled, share
+from probewise.challenge.reliability import calibration_error
+from probewise.challenge.scoring import (
+    NOISE,
+    answers,
+    extras,
+    fits,
+    is_outside,
+    leading,
+    leading_name_right,
+    names_of,
+    on_mean,
+    stated,
+)
+
+__all__ = ["Decision", "Row", "by_effect", "score"]
+
+Decision: TypeAlias = Literal["met", "missed", "open"]
+Result: TypeAlias = Mapping[str, Any]
+
+_GAUSSIAN = ("gaussian", "two_lobes")  # SSFs that are mixtures of Gaussians
+_SCANS = ("angle", "pattern", "direction")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row.
+
+    Parameters
+    ----------
+    name
+        What was measured.
+    found
+        The number with its 95 % interval.
+    least, most
+        The target's bounds; no bound, no target.
+    """
+
+    name: str
+    found: Estimate
+    least: float = -math.inf
+    most: float = math.inf
+
+    @property
+    def decision(self) -> Decision | None:
+        """Whether the target is met: decided only where the whole interval is on one side; None without a target."""
+        if math.isinf(self.least) and math.isinf(self.most):
+            return None
+        if self.found.low >= self.least and self.found.high <= self.most:
+            return "met"
+        return "missed" if self.found.low > self.most or self.found.high < self.least else "open"
+
+
+def score(results: Sequence[Result]) -> tuple[Row, ...]:
+    """Score the results of `run_case`; a case that failed counts in the last row alone."""
+    done = [r for r in results if "failed" not in r]
+    return (
+        *_clean(done),
+        *_detection(done),
+        *_naming(done),
+        *_probabilities(done),
+        *_places(done),
+        *_intervals(done),
+        *_held_out(done),
+        *_pairs(done),
+        *_outside(done),
+        *_aliases(done),
+        *_time(done),
+        Row("cases that failed", share(["failed" in r for r in results])),
+    )
+
+
+def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
+    """Tell of each single effect of a size how often it was detected at alpha .01, and named first."""
+    singles = _singles([r for r in results if "failed" not in r], size)
+    names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
+    own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
+    return {name: (_alarms(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
+
+
+def _clean(done: list[Result]) -> list[Row]:
+    clean = [r for r in done if r["kind"] == "clean"]
+    white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
+    models = sorted({r["noise_model"] for r in other})
+    return [
+        Row("false alarms, clean, alpha .05", _alarms(white, 0.05), 0.04, 0.06),
+        Row("false alarms, clean, alpha .01", _alarms(white, 0.01), 0.006, 0.015),
+        Row("false alarms, other noise, alpha .05", _alarms(other, 0.05), most=0.06),
+        *(Row(f"  {m}", _alarms([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
+        Row("physics named, clean", share([_names_physics(r) for r in clean]), most=0.005),
+        Row(
+            "physics named, one Gaussian more",
+            share([_names_physics(r) for r in done if r["kind"] == "ssf_order"]),
+            most=0.01,
+        ),
+    ]
+
+
+def _detection(done: list[Result]) -> list[Row]:
+    targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
+    rows = [
+        Row(f"detection, alpha .01, lambda {size:g}", _alarms(_on_mean(_singles(done, size)), 0.01), least)
+        for size, least in targets.items()
+    ]
+    each = [detected for detected, _ in by_effect(_on_mean(done)).values()]
+    worst = min(each, key=lambda e: (e.value, e.high), default=share([]))
+    return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
+
+
+def _naming(done: list[Result]) -> list[Row]:
+    targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
+    found = {size: share([leading_name_right(r) for r in _singles(done, size)]) for size in targets}
+    falls = [_fall(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
+    worst = max(falls, key=lambda fall: fall.value, default=share([]))
+    return [
+        *(Row(f"right name first, lambda {size:g}", found[size], least) for size, least in targets.items()),
+        Row("right name first, largest fall as lambda grows", worst, most=0.0),
+    ]
+
+
+def _fall(before: Estimate, after: Estimate) -> Estimate:
+    """Subtract two shares, with Newcombe's interval."""
+    fall = before.value - after.value
+    down = math.hypot(before.value - before.low, after.high - after.value)
+    up = math.hypot(before.high - before.value, after.value - after.low)
+    return Estimate(fall, fall - down, fall + up, before.n + after.n)
+
+
+def _probabilities(done: list[Result]) -> list[Row]:
+    covered = [any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in done]
+    sizes = {size: [float(len(r["credible_set"])) for r in _singles(done, size)] for size in (8.0, 12.0)}
+    return [
+        Row("95 % credible set holds the truth", share(covered), 0.95),
+        Row("size of the credible set, lambda 8", mean(sizes[8.0]), most=1.25),
+        Row("size of the credible set, lambda 12", mean(sizes[12.0]), most=1.1),
+        Row("expected calibration error", calibration_error(done), most=0.02),
+        Row("wrong name stated above .9", share([_surely_wrong(r) for r in done]), most=0.005),
+    ]
+
+
+def _places(done: list[Result]) -> list[Row]:
+    targets = {12.0: 0.8, 20.0: 0.9}
+    local = {size: [r["overlap"] for r in _singles(done, size) if r["overlap"] is not None] for size in targets}
+    shown = [r for r in _singles(done, 8.0) if on_mean(r)]
+    first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
+    return [
+        *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
+        Row("right covariate first, lambda 8", share(first), 0.98),
+    ]
+
+
+def _intervals(done: list[Result]) -> list[Row]:
+    right = [r for r in done if fits(r["combination"], answers(r, merged=False)) and not is_outside(r)]
+    stated_of = [interval for r in right for own in r["parameters"].values() for interval in own.values()]
+    gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
+    sensors = [interval for r in gaussian for interval in r["sensor"].values()]
+    return [
+        Row("95 % intervals of effect parameters cover", _covering(stated_of), 0.93, 0.97),
+        Row("95 % intervals of SSF and levels cover", _covering(sensors), 0.93),
+    ]
+
+
+def _covering(intervals: list[list[float]]) -> Estimate:
+    return share([low <= truth <= high for truth, low, high in intervals])
+
+
+def _held_out(done: list[Result]) -> list[Row]:
+    missing = [
+        r for r in done if r["kind"] in ("single", "pair", "outside") and r["noise_model"] == "white" and on_mean(r)
+    ]
+    gains = np.array([[_gains(r, [scan]) for scan in _SCANS] for r in missing]).reshape(-1, len(_SCANS), 2)
+    worse = [_gains(r, _SCANS)[0] < -1.0 for r in done]
+    return [
+        Row("held-out gain, share of the true model's", resampled(gains, _ratio), 0.98),
+        *(Row(f"  a new {scan}", resampled(gains[:, k], _ratio)) for k, scan in enumerate(_SCANS)),
+        Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
+    ]
+
+
+def _gains(result: Result, scans: Sequence[str]) -> tuple[float, float]:
+    """Return what the repaired and the true model gain over the null, nats."""
+    own = [result["held_out"][scan] for scan in scans]
+    return sum(s["repaired"] - s["null"] for s in own), sum(s["true"] - s["null"] for s in own)
+
+
+def _ratio(gains: FloatArray) -> float:
+    repaired, true = gains.reshape(-1, 2).sum(axis=0)
+    return float(repaired / true)
+
+
+def _pairs(done: list[Result]) -> list[Row]:
+    pairs = [r for r in done if r["kind"] == "pair"]
+    both = [leading_name_right(r) for r in pairs]
+    more = [bool(extras(_mean_names(r), answers(r, merged=True, noise=False))) for r in pairs]
+    return [
+        Row("two effects: both named", share(both), 0.95),
+        Row("two effects: a false extra", share(more), most=0.03),
+    ]
+
+
+def _outside(done: list[Result]) -> list[Row]:
+    targets = {12.0: 0.9, 20.0: 0.97}
+    outside = [r for r in done if is_outside(r)]
+    inside = [r for r in done if r["kind"] != "outside"]
+    return [
+        *(
+            Row(
+                f"outside the vocabulary: unknown, lambda {size:g}",
+                share([r["verdict"] == "unknown" for r in outside if r["size"] == size]),
+                least,
+            )
+            for size, least in targets.items()
+        ),
+        Row("false unknown", share([r["verdict"] == "unknown" for r in inside]), most=0.02),
+    ]
+
+
+def _aliases(done: list[Result]) -> list[Row]:
+    aliased = [r for r in done if r["kind"] == "alias"]
+    settled = [r | r["settled"] if r["settled"] else r for r in aliased]
+    return [
+        Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
+        Row("aliased pair: sure of the wrong name", share([_surely_wrong(r) for r in aliased]), most=0.01),
+        Row("right name after the advised readings", share([stated(r)[1] for r in settled]), 0.95),
+    ]
+
+
+def _time(done: list[Result]) -> list[Row]:
+    plans = {"paper": 5.0, "two_way": math.inf}
+    return [
+        Row(
+            f"processor time of a diagnosis, {plan} plan (s)",
+            mean([r["cpu_s"] for r in done if r["plan"] == plan]),
+            most=most,
+        )
+        for plan, most in plans.items()
+    ]
+
+
+def _singles(done: Sequence[Result], size: float) -> list[Result]:
+    return [r for r in done if r["kind"] == "single" and r["size"] == size]
+
+
+def _on_mean(results: Sequence[Result]) -> list[Result]:
+    """Keep what the p-value speaks of: that nothing is missing from the mean."""
+    return [r for r in results if on_mean(r)]
+
+
+def _alarms(results: Sequence[Result], alpha: float) -> Estimate:
+    return share([r["p_value"] <= alpha for r in results])
+
+
+def _names_physics(result: Result) -> bool:
+    return bool(set(result["combination"]) - NOISE - {"unknown"})
+
+
+def _mean_names(result: Result) -> list[str]:
+    return [name for name in leading(result, clean=True)[0] if name not in NOISE]
+
+
+def _surely_wrong(result: Result) -> bool:
+    probability, right = stated(result)
+    names = leading(result, clean=True)[0]
+    return probability > 0.9 and not right and names not in ((), ("unknown",))

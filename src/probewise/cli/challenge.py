@@ -1,0 +1,67 @@
+"""`probewise challenge`: what a diagnosis is worth, on concealed recordings of another simulator."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from typing import Any
+
+from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, positive_int, say, staged
+from probewise.cli._executor import add_executor, executor_of
+
+__all__ = ["VERB"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    add_out_directory(parser)
+    parser.add_argument(
+        "--cases",
+        type=positive_int,
+        default=60,
+        metavar="N",
+        help="recordings, always the first of the seed's; 60 are one of each kind, 6000 the whole table (default 60)",
+    )
+    add_executor(parser)
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run what is left of the challenge and write its table."""
+    from tqdm import tqdm
+
+    from probewise.challenge import run_challenge, score
+    from probewise.report import challenge as report
+
+    out = check_out_directory(arguments.out)
+    out.mkdir(parents=True, exist_ok=True)
+    cases = out / "cases.jsonl"
+    ended = 0
+    with (
+        executor_of(arguments) as executor,
+        tqdm(total=arguments.cases, desc="cases", unit="", disable=True if arguments.quiet else None) as bar,
+    ):
+
+        def advance(key: str, result: Any) -> None:
+            nonlocal ended
+            ended += 1
+            bar.set_postfix_str(key)
+            bar.update()
+
+        try:
+            results = run_challenge(
+                arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=advance
+            )
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(f"{cases} keeps {ended} more cases; the same command goes on") from stop
+    rows = score(results)
+    command = shlex.join(["probewise", "challenge", "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
+    with staged(out) as stage:
+        (stage / "table.csv").write_text(report.table_csv(rows), encoding="utf-8")
+        (stage / "report.html").write_text(report.write_page(results, command=command), encoding="utf-8")
+    say(report.answer(rows, len(results)), quiet=arguments.quiet)
+    say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+VERB = Verb("challenge", "Measure what a diagnosis is worth, on concealed recordings.", add_arguments, run)

@@ -1,0 +1,123 @@
+"""The page of a challenge: the table of targets, what is taken for what, and whether probabilities are honest."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from probewise.challenge import Estimate, Row, by_effect, confusion, reliability, score
+from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.plots import confusion_matrix, png, reliability_diagram
+from probewise.report.words import count
+
+__all__ = ["answer", "table_csv", "table_of_rows", "write_page"]
+
+Results = Sequence[Mapping[str, Any]]
+
+_DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
+
+
+def answer(rows: Sequence[Row], n_cases: int) -> str:
+    """Say in one sentence how many targets are met."""
+    n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
+    return (
+        f"{count(n_cases, 'case')}: {count(n['met'], 'target')} met, {n['missed']} missed, "
+        f"{n['open']} that so many cases cannot decide."
+    )
+
+
+def table_of_rows(rows: Sequence[Row]) -> Markup:
+    """Build the table of targets."""
+    header = ("what", "found", "95 % interval", "of", "target", "decision")
+    return table(
+        header,
+        (
+            (
+                row.name,
+                _value(row.found),
+                _interval(row.found),
+                str(row.found.n),
+                _target(row),
+                _DECISIONS[row.decision],
+            )
+            for row in rows
+        ),
+    )
+
+
+def table_csv(rows: Sequence[Row]) -> str:
+    """Write the table as CSV; what is not there is empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"])
+    for row in rows:
+        numbers = (row.found.value, row.found.low, row.found.high)
+        bounds = (row.least, row.most)
+        writer.writerow(
+            [row.name.strip(), *map(_number, numbers), row.found.n, *map(_number, bounds), _DECISIONS[row.decision]]
+        )
+    return text.getvalue()
+
+
+def write_page(results: Results, *, command: str) -> str:
+    """Write the whole page; `command` is what made it."""
+    rows = score(results)
+    done = [r for r in results if "failed" not in r]
+    sections = [Section("The table", (table_of_rows(rows), _legend()))]
+    if done:
+        drawn = figure(
+            png(confusion_matrix(*confusion(done))),
+            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as it.",
+        )
+        sections += [Section("What is taken for what", (drawn,)), Section("Each effect at lambda 8", (_effects(done),))]
+    failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
+    if failures:
+        sections.append(Section("Cases that failed", (definition_list(failures),)))
+    sections.append(Section("How it was made", (definition_list([("command", command)]),)))
+    honest = figure(
+        png(reliability_diagram(reliability(done))),
+        "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
+    )
+    return page("What a diagnosis is worth", answer=answer(rows, len(results)), key_figure=honest, sections=sections)
+
+
+def _effects(done: Results) -> Markup:
+    return table(
+        ("effect", "cases", "detected at alpha .01", "named first"),
+        (
+            (name, str(detected.n), *(f"{_value(e)} ({_interval(e)})" for e in (detected, named)))
+            for name, (detected, named) in by_effect(done).items()
+        ),
+    )
+
+
+def _legend() -> Markup:
+    return paragraph(
+        "A target is met or missed only where the whole 95 % interval says so; otherwise so many cases cannot decide. "
+        "Intervals of shares are Wilson's, of means Student's, of the others bootstrap ones. "
+        "Detection and covariates: effects on the mean. Held-out gain: white noise. "
+        "Aliases: effects that so many readings could tell apart by less than 3 nats."
+    )
+
+
+def _value(found: Estimate) -> str:
+    return "no case" if not found.n else f"{found.value:.3g}"
+
+
+def _interval(found: Estimate) -> str:
+    return f"{found.low:.3g} to {found.high:.3g}" if math.isfinite(found.high - found.low) else ""
+
+
+def _target(row: Row) -> str:
+    if row.decision is None:
+        return ""
+    if math.isinf(row.least):
+        return f"at most {row.most:g}"
+    return f"at least {row.least:g}" if math.isinf(row.most) else f"{row.least:g} to {row.most:g}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else ""

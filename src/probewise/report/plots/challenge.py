@@ -1,0 +1,62 @@
+"""Many diagnoses at once: are their probabilities honest, and what is taken for what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import IntArray
+from probewise.challenge import Bin
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, axes_or_new, tidy
+
+__all__ = ["confusion_matrix", "reliability_diagram"]
+
+
+def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
+    """Draw the share that was right against the probability stated, with Wilson's intervals and numbers of cases.
+
+    Parameters
+    ----------
+    bins
+        From `challenge.reliability`.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(5.2, 5.0))
+    ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
+    stated = np.array([b.stated for b in bins])
+    value, low, high = (np.array([getattr(b.right, end) for b in bins]) for end in ("value", "low", "high"))
+    # Rounding may put an end a hair inside the value.
+    whiskers = np.maximum([value - low, high - value], 0.0)
+    ax.errorbar(stated, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
+    for b in bins:
+        ax.annotate(str(b.right.n), (b.stated, b.right.value), xytext=(6, -3), textcoords="offset points", fontsize=8)
+    ax.set(xlim=(0, 1.04), ylim=(-0.02, 1.04), aspect="equal")
+    ax.legend(frameon=False, fontsize="small", loc="upper left")
+    return tidy(ax, x="probability stated", y="share that was right")
+
+
+def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray, *, ax: Axes | None = None) -> Axes:
+    """Draw what was said of each truth: the number of cases in each cell, shaded by its share of the row.
+
+    Parameters
+    ----------
+    truths, said
+        Names of the rows and of the columns.
+    counts
+        Number of cases, (n_truths, n_said).
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))
+    shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    ax.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for (row, column), n in np.ndenumerate(counts):
+        if n:
+            colour = "white" if shares[row, column] > 0.6 else BLACK
+            ax.text(column, row, str(n), ha="center", va="center", fontsize=8, color=colour)
+    ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
+    ax.set_yticks(np.arange(len(truths)), truths, fontsize=8)
+    return tidy(ax, x="most probable", y="concealed")

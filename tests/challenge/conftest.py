@@ -1,0 +1,68 @@
+"""Results of cases made by hand: what `run_case` returns, with all said rightly unless a test says otherwise."""
+
+import pytest
+
+
+def hidden(name, size=8.0, *, cosines=None, on_noise=False, in_vocabulary=True, shows_in=("time",)):
+    return {
+        "name": name,
+        "size_lambda": size,
+        "on_noise": on_noise,
+        "in_vocabulary": in_vocabulary,
+        "shows_in": list(shows_in),
+        "cosines": {name: 1.0} if cosines is None else cosines,
+    }
+
+
+def case(kind="clean", size=0.0, *, truth=(), hides=(), said=None, p=0.97, **others):
+    said = list(truth) if said is None else list(said)
+    verdict = {(): "clean", ("unknown",): "unknown"}.get(tuple(said), "named")
+    scan = {"null": -120.0, "repaired": -100.0, "true": -100.0}
+    return {
+        "kind": kind,
+        "size": size,
+        "other_noise": False,
+        "plan": "paper",
+        "ssf": "gaussian",
+        "noise_level": "low",
+        "noise_model": "white",
+        "readings": 408,
+        "truth": list(truth),
+        "hidden": list(hides),
+        "alias": None,
+        "cosine": None,
+        "verdict": verdict,
+        "p_value": 0.5 if not truth else 1e-4,
+        "combination": said,
+        "hypotheses": [[said, p], [["halo"], 1 - p]],
+        "credible_set": ["+".join(said) or "clean"],
+        "where": ["time"],
+        "overlap": None,
+        "parameters": {},
+        "sensor": {"u_mm": [0.0, -1.0, 1.0]},
+        "held_out": {name: dict(scan) for name in ("angle", "pattern", "direction")},
+        "settled": None,
+        "cpu_s": 4.0,
+        **others,
+    }
+
+
+def single(name="lag", size=8.0, *, hide=None, **others):
+    return case("single", size, truth=[name], hides=[hide or hidden(name, size)], **others)
+
+
+def outside(size=12.0, *, cosines=None, **others):
+    like = hidden("chirp", size, cosines=cosines or {}, in_vocabulary=False)
+    return case("outside", size, truth=["unknown"], hides=[like], **others)
+
+
+@pytest.fixture
+def make():
+    """Return the makers: `make.case`, `make.single`, `make.outside`, `make.hidden`."""
+
+    class Make:
+        pass
+
+    for maker in (case, single, outside, hidden):
+        setattr(Make, maker.__name__, staticmethod(maker))
+    return Make

@@ -1,0 +1,65 @@
+"""Right or wrong, case by case: worked out by hand from the rules of the target table."""
+
+import pytest
+
+from probewise.challenge.scoring import accepted, answers, extras, fits, is_outside, leading_name_right, stated
+
+
+def test_what_fewer_than_three_nats_tell_apart_is_the_same(make):
+    """lambda 12: 72 (1 - rho^2) is 2.87 at rho .98 and 4.26 at .97."""
+    found = accepted(make.hidden("lag", 12.0, cosines={"lag": 1.0, "backlash": 0.98, "halo": 0.97}))
+    assert found == {"lag", "backlash"}
+
+
+def test_a_larger_effect_has_fewer_aliases(make):
+    """lambda 20: 200 (1 - .98^2) is 7.9 nats."""
+    assert accepted(make.hidden("lag", 20.0, cosines={"lag": 1.0, "backlash": 0.98})) == {"lag"}
+
+
+def test_what_has_no_name_is_unknown_unless_it_is_like_one(make):
+    chirp = make.outside(cosines={"flicker": 0.89})
+    assert is_outside(chirp)
+    assert answers(chirp, merged=True) == [{"unknown"}]
+    like = make.outside(cosines={"flicker": 0.9})
+    assert not is_outside(like)
+    assert answers(like, merged=False) == [{"flicker"}]
+
+
+def test_one_gaussian_more_is_nothing_to_name(make):
+    assert answers(make.case("ssf_order", 12.0, hides=[make.hidden("ssf_order", 12.0)]), merged=True) == []
+
+
+@pytest.mark.parametrize(
+    ("names", "right"),
+    [(("a", "c"), True), (("c", "b"), True), (("a",), False), (("a", "b"), False), (("a", "c", "d"), False)],
+)
+def test_names_stand_one_to_one(names, right):
+    assert fits(names, [{"a", "b"}, {"c"}]) is right
+
+
+@pytest.mark.parametrize(("names", "n"), [((), 0), (("a",), 0), (("a", "b"), 1), (("d", "c"), 1), (("a", "c", "d"), 1)])
+def test_a_name_that_stands_for_nothing_is_an_extra(names, n):
+    assert extras(names, [{"a", "b"}, {"c"}]) == n
+
+
+def test_clean_ahead_of_the_right_name_leaves_it_first_of_the_names(make):
+    assert leading_name_right(make.single(said=[], hypotheses=[[[], 0.7], [["lag"], 0.2], [["halo"], 0.1]]))
+    assert not leading_name_right(make.single(said=[], hypotheses=[[[], 0.7], [["halo"], 0.2], [["lag"], 0.1]]))
+
+
+def test_noise_said_beside_an_effect_on_the_mean_is_left_out(make):
+    both = [[["halo"], 0.4], [["lag"], 0.3], [["lag", "outliers"], 0.3]]
+    assert leading_name_right(make.single(hypotheses=both))
+
+
+def test_an_effect_on_the_noise_has_to_be_named_itself(make):
+    hide = make.hidden("outliers", cosines={}, on_noise=True)
+    assert leading_name_right(make.single("outliers", hide=hide))
+    assert not leading_name_right(make.single("outliers", hide=hide, said=["dropouts"]))
+
+
+def test_a_probability_is_held_against_the_exact_truth(make):
+    alias = make.hidden("lag", cosines={"lag": 1.0, "backlash": 1.0})
+    assert stated(make.single(hide=alias, p=0.8)) == (0.8, True)
+    assert stated(make.single(hide=alias, said=["backlash"], p=0.8)) == (0.8, False)
+    assert stated(make.case(p=0.6)) == (0.6, True)

@@ -1,0 +1,76 @@
+"""What a null model leaves of an effect, by full refit and by projection."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.challenge import NullRefit
+from probewise.challenge.likeness import cosines
+from probewise.effects import VOCABULARY
+from probewise.recordings.plan import Recording
+from probewise.recordings.plans import paper_plan
+from probewise.world.concealed import AmbientStep
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(gaussian_spot([Blob(1.0, (0.5, 1.5), (4.0, 2.5), 0.2)], pixel_mm=0.5))
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return paper_plan()
+
+
+@pytest.fixture(scope="module")
+def clean(world, plan):
+    return world.simulate(plan, rng=None)
+
+
+@pytest.fixture(scope="module")
+def refit(clean):
+    refit = NullRefit()
+    refit.null(clean)
+    return refit
+
+
+def changed(clean, change):
+    return Recording(clean.plan, clean.readings + change)
+
+
+def test_a_sensor_of_one_gaussian_is_taken_for_one(refit, clean):
+    null = refit.null(clean)
+    assert null.model.sensor.n_gaussians == 1
+    assert np.abs(null.residuals).max() < 0.05
+
+
+def test_levels_take_up_an_offset_and_a_gain(refit, clean):
+    assert refit(clean, changed(clean, 0.0)) < 0.05
+    assert refit(clean, changed(clean, 1.0 + 0.1 * clean.readings)) < 0.05
+
+
+def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
+    """Two routes: the refit, and least squares on slopes by differences."""
+    null = refit.null(clean)
+    wave = 0.2 * np.sin(np.arange(len(clean)) / 7.0)
+    _, slopes = null.model.jacobian(null.z)
+    left = wave - slopes @ np.linalg.lstsq(slopes, wave)[0]
+    assert refit(clean, changed(clean, wave)) == pytest.approx(np.linalg.norm(left), rel=0.01)
+
+
+def test_the_null_is_fitted_once_for_each_clean_recording(refit, clean):
+    assert refit.null(clean) is refit.null(clean)
+
+
+def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
+    at_s = float(np.quantile(plan.time_s, 0.4))
+    step = replace(world, concealed=(AmbientStep(1.0, at_s),)).simulate(plan, rng=None)
+    few = {name: VOCABULARY[name] for name in ("ambient_step", "offset_drift", "backlash", "correlated_noise")}
+    found = cosines(refit, clean, step, vocabulary=few)
+    assert found["ambient_step"] == pytest.approx(1.0, abs=1e-3)
+    assert 0.3 < found["offset_drift"] < 0.95
+    assert found["backlash"] < 0.3
+    assert "correlated_noise" not in found

@@ -24,9 +24,10 @@ from probewise.nested import (
     State,
     run,
 )
+from probewise.nested.checkpoint import Live, Origin
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
-from probewise.nested.sampler import Live, step
+from probewise.nested.sampler import step
 from probewise.priors import Empty
 
 # A right sampler is further off than this many of its own errors less than once in 10 000 runs.
@@ -101,13 +102,13 @@ def test_one_step_by_hand_counts_the_shrinkage(rng: np.random.Generator) -> None
     problem = problems.box(1, 0, 1)
     evaluate = Evaluator(problems.Known(problem, lambda t: t[:, 0], 0.0))
     u = np.array([[0.1], [0.5], [0.3], [0.9], [0.7]])
-    live = Live(Points(u, u, np.zeros(5), u[:, 0], np.zeros(5)), np.full(5, -np.inf), np.ones(5), 0.0)
+    live = Live(Points(u, u, np.zeros(5), u[:, 0], np.zeros(5)), Origin.of_prior(5), 0.0)
     after, dead, _ = step(live, PriorRejection(1.0), evaluate, n_replaced=2, rng=rng)
     assert dead.points.theta[:, 0].tolist() == [0.1, 0.3]
     assert dead.n_at_death.tolist() == [5, 4]
     assert after.log_volume == pytest.approx(-1 / 5 - 1 / 4)
     assert (after.points.log_likelihood > 0.3).all()
-    assert after.log_birth.tolist() == [-np.inf, -np.inf, -np.inf, 0.3, 0.3]
+    assert after.origin.log_birth.tolist() == [-np.inf, -np.inf, -np.inf, 0.3, 0.3]
     assert (dead.rank <= dead.n_ranked).all()
     assert dead.n_ranked.tolist() == [3, 4]
 
@@ -295,7 +296,7 @@ def test_the_integral_of_a_known_sequence_is_exact(rng: np.random.Generator) -> 
     volume = np.exp(-np.cumsum(1 / n_at_death))
     evidence = integrate(-volume / s, n_at_death, rng=rng)
     assert evidence.log_z == pytest.approx(math.log(s), abs=0.01)
-    assert evidence.log_z_error == pytest.approx(math.sqrt(evidence.information / n_live), rel=0.3)
+    assert evidence.spread == pytest.approx(math.sqrt(evidence.information / n_live), rel=0.3)
 
 
 def test_insertion_ranks_of_a_wrong_sampler_are_found(rng: np.random.Generator) -> None:

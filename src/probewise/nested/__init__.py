@@ -7,6 +7,7 @@ the stop rule on consecutive values of log Z).
 
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.families import chain_memory
 from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
@@ -34,6 +35,7 @@ __all__ = [
     "Weighted",
     "agreement_of",
     "alive_at_death",
+    "chain_memory",
     "diversify",
     "diversify_by_kernels",
     "merge",

@@ -23,20 +23,47 @@ from probewise.nested.moves import Move
 from probewise.nested.stop import StopRule
 from probewise.recordings.atomic import write_bytes_atomically
 
-__all__ = ["Dead", "Keeper", "Live", "Run", "settings_of"]
+__all__ = ["Dead", "Keeper", "Live", "Origin", "Run", "settings_of"]
 
-_FORMAT = "nested-checkpoint/1"
+_FORMAT = "nested-checkpoint/2"
 _ROUNDING = 1e-6
 _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 
 
 @dataclass(frozen=True, eq=False)
-class Live:
-    """Hold the live points, the level and label each was born above, both (n_live,), and the log volume they fill."""
+class Origin:
+    """Say of points where each came from, all (n,).
 
-    points: Points
+    `log_birth`, `birth_label`: the level that it was drawn above. `ident`: its number in order of birth; `parent`:
+    that of the point at which its chain began, -1 for none.
+    """
+
     log_birth: FloatArray
     birth_label: FloatArray
+    ident: IntArray
+    parent: IntArray
+
+    @classmethod
+    def of_prior(cls, n: int) -> Origin:
+        """Say so of draws from the prior, numbered."""
+        return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
+
+    def take(self, rows: IntArray) -> Origin:
+        """Select."""
+        return Origin(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    @classmethod
+    def join(cls, *parts: Origin) -> Origin:
+        """Put one behind the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+
+@dataclass(frozen=True, eq=False)
+class Live:
+    """Hold the live points and the log volume they fill."""
+
+    points: Points
+    origin: Origin
     log_volume: float
 
 
@@ -49,8 +76,7 @@ class Dead:
     """
 
     points: Points
-    log_birth: FloatArray
-    birth_label: FloatArray
+    origin: Origin
     n_at_death: IntArray
     rank: IntArray
     n_ranked: IntArray
@@ -160,10 +186,12 @@ class Keeper:
             **{name: getattr(now, name) for name in _PLAIN},
         }
         arrays = {f"live_{name}": getattr(now.live.points, name) for name in _POINTS}
-        arrays |= {"live_log_birth": now.live.log_birth, "live_birth_label": now.live.birth_label}
+        arrays |= {f"live_{name}": getattr(now.live.origin, name) for name in _ORIGIN}
         if now.dead:
             dead = Points.join(*(d.points for d in now.dead))
             arrays |= {f"dead_{name}": getattr(dead, name) for name in _POINTS}
+            origin = Origin.join(*(d.origin for d in now.dead))
+            arrays |= {f"dead_{name}": getattr(origin, name) for name in _ORIGIN}
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_plain)), **arrays)
@@ -243,7 +271,8 @@ class Keeper:
 
 
 _PLAIN = ("log_start", "log_start_error", "notes", "log_z", "n_stuck", "last_cost", "n_calls", "ended")
-_RECORD = ("log_birth", "birth_label", "n_at_death", "rank", "n_ranked")
+_ORIGIN = ("log_birth", "birth_label", "ident", "parent")
+_RECORD = ("n_at_death", "rank", "n_ranked")
 
 
 def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> Run:
@@ -252,11 +281,11 @@ def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move
     for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):
         rows = slice(int(end - size), int(end))
         points = Points(*(arrays[f"dead_{name}"][rows] for name in _POINTS))
-        dead.append(Dead(points, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
+        origin = Origin(*(arrays[f"dead_{name}"][rows] for name in _ORIGIN))
+        dead.append(Dead(points, origin, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
     live = Live(
         Points(*(arrays[f"live_{name}"] for name in _POINTS)),
-        arrays["live_log_birth"],
-        arrays["live_birth_label"],
+        Origin(*(arrays[f"live_{name}"] for name in _ORIGIN)),
         float(str(head["log_volume"])),
     )
     plain = {name: head[name] for name in _PLAIN}

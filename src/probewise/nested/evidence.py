@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +18,21 @@ _SIMULATED_AT_A_TIME = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Hold log Z, its error, the information (nats), normalised log weights and Kish's sample size."""
+    """Hold log Z, the information (nats), normalised log weights and Kish's sample size.
+
+    `spread`: sd of log Z by the chance of the shrinkage alone; `log_start_error`: of the prior's possible share.
+    """
 
     log_z: float
-    log_z_error: float
+    spread: float
+    log_start_error: float
     information: float
     log_weight: FloatArray
     n_eff: float
+
+    def error(self, memory: float) -> float:
+        """Give the standard error of log Z where chains remember; see `probewise.nested.chain_memory`."""
+        return math.hypot(math.sqrt(memory) * self.spread, self.log_start_error)
 
 
 def log_volumes(n_at_death: IntArray, log_start: float = 0.0) -> FloatArray:
@@ -71,9 +80,7 @@ def integrate(
         edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
         simulated[first : first + n] = logsumexp(_log_shells(edges) + log_likelihood, axis=1)
     spread = float(np.std(simulated, ddof=1))
-    return Evidence(
-        log_z, float(np.hypot(spread, log_start_error)), information, log_weight, float(1.0 / (weight @ weight))
-    )
+    return Evidence(log_z, spread, log_start_error, information, log_weight, float(1.0 / (weight @ weight)))
 
 
 def _log_shells(log_edges: FloatArray) -> FloatArray:
@@ -82,6 +89,31 @@ def _log_shells(log_edges: FloatArray) -> FloatArray:
     after[..., -1] = -np.inf
     with np.errstate(divide="ignore"):
         return np.asarray(before + np.log(-np.expm1(after - before)))
+
+
+def birth_rows(
+    log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
+) -> IntArray:
+    """Find the death above whose level each point was drawn.
+
+    Parameters
+    ----------
+    log_likelihood, label
+        Levels of the deaths in order, (n_dead,); ties of likelihood are ordered by label.
+    log_birth, birth_label
+        Level above which each point was drawn, (n_dead,).
+
+    Returns
+    -------
+    Row of the last death at or below that level, -1 where there is none, (n_dead,).
+    """
+    n = len(log_likelihood)
+    born = np.repeat([0, 1], n)  # a death comes before the births at its own level
+    levels, labels = np.concatenate([log_likelihood, log_birth]), np.concatenate([label, birth_label])
+    order = np.lexsort((born, labels, levels))
+    n_dead = np.empty(2 * n, dtype=np.int64)
+    n_dead[order] = np.cumsum(born[order] == 0)
+    return n_dead[n:] - 1
 
 
 def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.random.Generator) -> float:

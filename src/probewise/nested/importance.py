@@ -306,11 +306,11 @@ def _lines(found: Posterior) -> float:
     """Count the independent samples that the shares of a posterior's parts are known as well as by.
 
     Many samples of a run descend from one live point: ln Z of a part that n live points follow scatters by
-    sqrt(H / n), as its share of n independent samples scatters by 1 / sqrt(n).
+    sqrt(H / n) times the root of the chains' memory, as its share of n independent samples scatters by 1 / sqrt(n).
     """
     if isinstance(found, Weighted):
         return found.n_eff if found.run is None else _lines(found.run)
-    return found.n_live / max(found.information, 1.0)
+    return found.n_live / max(found.information * found.memory, 1.0)
 
 
 def _parted(found: Posterior, lines: float, space: Space, rng: np.random.Generator) -> tuple[FloatArray, _Held]:

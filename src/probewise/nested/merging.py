@@ -59,11 +59,14 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     log_birth = np.concatenate([r.log_birth for r in parts])[order]
     birth_label = np.concatenate([r.birth_label for r in parts])[order]
     n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
+    parent = _joined_parents(parts, order)
+    # Each run asks its own families: between two of its rounds a run in a joined record is never whole.
+    remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _possible_share(parts)
     evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
     agreement = agreement_of(parts)
     p_value = _combined([r.insertion_p_value for r in parts])
-    doubts, error = [], evidence.log_z_error
+    doubts, error = [], evidence.error(remembered)
     if agreement.p_value < _DISAGREE:
         doubts.append(
             f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
@@ -84,11 +87,13 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         log_weight=evidence.log_weight,
         log_birth=log_birth,
         birth_label=birth_label,
+        parent=parent,
         n_at_death=n_at_death,
         log_start=log_start,
         log_start_error=log_start_error,
         log_z=evidence.log_z,
         log_z_error=error,
+        memory=remembered,
         information=evidence.information,
         n_eff=evidence.n_eff,
         n_calls=sum(r.n_calls for r in parts),
@@ -144,6 +149,14 @@ def alive_at_death(
     out = np.empty(2 * n, dtype=np.int64)
     out[order] = alive
     return out[:n]
+
+
+def _joined_parents(parts: Sequence[NestedResult], order: IntArray) -> IntArray:
+    """Give the rows of parents after all rows were joined and put in order, (n_dead,)."""
+    first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
+    parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
+    place = np.argsort(order)
+    return np.asarray(np.where(parent >= 0, place[parent], -1)[order])
 
 
 def _check(parts: Sequence[NestedResult]) -> list[object]:

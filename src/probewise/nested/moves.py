@@ -17,6 +17,8 @@ __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
 # Candidates drawn ahead of refusals, where few chains are left.
 _MOST_AHEAD = 4
+# Three steps in three dimensions left enough of the start for ln Z to scatter by 1.3 of its claimed errors.
+_FEWEST_STEPS = 6
 _FRAME, _AXIS, _DIFFERENCE, _HOP = 0, 1, 2, 3
 
 
@@ -119,7 +121,7 @@ class SliceMove:
     Parameters
     ----------
     steps_per_param
-        Steps of a chain along frames and differences for each parameter.
+        Steps of a chain for each parameter, hops besides; six in all at least.
     width
         Bracket width in units of the live points' sd along the line.
     axes
@@ -154,7 +156,7 @@ class SliceMove:
         n_chains, n_params = start.u.shape
         space = evaluate.space
         clusters = find_clusters(live)
-        n_lines = max(2, math.ceil(self.steps_per_param * n_params))
+        n_lines = max(_FEWEST_STEPS, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
         kind = self._kinds(n_chains, n_steps, n_hops, rng)

@@ -25,9 +25,9 @@ from probewise.recordings.atomic import write_bytes_atomically
 
 __all__ = ["Agreement", "NestedResult", "versions"]
 
-_FORMAT = "nested-result/2"
+_FORMAT = "nested-result/3"
 _PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
-_COUNTS = ("n_at_death", "insertion_rank", "insertion_n_ranked")
+_COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
 _ARRAYS = ("theta", *_PER_POINT, *_COUNTS)
 
 
@@ -87,12 +87,16 @@ class NestedResult(ShowsItself):
     log_birth, birth_label
         Log likelihood and label of the dead point above which each was drawn, (n_dead,);
         minus infinity and 1 where it was drawn from the whole prior.
+    parent
+        Row of the point at which the chain began that led to each; -1 for draws from the prior at the start, (n_dead,).
     n_at_death
         Points alive when each died, itself included, (n_dead,).
     log_start, log_start_error
         Natural log of the share of the prior with a likelihood above zero, and its standard error.
     log_z, log_z_error
-        Natural log of the evidence, and its standard error from simulated shrinkages.
+        Natural log of the evidence, and its standard error: from simulated shrinkages, times the root of `memory`.
+    memory
+        Variance of log Z over that of independent points, 1 or more; see `probewise.nested.chain_memory`.
     information
         Kullback-Leibler divergence of posterior from prior, nats.
     n_eff
@@ -122,11 +126,13 @@ class NestedResult(ShowsItself):
     log_weight: FloatArray
     log_birth: FloatArray
     birth_label: FloatArray
+    parent: IntArray
     n_at_death: IntArray
     log_start: float
     log_start_error: float
     log_z: float
     log_z_error: float
+    memory: float
     information: float
     n_eff: float
     n_calls: int
@@ -147,7 +153,8 @@ class NestedResult(ShowsItself):
         object.__setattr__(self, "theta", theta)
         for name in _PER_POINT:
             self._freeze(name, frozen(getattr(self, name)), len(theta), "a row of theta")
-        self._freeze("n_at_death", frozen_int(self.n_at_death), len(theta), "a row of theta")
+        for name in ("parent", "n_at_death"):
+            self._freeze(name, frozen_int(getattr(self, name)), len(theta), "a row of theta")
         rank = frozen_int(self.insertion_rank)
         self._freeze("insertion_rank", rank, rank.size, "an inserted point")
         self._freeze("insertion_n_ranked", frozen_int(self.insertion_n_ranked), rank.size, "an inserted point")
@@ -269,6 +276,7 @@ class NestedResult(ShowsItself):
             f"information  {self.information:.2f} nats",
             f"samples      {self.n_dead}, worth {self.n_eff:.0f} independent ones",
             f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points{self._efficiency()}",
+            f"memory       {self.memory:.2f} times the variance of independent points",
             f"stopped      {self.stop_reason}",
             f"insertion    p = {self.insertion_p_value:.2g}",
         ]

@@ -15,9 +15,10 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
-from probewise.nested.checkpoint import Dead, Keeper, Live, Run, settings_of
+from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
-from probewise.nested.evidence import insertion_p_value, integrate, log_volumes
+from probewise.nested.evidence import birth_rows, insertion_p_value, integrate, log_volumes
+from probewise.nested.families import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult, versions
 from probewise.nested.stop import RemainingEvidence, State, StopRule
@@ -46,7 +47,8 @@ def step(
     last = doomed[-1]
     bound = Bound(float(live.points.log_likelihood[last]), float(live.points.label[last]))
     survivors = live.points.take(spared)
-    start = survivors.take(rng.permutation(len(spared))[:n_replaced])
+    begin = rng.permutation(len(spared))[:n_replaced]
+    start = survivors.take(begin)
     new, tally = move.draw(start, bound, survivors.u, evaluate, rng)
     points = Points.join(survivors, new)
     place = np.empty(n_live, dtype=np.int64)
@@ -55,11 +57,16 @@ def step(
     n_ranked = len(spared) + np.arange(n_replaced)
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    dead = Dead(live.points.take(doomed), live.log_birth[doomed], live.birth_label[doomed], n_at_death, rank, n_ranked)
-    births = np.concatenate([live.log_birth[spared], np.full(n_replaced, bound.log_likelihood)])
-    labels = np.concatenate([live.birth_label[spared], np.full(n_replaced, bound.label)])
+    dead = Dead(live.points.take(doomed), live.origin.take(doomed), n_at_death, rank, n_ranked)
+    known = live.origin.take(spared)
+    fresh = Origin(
+        np.full(n_replaced, bound.log_likelihood),
+        np.full(n_replaced, bound.label),
+        live.origin.ident.max() + 1 + np.arange(n_replaced),
+        known.ident[begin],
+    )
     log_volume = float(log_volumes(n_at_death, live.log_volume)[-1])
-    return Live(points, births, labels, log_volume), dead, tally
+    return Live(points, Origin.join(known, fresh), log_volume), dead, tally
 
 
 def run(
@@ -286,7 +293,7 @@ def _first(evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, 
         cloud = points.u if found > n_params else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
         more, _ = move.draw(start, bound, cloud, evaluate, rng)
         points = Points.join(points, more)
-    live = Live(points, np.full(n_live, -np.inf), np.ones(n_live), log_volume)
+    live = Live(points, Origin.of_prior(n_live), log_volume)
     return Run(live, (), move, log_volume, error, notes, n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
 
 
@@ -304,6 +311,10 @@ def _result(
     evidence = integrate(
         points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
+    origin = Origin.join(*(d.origin for d in dead), live.origin.take(order))
+    parent = np.where(origin.parent >= 0, np.argsort(origin.ident)[origin.parent], -1)
+    born = birth_rows(points.log_likelihood, points.label, origin.log_birth, origin.birth_label)
+    remembered = chain_memory(parent, born, n_at_death)
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
     n_ranked = np.concatenate([empty, *(d.n_ranked for d in dead)])
@@ -322,13 +333,15 @@ def _result(
         log_likelihood=points.log_likelihood,
         log_weight=evidence.log_weight,
         label=points.label,
-        log_birth=np.concatenate([*(d.log_birth for d in dead), live.log_birth[order]]),
-        birth_label=np.concatenate([*(d.birth_label for d in dead), live.birth_label[order]]),
+        log_birth=origin.log_birth,
+        birth_label=origin.birth_label,
+        parent=parent,
         n_at_death=n_at_death,
         log_start=now.log_start,
         log_start_error=now.log_start_error,
         log_z=evidence.log_z,
-        log_z_error=evidence.log_z_error,
+        log_z_error=evidence.error(remembered),
+        memory=remembered,
         information=evidence.information,
         n_eff=evidence.n_eff,
         n_calls=evaluate.n_calls,
@@ -357,11 +370,13 @@ def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> Ne
         label=np.zeros(1),
         log_birth=np.full(1, -np.inf),
         birth_label=np.ones(1),
+        parent=np.full(1, -1),
         n_at_death=np.ones(1, dtype=np.int64),
         log_start=0.0,
         log_start_error=0.0,
         log_z=float(log_likelihood[0]),
         log_z_error=0.0,
+        memory=1.0,
         information=0.0,
         n_eff=1.0,
         n_calls=1,

@@ -58,4 +58,5 @@ def quick_frames(monkeypatch):
     """Draw every step of a run as one black pixel."""
     dot = io.BytesIO()
     Image.new("RGB", (1, 1)).save(dot, "PNG")
-    monkeypatch.setattr(exploration, "frame", lambda *_, **__: dot.getvalue())
+    for drawing in ("frame", "frame_of_both"):
+        monkeypatch.setattr(exploration, drawing, lambda *_, **__: dot.getvalue())

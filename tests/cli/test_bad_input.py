@@ -145,6 +145,7 @@ def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, r
         "explore": ["explore", "--sensor", sensor_file, "--out", out],
         "diagnose": ["diagnose", recording_file, "--out", out],
         "study": ["study", "--out", out],
+        "audit": ["audit", recording_file, "--out", out],
         "challenge": ["challenge", "--out", out],
         "arm": ["arm", "check", "--out", out / "reach.png"],
         "emulate-nxt": ["emulate-nxt", "--log", out / "log.txt"],

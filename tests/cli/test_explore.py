@@ -5,6 +5,7 @@ import json
 import pytest
 
 from probewise.cli import main
+from probewise.report import exploration
 
 
 @pytest.fixture
@@ -49,3 +50,22 @@ def test_readings_may_be_chosen_several_at_a_time(explore):
     assert lines[0]["options"]["batch"] == 2
     first, second = (line["pose"] for line in lines[1:])
     assert lines[1]["belief"]["next"] == second != first
+
+
+def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, monkeypatch, tmp_path):
+    """The naive model left, as in the paper, whichever chooses; the run itself is the same as without."""
+    drawn, quick = [], exploration.frame_of_both
+
+    def remember(views, *_, **__):
+        drawn.append(views)
+        return quick()
+
+    monkeypatch.setattr(exploration, "frame_of_both", remember)
+    status, lines = explore("--both-models", "--max-readings", 2)
+    assert status == 0
+    assert [[title for title, *_ in views] for views in drawn] == [["naive model", "SSF model"]] * 2
+    for views, line in zip(drawn, lines[1:], strict=True):
+        assert [step.reading.value for _, step, _ in views] == [line["reading"]] * 2
+        (_, naive, _), (_, ssf, _) = views
+        assert ssf.mean.tolist() == [line["belief"]["mean"][name] for name in ssf.names] != naive.mean.tolist()
+    assert "naive model makes of the same readings" in (tmp_path / "found" / "report.html").read_text()

@@ -15,6 +15,7 @@ from probewise.diagnosis import Diagnosis, diagnose, diagnosis_json, diagnosis_s
 from probewise.effects import VOCABULARY
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
+from probewise.sensor import Stage
 from probewise.world import concealed as hidden
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -121,6 +122,11 @@ CASES = [
     (hidden.Nonlinearity(1.08), ("nonlinearity",)),
     (hidden.Backlash(0.4), ("backlash",)),
     (hidden.CorrelatedNoise(0.5), ("correlated_noise",)),
+    (hidden.Outliers(0.03, 8.0), ("outliers",)),
+    (hidden.HeavyTails(4.0), ("outliers",)),
+    (hidden.Dropouts(0.01, 0.0), ("dropouts",)),
+    (hidden.SignalDependentNoise(4.0), ("signal_dependent_noise",)),
+    (hidden.Quantisation(1.5), ("quantisation",)),
 ]
 
 
@@ -133,7 +139,9 @@ def test_each_effect_is_named_in_a_two_way_recording(effect, combination):
     found = diagnose(made, rng=np.random.default_rng(0))
     strict(found)
     assert found.combination == combination
-    assert found.verdict == ("noise" if combination == ("correlated_noise",) else "named")
+    on_noise = VOCABULARY[combination[0]].stage is Stage.NOISE
+    assert found.verdict == ("noise" if on_noise else "named")
+    assert (found.p_value > 0.01) == on_noise
 
 
 @pytest.mark.slow

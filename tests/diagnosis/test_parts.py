@@ -10,6 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.audit import Alias, surviving_cosine
+from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.coordinates import (
     default_sensor,
     effect_scores,
@@ -21,8 +22,9 @@ from probewise.diagnosis.covariates import Covariate
 from probewise.diagnosis.evidence import SCALES, Blocks, Linearised, block_log_bayes_factors
 from probewise.diagnosis.fit import Fit, Model
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.locate import places, windows
-from probewise.diagnosis.noise import NoiseModel, Whitener, noise_statistics, steps_within_scans, white
+from probewise.diagnosis.locate import places, places_of_effect, windows
+from probewise.diagnosis.noise import NoiseLaw, noise_statistics, steps_within_scans, white
+from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.verdict import Hypothesis, credible_set, decide
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
@@ -134,10 +136,10 @@ def test_whitening_is_the_inverse_root_of_the_covariance():
     recording = Recording(recording.plan, readings)
     steps = steps_within_scans(recording)
     np.testing.assert_array_equal(steps, [0, 1, 2, 1, 1, 0, 1, 1, 1, 1, 1])
-    model = NoiseModel.of([CorrelatedNoise()], recording)
-    node = 20
-    rho, whitener = model.settings[node, 0], model.whiteners[node]
     rows = np.flatnonzero(recording.usable)
+    laid_out = NoiseModel((CorrelatedNoise(),), recording).laws(np.zeros(len(rows)))
+    node = 20
+    rho, whitener = laid_out.settings[node, 0], laid_out.laws[node]
     scan = recording.plan.scan[rows]
     cov = np.where(scan[:, None] == scan[None, :], rho ** np.abs(rows[:, None] - rows[None, :]), 0.0)
     r = np.random.default_rng(0).normal(size=len(rows))
@@ -180,6 +182,21 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
         center = 0.5 * math.log(rss / n)
         total += quad(density, center - 3, center + 3)[0] / quad(null, center - 3, center + 3)[0]
     assert found == pytest.approx(math.log(total / len(SCALES)), abs=1e-6)
+
+
+def test_a_bank_weighs_as_blocks_do():
+    """Route one: the templates projected; route two: the products that a fit takes off."""
+    rng = np.random.default_rng(4)
+    n, p = 60, 4
+    templates = [rng.normal(size=(n, k)) for k in (1, 2, 1, 3)]
+    law = NoiseLaw(np.exp(0.2 * rng.normal(size=n)), np.full(n, 0.3) * (np.arange(n) % 10 > 0), np.arange(n) == 5)
+    basis, _ = np.linalg.qr(rng.normal(size=(n + p, p)))
+    residuals = rng.normal(size=(n + p, 3))
+    residuals -= basis @ (basis.T @ residuals)
+    problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
+    blocks = Blocks.of(problem, templates, [""] * 4)
+    wanted = block_log_bayes_factors(blocks, residuals, n)
+    np.testing.assert_allclose(Bank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
 
 
 def test_null_draws_have_nothing_in_the_span_of_the_fit():
@@ -227,6 +244,25 @@ def test_a_bump_is_found_where_it_is():
     assert found[0].curve_mean.max() > 1.0
 
 
+def test_an_effect_is_where_it_has_half_its_strength():
+    x_mm = np.arange(-50.0, 51.0)
+    place = Covariate("place", x_mm, np.arange(101))
+    change = 2.0 * np.exp(-0.5 * ((x_mm - 10) / 8) ** 2)
+    glint = VOCABULARY["glint"].for_extent(EXTENT)
+    (found,) = places_of_effect(glint, change, [place], change, p_value=0.001, size=8.0, sd=0.5)
+    half = 8 * math.sqrt(2 * math.log(2))
+    assert (found.covariate, found.scan) == ("place", None)
+    assert found.start == pytest.approx(10 - half, abs=1)
+    assert found.end == pytest.approx(10 + half, abs=1)
+
+
+def test_an_effect_of_one_scan_is_in_that_scan():
+    scan = Covariate("scan", np.repeat([0.0, 1.0], 6), np.arange(12), groups=True)
+    effect = VOCABULARY["scan_misplacement"].for_extent(EXTENT).variants()[1]
+    (found,) = places_of_effect(effect, np.ones(12), [scan], np.ones(12), p_value=0.001, size=8.0, sd=0.5)
+    assert (found.covariate, (found.scan,), found.start) == ("scan", effect.scans, None)
+
+
 def test_noise_statistics_see_memory_tails_and_level():
     rng = np.random.default_rng(0)
     n = 2000
@@ -246,7 +282,8 @@ def test_noise_statistics_see_memory_tails_and_level():
 def test_white_noise_is_left_as_it_is():
     r = np.arange(5.0)
     np.testing.assert_array_equal(white(5)(r), r)
-    assert Whitener(np.full(5, 2.0), np.zeros(5)).log_det() == pytest.approx(5 * math.log(2))
+    twice = NoiseLaw(np.full(5, 2.0), np.zeros(5), np.zeros(5, dtype=np.bool_))
+    assert twice.log_det() == pytest.approx(5 * math.log(2))
 
 
 def test_joined_recordings_keep_scans_and_patterns_apart():

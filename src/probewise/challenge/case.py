@@ -18,7 +18,7 @@ from probewise.diagnosis import Diagnosis, diagnose
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.world.challenge import Case, Hidden, Ruler, draw_case, stratum_of
 from probewise.world.challenge.candidates import Setting
-from probewise.world.concealed import Disturbs
+from probewise.world.concealed import Disturbs, Quantisation
 
 __all__ = ["Task", "run_case"]
 
@@ -84,7 +84,8 @@ def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
 
 def _hidden(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
     """Tell of one effect; "cosines": what else looks like it in this plan, and how much."""
-    on_noise = isinstance(hidden.effect, Disturbs)
+    # Rounding is no noise of the world's, but what a diagnosis says of it is said of the noise.
+    on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
     like = {} if on_noise else cosines(refit, ruler.clean, ruler.recording(hidden.effect))
     return {
         "name": hidden.name,

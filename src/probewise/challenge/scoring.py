@@ -22,7 +22,7 @@ __all__ = [
     "stated",
 ]
 
-NOISE = frozenset(NOISE_NAMES.values())
+NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation"}
 """Effects on the noise."""
 
 _HONEST_NATS = 3.0  # below it two effects cannot be told apart (diagnosis, section 3)

@@ -8,7 +8,8 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.evidence import weigh
 from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.noise import NoiseModel, white
+from probewise.diagnosis.noise import white
+from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent
 from probewise.recordings.plan import Recording
 
@@ -52,7 +53,7 @@ class NullRefit:
 
 
 def _best_order(clean: Recording) -> Fit:
-    extent, noise = Extent.of(clean), NoiseModel.of((), clean)
+    extent, noise = Extent.of(clean), NoiseModel((), clean)
     sensor = default_sensor(extent, 1)
     found = min(
         (_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),

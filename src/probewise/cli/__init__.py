@@ -1,9 +1,9 @@
 """The command line `probewise`: one file a verb.
 
 The paper's road as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
-(sections 2.2-2.3, the robot finds a shape), `diagnose` (what the model leaves out), `predict`
-(eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once; `arm`
-moves and reads the LEGO arm, `emulate-nxt` stands in for it.
+(sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can tell), `diagnose` (what the
+model leaves out), `predict` (eq. of the sensor model with its uncertainty) and `demo`, which does
+all of them at once; `arm` moves and reads the LEGO arm, `emulate-nxt` stands in for it.
 
 Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
 2: input that cannot be used, told in one line, nothing written; 130: stopped by Ctrl-C.
@@ -16,7 +16,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from probewise.cli import arm, calibrate, challenge, demo, diagnose, emulate_nxt, explore, predict, study
+from probewise.cli import arm, audit, calibrate, challenge, demo, diagnose, emulate_nxt, explore, predict, study
 from probewise.cli._common import OneLineParser, Verb
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
@@ -28,6 +28,7 @@ VERBS: tuple[Verb, ...] = (
     predict.VERB,
     explore.VERB,
     study.VERB,
+    audit.VERB,
     diagnose.VERB,
     challenge.VERB,
     arm.VERB,

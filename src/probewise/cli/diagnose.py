@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, say, staged
+from probewise.cli._journal import is_journal, journal_recording
+from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="REC.csv",
-        help="recording, its JSON beside it; several are diagnosed together",
+        help="recording, its JSON beside it, or the journal.jsonl of an explore run; several are diagnosed together",
     )
     parser.add_argument(
         "--sensor", type=Path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
@@ -37,20 +39,40 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from probewise.calibration import read_sensor
-    from probewise.diagnosis import diagnose
+    from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join
     from probewise.recordings import read_recording
     from probewise.report import diagnosis as report
 
     out = check_out_directory(arguments.out)
-    recordings = [read_recording(path) for path in arguments.recordings]
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+    recordings, shapes = [], []
+    for path in arguments.recordings:
+        if not is_journal(path):
+            recordings.append(read_recording(path))
+            continue
+        if sensor is None:
+            raise ParameterError(
+                "--sensor", None, f"the sensor.json that the run of {path} was made with, or a newer one"
+            )
+        recording, shape = journal_recording(path, sensor)
+        recordings.append(recording)
+        shapes.append(shape)
+    if len(shapes) > 1:
+        raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
     diagnosis_rng, files_rng = np.random.default_rng(arguments.seed).spawn(2)
-    diagnosis = diagnose(recordings, sensor=sensor, rng=diagnosis_rng)
+    joined = join(recordings)
+    null = None
+    if sensor is not None and shapes:
+        null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
+    diagnosis = diagnose(joined, sensor=None if shapes else sensor, null=null, rng=diagnosis_rng)
+    if null is not None:
+        diagnosis = null.with_described_field(diagnosis)
+    audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
     drawn = report.figures(diagnosis)
     source = ", ".join(path.name for path in arguments.recordings)
     with staged(out) as stage:
         write_results(diagnosis, drawn, stage, rng=files_rng)
-        page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed)
+        page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
         (stage / "report.html").write_text(page, encoding="utf-8")
     if diagnosis.next_measurement is None:
         for name in ("next_plan.csv", "next_plan.json"):  # of an earlier run: nobody asks for it now

@@ -6,12 +6,17 @@ the gain is shown on readings kept back.
 """
 
 from probewise.diagnosis.audit import Alias, NextMeasurement
+from probewise.diagnosis.audit_document import CURE_PLAN, audit_json
 from probewise.diagnosis.document import diagnosis_json, diagnosis_schema
 from probewise.diagnosis.engine import SensorPrior, diagnose
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place
+from probewise.diagnosis.null import Null
+from probewise.diagnosis.odds import PriorOdds
+from probewise.diagnosis.own_model import OwnModel, Parameters
+from probewise.diagnosis.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
 from probewise.diagnosis.repaired import ModelSamples
-from probewise.diagnosis.search import PriorOdds
+from probewise.diagnosis.unknown_shape import SensorAndShape
 from probewise.diagnosis.verdict import (
     Diagnosis,
     EffectFound,
@@ -23,19 +28,31 @@ from probewise.diagnosis.verdict import (
 )
 
 __all__ = [
+    "CURE_PLAN",
     "Alias",
+    "Cure",
     "Diagnosis",
+    "EffectAudit",
     "EffectFound",
     "Hypothesis",
     "Improvement",
     "ModelSamples",
     "NextMeasurement",
     "NoiseFound",
+    "Null",
+    "OwnModel",
     "ParameterFound",
+    "Parameters",
     "Place",
+    "PlanAudit",
     "PriorOdds",
+    "SensorAndShape",
     "SensorPrior",
+    "Smallest",
     "Verdict",
+    "audit_json",
+    "audit_plan",
+    "audit_recorded",
     "diagnose",
     "diagnosis_json",
     "diagnosis_schema",

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
+from probewise.diagnosis.commands import MOST_READINGS, commands, minutes_of, rescheduled
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.fit import Fit, Model
+from probewise.diagnosis.fit import Fit, Model, degrees_of_freedom
 from probewise.effects import NamedEffect
 from probewise.recordings.patterns import Uniform
 from probewise.recordings.plan import Plan
@@ -29,7 +30,7 @@ __all__ = [
 ]
 
 ALIAS_COSINE = 0.9
-_MOST_READINGS = 102
+_LEAST_ROWS = 8
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
     """Largest principal cosine of what survives of two templates, each (n_points, k)."""
     bases = []
     for columns in (first, second):
-        raw = np.linalg.norm(problem.whitener(columns)) / problem.sd
+        raw = np.linalg.norm(problem.law(columns)) / problem.sd
         projected = problem.project(columns)
         # What the fit absorbs to within a thousandth is not there to be compared.
         if np.linalg.norm(projected) <= 1e-3 * raw:
@@ -91,71 +92,31 @@ def aliases(
 
 
 def candidate_plans(plan: Plan) -> list[tuple[str, Plan]]:
-    """List what could be measured next, with words for it: repeat, reverse, respeed, rotate, plain patterns."""
-    rows_by_scan = [rows for rows in plan.rows_by_scan() if rows.size >= 8]
-    out: list[tuple[str, Plan]] = []
-    if not rows_by_scan:
+    """List what could be measured next, with words for it: the six R's, plain surfaces, the other axis."""
+    out = [(command.description, command.plan) for command in commands(plan)]
+    if not out:
         return out
-    seen_poses: set[tuple[object, ...]] = set()
-    gap_s = _reading_s(plan)
-    start_s = float(plan.time_s.max()) + 30.0
-    for rows in rows_by_scan:
-        ends = tuple(
-            sorted((round(float(plan.x_mm[r]), 3), round(float(plan.y_mm[r]), 3)) for r in (rows[0], rows[-1]))
-        )
-        key = (int(plan.pattern[rows[0]]), round(float(plan.orientation_rad[rows[0]]), 4), ends)
-        if key in seen_poses or len(seen_poses) >= 6:
-            continue
-        seen_poses.add(key)
-        rows = rows[:_MOST_READINGS]
-        name = plan.scan_names[int(plan.scan[rows[0]])]
-        degrees = math.degrees(float(plan.orientation_rad[rows[0]]))
-        out.append((f"take scan {name} again", _rescheduled(plan, rows, start_s, gap_s, f"{name}_again")))
-        out.append((f"take scan {name} backwards", _rescheduled(plan, rows[::-1], start_s, gap_s, f"{name}_reversed")))
-        both = np.concatenate([rows[: _MOST_READINGS // 2 * 2 : 2], rows[: _MOST_READINGS // 2 * 2 : 2][::-1]])
-        out.append(
-            (f"scan {name} forth and back at double speed", _rescheduled(plan, both, start_s, gap_s, f"{name}_both"))
-        )
-        if "orientation_deg" in plan.instrumentation.controls and len(seen_poses) == 1:
-            turned = _rescheduled(plan, rows, start_s, gap_s, f"{name}_turned")
-            turned = replace(turned, orientation_rad=turned.orientation_rad + math.radians(45))
-            out.append((f"take scan {name} with the sensor turned to {degrees + 45:.0f} degrees", turned))
+    rows = next(rows for rows in plan.rows_by_scan() if rows.size >= _LEAST_ROWS)
+    first = rescheduled(plan, rows, out[0][1].time_s[0], float(np.diff(out[0][1].time_s[:2])[0]), "across")
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
-        rows = rows_by_scan[0][:: max(len(rows_by_scan[0]) // 20, 1)]
-        flat = _rescheduled(plan, rows, start_s, gap_s, f"{colour}_next")
+        flat = first.take(np.arange(0, len(rows), max(len(rows) // 20, 1)))
         names = (*flat.pattern_names, f"plain_{colour}")
         flat = replace(
             flat,
+            time_s=first.time_s[: len(flat)],
+            scan_names=(f"{colour}_next",),
             pattern=np.full(len(flat), len(names) - 1),
             pattern_names=names,
             patterns={**flat.patterns, f"plain_{colour}": Uniform(albedo)},
         )
         out.append((f"scan a plain {colour} surface", flat))
-    rows = rows_by_scan[0]
     turned_way = replace(
-        _rescheduled(plan, rows, start_s, gap_s, "across"),
+        first,
         x_mm=plan.x_mm[rows].mean() + (plan.y_mm[rows] - plan.y_mm[rows].mean()),
         y_mm=plan.y_mm[rows].mean() + (plan.x_mm[rows] - plan.x_mm[rows].mean()),
     )
     out.append((f"scan across scan {plan.scan_names[int(plan.scan[rows[0]])]}, along the other axis", turned_way))
     return out
-
-
-def _reading_s(plan: Plan) -> float:
-    gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
-    gaps = gaps[gaps > 0]
-    return float(np.median(gaps)) if gaps.size else 1.0
-
-
-def _rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
-    taken = plan.take(rows)
-    return replace(
-        taken,
-        time_s=np.asarray(start_s + gap_s * np.arange(len(rows)), dtype=np.float64),
-        scan=np.zeros(len(rows), dtype=np.int64),
-        scan_names=(name,),
-        covariates={},
-    )
 
 
 def log_bayes_factor_expected(
@@ -201,7 +162,7 @@ def next_measurement(
     """
     best: tuple[float, NextMeasurement] | None = None
     for description, candidate in candidate_plans(plan):
-        minutes = (float(np.ptp(candidate.time_s)) + 30.0) / 60.0
+        minutes = minutes_of(candidate)
         expected = log_bayes_factor_expected(first, second, sd, candidate)
         option = NextMeasurement(candidate, description, minutes, expected)
         worth = min(expected, 10.0) / minutes
@@ -236,7 +197,7 @@ def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect
             nats = 0.5 * float(np.sum((there[first] - sign * there[second]) ** 2)) / sd**2
             per_reading = nats / len(plan)
             if per_reading > best[first, second][0]:
-                readings = min(max(math.ceil(3.0 / per_reading), 1), _MOST_READINGS)
+                readings = min(max(math.ceil(3.0 / per_reading), 1), MOST_READINGS)
                 advised = replace(best[first, second][1], settle_by=description, readings=readings)
                 best[first, second] = (per_reading, advised)
     return [alias for _, alias in best.values()]
@@ -245,5 +206,5 @@ def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect
 def covariance_of(found: Fit) -> FloatArray:
     """Covariance of a fit's coordinates by Laplace, noise white."""
     n_points, p = found.slopes.shape
-    variance = found.sd**2 * n_points / max(n_points - p, 1)
+    variance = found.sd**2 * n_points / degrees_of_freedom(found.slopes, found.sd)
     return np.asarray(np.linalg.inv(found.slopes.T @ found.slopes / variance + np.eye(p)))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,27 @@ from scipy.special import ndtr, ndtri
 from probewise._arrays import FloatArray, frozen
 from probewise.effects import Extent, NamedEffect
 from probewise.errors import ParameterError, ShapeError
+from probewise.recordings.plan import Plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FreeLevels, FreeMixture
 
-__all__ = ["FARTHEST", "SensorCoordinates", "default_sensor", "effect_scores", "effect_values", "sensor_from_posterior"]
+__all__ = [
+    "FARTHEST",
+    "LEAST_READINGS",
+    "SensorCoordinates",
+    "default_sensor",
+    "effect_scores",
+    "effect_values",
+    "known_scene",
+]
+__all__ += ["sensor_from_posterior"]
 
 FARTHEST = 6.0
 """Bound of every coordinate: six standard deviations of its prior."""
+
+
+LEAST_READINGS = 24
+"""Fewest usable readings that a verdict on a sensor is given on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +71,28 @@ class SensorCoordinates:
         return len(self.center)
 
     @property
+    def starts(self) -> FloatArray:
+        """Start from the centre, (1, n_params)."""
+        return np.zeros((1, self.n_params))
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """Nothing: all its parameters are the sensor's own."""
+        return ()
+
+    @property
+    def least_readings(self) -> int:
+        """As many as tell its parameters from the noise."""
+        return LEAST_READINGS
+
+    @property
     def log_multiplicity(self) -> float:
         """Log of the number of equal peaks of the posterior."""
         return math.lgamma(self.n_gaussians + 1) if self.exchangeable else 0.0
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """All of them."""
+        return True
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max: one column more."""
@@ -65,6 +101,16 @@ class SensorCoordinates:
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
         return np.asarray(np.linalg.solve(self.factor, (theta_to_natural(theta, self.n_gaussians) - self.center).T).T)
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        """Build the chain over the plan's patterns."""
+        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), known_scene(plan), tuple(effects), n_nodes=n_nodes)
+
+
+@lru_cache(maxsize=32)
+def known_scene(plan: Plan) -> KnownScene:
+    """Build a plan's scene once for all models that look at it."""
+    return KnownScene(plan.patterns)
 
 
 def natural_to_theta(natural: FloatArray, n_gaussians: int) -> FloatArray:

@@ -9,9 +9,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import Model
+from probewise.effects import edge_distance
 from probewise.recordings.plan import Plan
+from probewise.scene import region_of
 
 __all__ = ["Covariate", "covariates_of", "slope_along_the_move"]
+
+
+_MOST_SCANS = 24  # beyond which no place is looked for in each scan by itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,7 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
     pooled: Mapping[str, FloatArray] = {
         "time": plan.time_s[usable],
         "level": level,
+        "edge_distance": _edge_distance(plan)[usable],
         **{name: values[usable] for name, values in plan.covariates.items()},
     }
     out: list[Covariate] = []
@@ -78,21 +84,30 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
         out.append(Covariate("orientation", degrees, everything, groups=True))
     if len(np.unique(scan)) > 1:
         out.append(Covariate("scan", scan.astype(np.float64), everything, groups=True))
-    longest = _along(plan.x_mm[usable], plan.y_mm[usable])
+    x_mm, y_mm = plan.x_mm[usable], plan.y_mm[usable]
+    by_scan = [np.flatnonzero(scan == k) for k in range(len(plan.scan_names))]
+    along_x = np.ptp(x_mm) >= np.ptp(y_mm)
+    alike = [rows for rows in by_scan if rows.size and (np.ptp(x_mm[rows]) >= np.ptp(y_mm[rows])) == along_x]
+    rows = np.sort(np.concatenate(alike)) if alike else everything
+    longest = (x_mm if along_x else y_mm)[rows]
     if _varies(longest):
-        out.append(Covariate("place", longest, everything))
-    for k, name in enumerate(plan.scan_names):
-        rows = np.flatnonzero(scan == k)
-        if rows.size >= 16:
-            along = _along(plan.x_mm[usable][rows], plan.y_mm[usable][rows])
+        out.append(Covariate("place", longest, rows))
+    for rows, name in zip(by_scan, plan.scan_names, strict=True):
+        if rows.size >= 16 and len(by_scan) <= _MOST_SCANS:
+            along = x_mm[rows] if np.ptp(x_mm[rows]) >= np.ptp(y_mm[rows]) else y_mm[rows]
             if _varies(along):
                 out.append(Covariate("place", along, rows, scan=name))
     return out
 
 
-def _along(x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Take the coordinate along the longer side of a scan."""
-    return x_mm if np.ptp(x_mm) >= np.ptp(y_mm) else y_mm
+def _edge_distance(plan: Plan) -> FloatArray:
+    """Distance of each row from the nearest edge under it, mm; infinite where there is none or none is described."""
+    out = np.full(len(plan), np.inf)
+    for name, rows in plan.rows_by_pattern():
+        if name in plan.patterns:
+            region = region_of(plan.patterns[name])
+            out[rows] = edge_distance(region, plan.x_mm[None, rows], plan.y_mm[None, rows])[0]
+    return out
 
 
 def _varies(values: FloatArray) -> bool:

@@ -19,15 +19,19 @@ from probewise.diagnosis.audit import (
     next_measurement,
     settle,
 )
-from probewise.diagnosis.coordinates import SensorCoordinates, sensor_from_posterior
+from probewise.diagnosis.bank import Bank
+from probewise.diagnosis.convergence import require_converged
+from probewise.diagnosis.coordinates import LEAST_READINGS, sensor_from_posterior
 from probewise.diagnosis.evidence import Blocks, Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
 from probewise.diagnosis.gain import held_out_gain
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.locate import families_of, global_p_value, places
+from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.noise import noise_statistics, steps_within_scans
+from probewise.diagnosis.null import Null
 from probewise.diagnosis.repaired import ModelSamples, sample_model
-from probewise.diagnosis.search import Candidate, Search, search
+from probewise.diagnosis.search import search
+from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.unknown import correct
 from probewise.diagnosis.verdict import (
     Diagnosis,
@@ -40,7 +44,9 @@ from probewise.diagnosis.verdict import (
     credible_set,
     decide,
 )
-from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.diagnosis.weighed import Candidate, Search
+from probewise.effects import NUISANCES, VOCABULARY, Extent, NamedEffect
+from probewise.errors import ParameterError
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -49,8 +55,8 @@ __all__ = ["SensorPrior", "diagnose"]
 
 N_DRAWS = 999
 _LEAST_PROBABILITY = 1e-3
-_LEAST_READINGS = 24
 _ALARM = 0.01
+_FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
 
 
 class SensorPrior(Protocol):
@@ -71,6 +77,7 @@ def diagnose(
     recordings: Recording | Sequence[Recording],
     *,
     sensor: SensorPrior | None = None,
+    null: Null | None = None,
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
     rng: np.random.Generator,
 ) -> Diagnosis:
@@ -79,9 +86,13 @@ def diagnose(
     Parameters
     ----------
     recordings
-        One, or the first and those that it asked for.
+        One, or the first and those that it asked for. Of more than 2,400 readings as many are diagnosed, in
+        scans spread over all of them; residuals and predictions are given for every row.
     sensor
         An earlier posterior of the sensor, taken as the prior; without it the null is calibrated here.
+    null
+        What is to be diagnosed instead of a calibrated sensor: `SensorAndShape`, where what lies under it
+        is not known, or `OwnModel`, any simulator.
     effects
         The vocabulary to choose from, by name.
     rng
@@ -95,49 +106,61 @@ def diagnose(
     Raises
     ------
     ParameterError
-        If there is no usable reading, or units differ.
+        If there is no usable reading, or units differ, or both a sensor and a null are given.
+    NotConvergedError
+        If the fit of the null did not arrive anywhere.
     """
-    recording = join([recordings] if isinstance(recordings, Recording) else list(recordings))
+    if sensor is not None and null is not None:
+        raise ParameterError("sensor, null", "both", "one of them: a null holds what is known of its sensor")
+    everything = join([recordings] if isinstance(recordings, Recording) else list(recordings))
+    rows = rows_to_diagnose(everything)
+    recording = everything if len(rows) == len(everything) else everything.take(rows)
     extent = Extent.of(recording)
-    fitted = {name: kind.for_extent(extent) for name, kind in effects.items()}
-    built = {name: effect for name, effect in fitted.items() if effect is not None}
+    fitted = {name: kind.for_extent(extent) for name, kind in {**effects, **NUISANCES}.items()}
     floor = sd_floor(recording)
-    known = None
+    known = null
     if sensor is not None:
         samples = np.asarray(sensor.samples, dtype=np.float64)
         known = sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
-    return _Diagnoser(recording, built, known, floor, rng).run()
+    able = {name: effect for name, effect in fitted.items() if effect is not None}
+    built = {name: effect for name, effect in able.items() if known is None or known.admits(effect)}
+    found = _Diagnoser(recording, built, known, floor, rng).run()
+    return found if recording is everything else _of_everything(found, everything)
 
 
 @dataclass(eq=False)
 class _Diagnoser:
     recording: Recording
     built: Mapping[str, NamedEffect[Any]]
-    sensor: SensorCoordinates | None
+    sensor: Null | None
     floor: float
     rng: np.random.Generator
+
+    @property
+    def least_readings(self) -> int:
+        """Fewest usable readings that a verdict is given on."""
+        return LEAST_READINGS if self.sensor is None else self.sensor.least_readings
 
     def run(self) -> Diagnosis:
         self.usable: IntArray = np.flatnonzero(self.recording.usable)
         n = len(self.usable)
         constant = float(np.ptp(self.recording.readings[self.usable])) == 0.0
-        few = n < _LEAST_READINGS or constant
+        few = n < self.least_readings or constant
         self.search: Search = search(
-            self.recording, self.built, sensor=self.sensor, sd_floor=self.floor, max_order=1 if n < 60 else 3
+            self.recording, self.built, sensor=self.sensor, sd_floor=self.floor, max_order=1 if n < 40 else 3
         )
         self.noise_names = frozenset(k for k, e in self.built.items() if e.stage is Stage.NOISE)
         probabilities = self.search.probabilities
         hypotheses = _hypotheses(probabilities)
-        marginal = {
-            k: sum(p for (_, noise), p in probabilities.items() if noise == k) for k in self.search.noise_models
-        }
-        noise = max(marginal, key=lambda k: marginal[k])
-        null = self.search.candidates[self.search.order, ()]
-        problem = Linearised.of(null.found, null.evidence[noise].whitener)
+        noise = self._most_probable_noise(probabilities)
+        self.order = self.search.order
+        null = self.search.candidates[self.order, ()]
+        problem = Linearised.of(null.found, null.evidence[noise].law)
+        if not few:
+            require_converged(null.found, Linearised.of(null.found, null.law))
         draws = problem.draws(N_DRAWS, rng=self.rng)
 
-        columns, families = self._looks(null.found)
-        p_value = global_p_value(problem, columns, families, draws)
+        p_value = global_p_value(problem, self._looks(null.found), draws)
         pairs = self._aliases(problem, null.found)
         verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs))
         # Physics is named only where the test that counts every look has raised an alarm too.
@@ -147,30 +170,27 @@ class _Diagnoser:
             p_value = 1.0  # readings that never change carry no noise to measure a residual by
 
         mean_names = tuple(name for name in combination if name in self.built and name not in self.noise_names)
-        noise_of = tuple(name for name in combination if name in self.noise_names) or (
-            () if verdict in ("named", "noise", "clean") else noise
-        )
+        if verdict == "unknown":
+            mean_names = self.search.beside(noise)
+        noise_of = noise
+        if verdict in ("named", "noise", "clean"):
+            stated = tuple(name for name in combination if name in self.noise_names)
+            noise_of = self._most_probable_noise(
+                {key: p for key, p in probabilities.items() if _in_vocabulary(key[1]) == stated}
+            )
         best = self.search.best(mean_names, noise_of) or null
         samples = self._sample(best, noise_of)
         null_samples = self._sample(null, noise_of)
         effects = self._effects(hypotheses, best, samples, noise_of)
-        after = Linearised.of(best.found, best.evidence[noise_of].whitener)
-        favoured = [c for name in combination if name in self.built for c in self.built[name].covariates]
-        where = places(
-            problem,
-            self.search.covariates,
-            self.recording.plan.scan_names,
-            null.found.residuals,
-            draws,
-            favoured=favoured,
-        )
+        after = Linearised.of(best.found, best.evidence[noise_of].law)
+        where = self._where(null, problem, draws, best, effects, p_value)
         improvement = self._improvement(null, best, noise_of, after, p_value)
         residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
         if verdict == "unknown":
-            improvement, correction = self._corrected(null, problem, noise, improvement)
+            improvement, correction = self._corrected(null, best, after, noise, improvement)
             residuals_after = residuals_after - correction
             change[self.usable] = correction
-        reason = self._reason(verdict, combination, hypotheses, effects, p_value, few, pairs, where)
+        reason = self._reason(verdict, combination, hypotheses, effects, p_value, few, pairs, where, noise)
         predicted_before, predicted_after = (c.found.model.predict(c.found.z[None, :])[0] for c in (null, best))
         return Diagnosis(
             recording=self.recording,
@@ -198,6 +218,14 @@ class _Diagnoser:
             unknown_shares=dict(self.search.unknown_shares),
         )
 
+    def _most_probable_noise(
+        self, probabilities: Mapping[tuple[tuple[str, ...], tuple[str, ...]], float]
+    ) -> tuple[str, ...]:
+        marginal: dict[tuple[str, ...], float] = {}
+        for (_, noise), p in probabilities.items():
+            marginal[noise] = marginal.get(noise, 0.0) + p
+        return max(marginal, key=lambda k: marginal[k])
+
     def _sample(self, candidate: Candidate, noise: tuple[str, ...]) -> ModelSamples:
         evidence = candidate.evidence[noise]
         return sample_model(candidate.found, evidence, self.recording, weights=candidate.weights, rng=self.rng)
@@ -207,13 +235,10 @@ class _Diagnoser:
         out[self.usable] = values
         return out
 
-    def _looks(self, found: Fit) -> tuple[list[FloatArray], list[str]]:
-        """List every template that a test looks at about a fit, with its family."""
+    def _looks(self, found: Fit) -> list[Bank]:
+        """List every template that a test looks at about a fit."""
         missing = [e for k, e in self.built.items() if k not in self.noise_names and k not in found.model.names]
-        named = {e.name: self.search.templates.of(found, e).columns for e in missing}
-        columns, families = families_of(named)
-        bases = self.search.unknown_bases
-        return [*columns, *bases.columns], [*families, *(f"unknown in {f}" for f in bases.families)]
+        return [self.search.templates.bank(found, missing), self.search.unknown_bases]
 
     def _aliases(self, problem: Linearised, found: Fit) -> list[Alias]:
         """Compare what survives of the effects, each by the entry of its bank that fits best here."""
@@ -229,6 +254,44 @@ class _Diagnoser:
             telling[name], chosen[name] = templates.columns[best], templates.variant(best)
         return settle(aliases(problem, telling, {}), found, chosen, problem.sd)
 
+    def _where(
+        self,
+        null: Candidate,
+        problem: Linearised,
+        draws: FloatArray,
+        best: Candidate,
+        effects: tuple[EffectFound, ...],
+        p_value: float,
+    ) -> list[Place]:
+        """Say where what was named is, the largest first; then where else the residual stands out."""
+        covariates, residuals = self.search.covariates, null.found.residuals
+        sizes = {effect.name: effect.size_lambda for effect in effects}
+        named: list[Place] = []
+        for effect in sorted(best.found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
+            change = self._change(best.found, effect)
+            named += places_of_effect(
+                effect,
+                change,
+                covariates,
+                residuals,
+                p_value=p_value,
+                size=sizes.get(effect.name, 0.0),
+                sd=problem.sd,
+            )
+        scanned = places(problem, covariates, self.recording.plan.scan_names, residuals, draws)
+        first: dict[str, Place] = {}
+        for place in [*named, *scanned]:
+            first.setdefault(place.witness, place)
+        return list(first.values())
+
+    def _change(self, found: Fit, effect: NamedEffect[Any]) -> FloatArray:
+        """Tell what one of a fit's effects does to the usable readings, (n_usable,)."""
+        model = found.model
+        keep = np.ones(len(found.z), dtype=np.bool_)
+        keep[model.columns_of(effect.name)] = False
+        without = Model(model.sensor, tuple(e for e in model.effects if e is not effect), model.plan)
+        return np.asarray(found.predicted - without.predict(found.z[None, keep])[0, self.usable])
+
     def _effects(
         self,
         hypotheses: tuple[Hypothesis, ...],
@@ -239,7 +302,7 @@ class _Diagnoser:
         out, unit = [], self.recording.plan.instrumentation.unit
         for name, effect in self.built.items():
             p = sum(h.probability for h in hypotheses if name in h.effects)
-            if p <= _LEAST_PROBABILITY:
+            if p <= _LEAST_PROBABILITY or name in NUISANCES:
                 continue
             holder, noise = (best, noise_of) if name in samples.effects else self._holder(name)
             if holder is None:
@@ -264,8 +327,8 @@ class _Diagnoser:
     def _holder(self, name: str) -> tuple[Candidate | None, tuple[str, ...]]:
         """Find the most probable refitted candidate that holds an effect."""
         ranked = sorted(self.search.probabilities.items(), key=lambda item: -item[1])
-        for (mean, noise), _ in ranked:
-            if name in (*mean, *noise):
+        for (mean, noise), p in ranked:
+            if p > 0 and name in (*mean, *noise):
                 candidate = self.search.best(mean, noise)
                 if candidate is not None:
                     return candidate, noise
@@ -276,9 +339,9 @@ class _Diagnoser:
 
         Of its variants the one is taken that stands in the middle.
         """
-        null = self.search.candidates[self.search.order, ()]
+        null = self.search.candidates[self.order, ()]
         best = max(null.evidence.values(), key=lambda e: e.log_z)
-        problem = Linearised.of(null.found, best.whitener)
+        problem = Linearised.of(null.found, best.law)
         templates = self.search.templates.of(null.found, effect)
         middle = len(templates.columns) // 2
         effect = templates.variant(middle)
@@ -300,8 +363,11 @@ class _Diagnoser:
 
     def _size(self, holder: Candidate, name: str, noise: tuple[str, ...]) -> float:
         """Measure lambda: what is left on noise-free readings after a full refit without the effect."""
-        whitener = holder.evidence[noise].whitener
+        law = holder.evidence[noise].law
         found = holder.found
+        if name in self.search.certain:
+            step = holder.evidence[noise].laid_out.settings[0, holder.evidence[noise].noise.columns_of(name)]
+            return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
         if name in self.noise_names:
             # On the noise: the evidence for it, as the effect of that many sd on the mean would leave.
             gain = holder.evidence[noise].log_z - holder.evidence[tuple(n for n in noise if n != name)].log_z
@@ -314,44 +380,48 @@ class _Diagnoser:
         keep[found.model.columns_of(name)] = False
         noise_free = Recording(self.recording.plan, clean)
         # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
-        refit = fit(model, noise_free, found.z[keep], whitener, sd_floor=found.sd, max_steps=12, tolerance=0.02)
-        return float(np.linalg.norm(whitener(refit.residuals))) / found.sd
+        refit = fit(model, noise_free, found.z[keep], law, sd_floor=found.sd, max_steps=12, tolerance=0.02)
+        return float(np.linalg.norm(law(refit.residuals))) / found.sd * math.sqrt(law.information)
 
     def _improvement(
         self, null: Candidate, best: Candidate, noise: tuple[str, ...], after: Linearised, p_value: float
     ) -> Improvement:
         rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
         if best is null:
-            gain = best.evidence[noise].log_z - null.evidence[()].log_z
+            gain = best.evidence[noise].log_z - null.evidence[self.search.certain].log_z
             return Improvement(gain, 0.0, 0.0, (), rms[0], rms[1], p_value)
-        held = held_out_gain(null.found, best.found, self.recording, sd_floor=self.floor)
-        columns, families = self._looks(best.found)
-        p_after = global_p_value(after, columns, families, after.draws(N_DRAWS // 2, rng=self.rng))
-        log_evidence = best.evidence[noise].log_z - null.evidence[()].log_z
+        law = best.evidence[noise].law
+        held = held_out_gain(null.found, best.found, self.recording, law, sd_floor=self.floor)
+        p_after = global_p_value(after, self._looks(best.found), after.draws(N_DRAWS // 2, rng=self.rng))
+        log_evidence = best.evidence[noise].log_z - null.evidence[self.search.certain].log_z
         return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
 
     def _corrected(
-        self, null: Candidate, problem: Linearised, noise: tuple[str, ...], plain: Improvement
+        self, null: Candidate, best: Candidate, problem: Linearised, noise: tuple[str, ...], plain: Improvement
     ) -> tuple[Improvement, FloatArray]:
-        """Repair by bases without a name, and weigh that repair like any other."""
+        """Repair what the named effects leave by bases without a name, where that predicts scans kept back."""
         bases = self.search.unknown_bases
         scan = self.recording.plan.scan[self.usable]
-        fixed = correct(null.found, problem, bases.columns, scan)
+        fixed = correct(best.found, problem, bases, scan)
+        if fixed.held_out.by_scan and fixed.held_out.per_reading <= 0:
+            return plain, np.zeros(len(fixed.change))
         wider = replace(
-            null.found,
-            residuals=null.found.residuals - fixed.change,
-            slopes=np.concatenate([null.found.slopes, fixed.columns], axis=1),
-            z=np.concatenate([null.found.z, np.zeros(fixed.columns.shape[1])]),
+            best.found,
+            residuals=best.found.residuals - fixed.change,
+            slopes=np.concatenate([best.found.slopes, fixed.columns], axis=1),
+            z=np.concatenate([best.found.z, np.zeros(fixed.columns.shape[1])]),
         )
-        after = Linearised.of(wider, problem.whitener)
-        columns, families = self._looks(null.found)
-        p_after = global_p_value(after, columns, families, after.draws(N_DRAWS // 2, rng=self.rng))
+        after = Linearised.of(wider, problem.law)
+        p_after = global_p_value(after, self._looks(best.found), after.draws(N_DRAWS // 2, rng=self.rng))
+        plain_z = null.evidence[noise].log_z
+        named = dict(plain.heldout_by_scan)
+        by_scan = ((self.recording.plan.scan_names[int(k)], gained) for k, gained in fixed.held_out.by_scan)
         gain = replace(
             plain,
-            log_evidence=self.search.unknown[noise],
-            heldout_log_density_per_reading=fixed.held_out.per_reading,
-            heldout_sd=fixed.held_out.sd,
-            heldout_by_scan=fixed.held_out.by_scan,
+            log_evidence=self.search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,
+            heldout_log_density_per_reading=plain.heldout_log_density_per_reading + fixed.held_out.per_reading,
+            heldout_sd=math.hypot(plain.heldout_sd, fixed.held_out.sd),
+            heldout_by_scan=tuple((name, gained + named.get(name, 0.0)) for name, gained in by_scan),
             rms_after=float(np.sqrt(np.mean(wider.residuals**2))),
             p_value_after=p_after,
         )
@@ -368,7 +438,7 @@ class _Diagnoser:
         p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + N_DRAWS)
         unit = self.recording.plan.instrumentation.unit
         parameters = [_parameter("sd", unit, samples.noise_sd)]
-        for name in noise:
+        for name in _in_vocabulary(noise):
             parameters += _parameters(self.built[name], samples.columns(name), unit)
         return NoiseFound("+".join(noise) or "white", p_value, tuple(parameters))
 
@@ -377,7 +447,7 @@ class _Diagnoser:
         leaders: list[Candidate] = []
         for hypothesis in hypotheses:
             names = tuple(n for n in hypothesis.effects if n not in self.noise_names)
-            candidate = null if names in ((), ("unknown",)) else self.search.best(names)
+            candidate = null if names in ((), ("unknown",)) else self.search.best(names, self.search.certain)
             if candidate is not None and all(candidate.names != leader.names for leader in leaders):
                 leaders.append(candidate)
             if len(leaders) == 2:
@@ -401,7 +471,7 @@ class _Diagnoser:
             return None
         effect, found = self.built[name], leader.found
         best = max(leader.evidence.values(), key=lambda e: e.log_z)
-        problem = Linearised.of(found, best.whitener)
+        problem = Linearised.of(found, best.law)
         templates = self.search.templates.of(found, effect)
         sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
         at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / 3.0))))
@@ -424,20 +494,23 @@ class _Diagnoser:
         few: bool,
         pairs: Sequence[Alias],
         where: Sequence[Any],
+        noise: tuple[str, ...],
     ) -> str:
         n = len(self.usable)
-        if few and n >= _LEAST_READINGS:
+        if few and n >= self.least_readings:
             return f"All {n} usable readings are equal: there is no signal to diagnose; scan across an edge."
         if few:
-            return f"{n} usable readings are too few to tell; {_LEAST_READINGS} or more are needed."
+            return f"{n} usable readings are too few to tell; {self.least_readings} or more are needed."
         by_name = {effect.name: effect for effect in effects}
         if verdict == "clean":
             order = max(self.search.order_probabilities, key=lambda k: self.search.order_probabilities[k])
-            ssf = "one Gaussian" if order == 1 else f"{order} Gaussians"
-            return f"The model, an SSF of {ssf}, explains all {n} readings to within their noise (p = {p_value:.2g})."
+            ssf = "" if order == 0 else ", an SSF of one Gaussian," if order == 1 else f", an SSF of {order} Gaussians,"
+            return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
         if verdict == "unknown":
             place = f" It shows most in {where[0].covariate}." if where else ""
-            return f"Something is missing (p = {p_value:.2g}) that no named effect explains.{place}"
+            known = " and ".join(name.replace("_", " ") for name in self.search.beside(noise))
+            beside = f", beside {known}" if known else ""
+            return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
         if verdict == "cannot_tell":
             leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
             cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
@@ -446,17 +519,40 @@ class _Diagnoser:
         return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g})."
 
 
+def _of_everything(found: Diagnosis, everything: Recording) -> Diagnosis:
+    """Carry what part of a recording told to the whole of it: predictions and residuals of every row."""
+    predicted = [
+        samples.chain.predict(samples.theta[:_FOR_A_MEAN], everything.plan).mean(axis=0)
+        for samples in (found.null, found.repaired)
+    ]
+    readings = np.where(everything.usable, everything.readings, np.nan)
+    return replace(
+        found,
+        recording=everything,
+        reason=f"{found.reason} (From {len(found.recording)} of {len(everything)} readings, spread over all.)",
+        residuals_before=readings - predicted[0],
+        residuals_after=readings - predicted[1],
+        predicted_before=predicted[0],
+        predicted_after=predicted[1],
+    )
+
+
 def _hypotheses(
     probabilities: Mapping[tuple[tuple[str, ...], tuple[str, ...]], float],
 ) -> tuple[Hypothesis, ...]:
     """Join mean and noise into combinations; unknown is one hypothesis under any noise."""
     joined: dict[tuple[str, ...], float] = {}
     for (mean, noise), p in probabilities.items():
-        key = mean if mean == ("unknown",) else tuple(sorted((*mean, *noise)))
+        key = mean if mean == ("unknown",) else tuple(sorted((*mean, *_in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)
+
+
+def _in_vocabulary(noise: tuple[str, ...]) -> tuple[str, ...]:
+    """Leave out what is no name of the vocabulary's."""
+    return tuple(name for name in noise if name not in NUISANCES)
 
 
 def _parameters(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:

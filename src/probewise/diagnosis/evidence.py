@@ -7,64 +7,132 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.fit import Fit
-from probewise.diagnosis.noise import NoiseModel, Whitener
+from probewise.diagnosis.fit import Fit, degrees_of_freedom
+from probewise.diagnosis.noise import NoiseLaw, Tail
+from probewise.diagnosis.noise_models import LaidOut, NoiseModel
 
-__all__ = ["SCALES", "Blocks", "Linearised", "NoiseEvidence", "block_log_bayes_factors", "weigh"]
+__all__ = [
+    "SCALES",
+    "Blocks",
+    "Linearised",
+    "NoiseEvidence",
+    "block_log_bayes_factors",
+    "mix_scales",
+    "project_scaled",
+    "weigh",
+]
 
 SCALES = np.geomspace(0.05, 25.0, 8)
 """Prior scales of an effect's rms, in noise sd: a mixture with a heavy tail."""
 
 
+_MOST_NUMBERS = 4_000_000  # held at once, of the slopes under several laws
+
+
 @dataclass(frozen=True, eq=False)
 class NoiseEvidence:
-    """Log evidence of a fit under one noise model, and where among its nodes the evidence lies."""
+    """Log evidence of a fit under one noise model, and where among its nodes the evidence lies.
+
+    A model that cannot be (none of its nodes fits these readings) has no nodes, and log evidence minus infinity.
+    """
 
     noise: NoiseModel
     log_z: float
     log_z_nodes: FloatArray
+    laid_out: LaidOut
 
     @property
     def weights(self) -> FloatArray:
         """Posterior weight of each node."""
         return np.exp(self.log_z_nodes - logsumexp(self.log_z_nodes))
 
+    def likely_nodes(self, name: str) -> tuple[FloatArray, float]:
+        """Give up to four nodes of one effect that hold most, (n_nodes, n_params), and the log weight of each."""
+        best = np.argsort(-self.weights)[:4]
+        each = float(self.laid_out.log_weights[0]) - math.log(float(self.weights[best].sum()))
+        return self.laid_out.settings[best][:, self.noise.columns_of(name)], each
+
     @property
-    def whitener(self) -> Whitener:
+    def law(self) -> NoiseLaw:
         """The most probable node's."""
-        return self.noise.whiteners[int(np.argmax(self.log_z_nodes))]
+        return self.laid_out.laws[int(np.argmax(self.log_z_nodes))]
 
 
 def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
-    """Integrate a fit's likelihood over its parameters (Laplace), the noise sd, and the noise model's nodes.
+    """Integrate a fit's likelihood over its parameters and the noise sd (Laplace), and the noise model's nodes.
 
     At each node the fit is carried to its new optimum by the linearised model, so that a correlation
     is judged without the bias of residuals that were fitted as if white.
     """
-    n_points = len(found.residuals)
+    laid_out = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
-    p = found.slopes.shape[1]
-    eye = np.eye(p)
-    constant = float(gammaln(n_points / 2)) - 0.5 * n_points * math.log(math.pi) + found.model.sensor.log_multiplicity
-    out = np.empty(len(noise.whiteners))
-    for node, whitener in enumerate(noise.whiteners):
-        turned = whitener(joined)
-        gram = turned.T @ turned
-        jj, jr, rr = gram[:p, :p], gram[:p, p], float(gram[p, p])
-        floor = n_points * sd_floor**2
-        rss = rr + floor
-        for _ in range(3):
-            variance = rss / n_points
-            curvature = jj / variance + eye
-            step = np.linalg.solve(curvature, jr / variance - found.z)
-            rss = max(rr - 2 * float(step @ jr) + float(step @ jj @ step), 0.0) + floor
-        _, log_det = np.linalg.slogdet(curvature)
-        z = found.z + step
-        out[node] = constant - 0.5 * n_points * math.log(rss) - whitener.log_det() - 0.5 * float(z @ z) - 0.5 * log_det
-    return NoiseEvidence(noise, float(logsumexp(out)) - math.log(len(out)), out)
+    out = np.empty(len(laid_out.laws))
+    normal = [node for node, law in enumerate(laid_out.laws) if law.share == 0]
+    chunk = max(_MOST_NUMBERS // joined.size, 1)
+    for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
+        out[nodes] = _of_normal_laws(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
+    tailed: dict[tuple[bytes, bytes, bytes], list[int]] = {}  # by their whitening
+    for node in sorted({*range(len(out))} - {*normal}):
+        tailed.setdefault(laid_out.laws[node].linear, []).append(node)
+    for nodes in tailed.values():
+        out[nodes] = _of_tails(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
+    out += [law.log_extra for law in laid_out.laws]
+    out += laid_out.log_weights + found.model.sensor.log_multiplicity
+    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, laid_out)
+
+
+def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:
+    """Weigh a fit under laws without a tail, (n_laws,); `joined` are slopes and residual, (n_points, n_params + 1)."""
+    p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
+    turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
+    if any(law.carry.any() for law in laws):
+        carry = np.stack([law.carry for law in laws])[:, 1:, None]
+        turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
+    gram = turned.transpose(0, 2, 1) @ turned
+    jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
+    steps: FloatArray = np.zeros_like(jr)
+
+    def variance_now() -> FloatArray:
+        rss = rr - 2 * np.sum(steps * jr, axis=1) + np.einsum("lp,lpq,lq->l", steps, jj, steps)
+        return np.asarray(np.maximum(rss, 0.0) / n_points + sd_floor**2)
+
+    for _ in range(3):
+        variance = variance_now()[:, None]
+        curvature = jj / variance[:, :, None] + np.eye(p)
+        steps = np.asarray(np.linalg.solve(curvature, (jr / variance - found.z)[:, :, None])[:, :, 0])
+    fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
+    return np.asarray(fit_and_prior - 0.5 * n_points * (np.log(variance_now()) + 1) + 0.5 * np.log(math.pi / n_points))
+
+
+def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:
+    """Weigh a fit under laws of one whitening that differ in their tails, (n_laws,)."""
+    turned = laws[0](joined)
+    p, n_points = turned.shape[1] - 1, laws[0].n_points
+    slopes, residual = turned[:, :p], turned[:, p:]
+    gram = slopes.T @ slopes
+    tail = Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))
+    steps, sigma = np.zeros((p, len(laws))), tail.scale(residual, n_points, floor=sd_floor)
+    for _ in range(3):
+        left = residual - slopes @ steps
+        sigma = tail.scale(left, n_points, floor=sd_floor, start=sigma)
+        variance = sigma**2 / tail.information
+        curvature = gram / variance[:, None, None] + np.eye(p)
+        downhill = slopes.T @ tail.as_normal(left, sigma) / variance - found.z[:, None] - steps
+        steps += np.linalg.solve(curvature, downhill.T[:, :, None])[:, :, 0].T
+    left = residual - slopes @ steps
+    sigma = tail.scale(left, n_points, floor=sd_floor, start=sigma)
+    fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
+    scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
+    return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points, floor=sd_floor) + scale)
+
+
+def _peak(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
+    """Give what Laplace's approximation makes of peaks at z (n_laws, n_params), and the densities' constant."""
+    widths = -0.5 * np.linalg.slogdet(curvature)[1]
+    return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,19 +145,23 @@ class Linearised:
 
     basis: FloatArray  # Q of the augmented slopes, (n_rows, n_params)
     residual: FloatArray  # P r, (n_rows,)
-    whitener: Whitener
+    law: NoiseLaw
     sd: float
     n_points: int
 
     @classmethod
-    def of(cls, found: Fit, whitener: Whitener) -> Linearised:
+    def of(cls, found: Fit, law: NoiseLaw) -> Linearised:
         """Linearise about a fit."""
-        whitened = whitener(found.residuals)
         n_points, p = found.slopes.shape
-        sd = math.sqrt(float(whitened @ whitened) / max(n_points - p, 1)) or found.sd
-        basis, _ = np.linalg.qr(np.concatenate([whitener(found.slopes) / sd, np.eye(p)]))
-        augmented = np.concatenate([whitened / sd, -found.z])
-        return cls(basis, augmented - basis @ (basis.T @ augmented), whitener, sd, n_points)
+        whitened = law(found.residuals)[:, None]
+        turned, sigma = law(found.slopes), law.scale(whitened)
+        sigma = np.where(sigma > 0, sigma, found.sd)
+        free = degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
+        sigma = sigma * math.sqrt(n_points / free)
+        sd = float(sigma[0]) / math.sqrt(law.information)
+        basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
+        augmented = np.concatenate([law.as_normal(whitened, sigma)[:, 0] / sd, -found.z])
+        return cls(basis, augmented - basis @ (basis.T @ augmented), law, sd, n_points)
 
     @property
     def n_rows(self) -> int:
@@ -98,7 +170,7 @@ class Linearised:
 
     def project(self, columns: FloatArray) -> FloatArray:
         """Whiten columns of readings (n_points, k) and project the fit's parameters out: (n_rows, k)."""
-        return self.without_fit(self.whitener(columns) / self.sd)
+        return self.without_fit(self.law(columns) / self.sd)
 
     def without_fit(self, whitened: FloatArray) -> FloatArray:
         """Project the fit's parameters out of columns in units of the noise sd: (n_points, k) -> (n_rows, k)."""
@@ -108,14 +180,18 @@ class Linearised:
 
     def absorbed(self, found: Fit, change: FloatArray) -> FloatArray:
         """Move the fit's coordinates so that a change of the readings (n_points,) is taken up, (n_params,)."""
-        slopes = self.whitener(found.slopes) / self.sd
-        shift = slopes.T @ (self.whitener(found.residuals - change) / self.sd) - found.z
+        slopes = self.law(found.slopes) / self.sd
+        left = self.law(found.residuals - change)[:, None]
+        normal = self.law.as_normal(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
+        shift = slopes.T @ (normal / self.sd) - found.z
         return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
 
     def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw residuals under the null, shape (n_rows, n_draws)."""
-        eps = rng.standard_normal((self.n_rows, n_draws))
-        return eps - self.basis @ (self.basis.T @ eps)
+        eps = np.concatenate(
+            [self.law.draws(n_draws, rng=rng), rng.standard_normal((self.n_rows - self.n_points, n_draws))]
+        )
+        return np.asarray(eps - self.basis @ (self.basis.T @ eps))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,19 +211,30 @@ class Blocks:
     @classmethod
     def of(cls, problem: Linearised, templates: Sequence[FloatArray], labels: Sequence[str]) -> Blocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
-        widths = [t.shape[1] for t in templates]
-        whitened = problem.whitener(np.concatenate(templates, axis=1))
-        per_column = np.repeat(widths, widths)
-        norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-        whitened *= np.sqrt(problem.n_points / per_column) / np.where(norms > 0, norms, 1.0)
-        projected = problem.without_fit(whitened)
-        starts = np.concatenate([[0], np.cumsum(widths)[:-1]])
-        u, gain = np.empty_like(projected), np.empty(len(per_column))
+        return cls.of_projected(project_scaled(problem, templates), [t.shape[1] for t in templates], labels, problem)
+
+    @classmethod
+    def of_projected(
+        cls, projected: FloatArray, widths: Sequence[int], labels: Sequence[str], problem: Linearised
+    ) -> Blocks:
+        """Orthonormalise templates that `project_scaled` gave, side by side (n_rows, n_columns), each by itself."""
+        starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
+        u, gain = np.empty_like(projected), np.empty(projected.shape[1])
         for width in set(widths):  # all templates of one width at a time
             columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
             u[:, columns], gain[columns] = _orthonormal(projected[:, columns], width)
         shares = np.sqrt(np.add.reduceat(gain, starts) / problem.n_points)
         return cls(u, gain, starts, tuple(labels), shares)
+
+
+def project_scaled(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
+    """Whiten templates (n_points, k), scale each to unit rms, project the fit out: side by side (n_rows, n_columns)."""
+    widths = [t.shape[1] for t in templates]
+    whitened = problem.law(np.concatenate(templates, axis=1))
+    per_column = np.repeat(widths, widths)
+    norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+    whitened *= np.sqrt(problem.n_points / per_column) / np.where(norms > 0, norms, 1.0)
+    return problem.without_fit(whitened)
 
 
 def _orthonormal(columns: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
@@ -182,12 +269,38 @@ def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int
     Log Bayes factors, shape (n_blocks, n_draws).
     """
     scores = (blocks.u.T @ residuals) ** 2
-    total = np.maximum(np.sum(residuals**2, axis=0), 1e-300)
-    terms = np.empty((len(SCALES), len(blocks.starts), residuals.shape[1]))
+    scores /= np.maximum(np.sum(residuals**2, axis=0), 1e-300)
+    out = np.empty((len(blocks.starts), residuals.shape[1]))
+    widths = np.diff(blocks.starts, append=len(scores))
+    for width in np.unique(widths):  # all blocks of one width at a time
+        members = np.flatnonzero(widths == width)
+        columns = blocks.starts[members, None] + np.arange(width)
+        out[members] = mix_scales(scores[columns], blocks.gain[columns], n_points)
+    return out
+
+
+def mix_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatArray:
+    """Average over `SCALES` the Bayes factors of templates of one width.
+
+    Parameters
+    ----------
+    explained
+        Share of the residual's sum of squares along each axis, (n_templates, width, n_draws).
+    gain
+        Squared length of what survives along each axis, (n_templates, width).
+    n_points
+        Number of readings.
+
+    Returns
+    -------
+    Log Bayes factors, (n_templates, n_draws).
+    """
+    terms = np.empty((len(SCALES), explained.shape[0], explained.shape[2]))
     for k, scale in enumerate(SCALES):
-        ratio = scale**2 * blocks.gain
-        occam = np.add.reduceat(0.5 * np.log1p(ratio), blocks.starts)
-        explained = np.add.reduceat(scores * (ratio / (1 + ratio))[:, None], blocks.starts, axis=0) / total
-        terms[k] = -occam[:, None] - 0.5 * n_points * np.log1p(-np.minimum(explained, 1 - 1e-12))
+        ratio = scale**2 * gain
+        of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
+        np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
+        terms[k] *= -0.5 * n_points
+        terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
     top = terms.max(axis=0)
     return np.asarray(top + np.log(np.exp(terms - top).mean(axis=0)))

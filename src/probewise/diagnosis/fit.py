@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, effect_scores, effect_values
-from probewise.diagnosis.noise import Whitener
+from probewise.diagnosis.noise import NoiseLaw
+from probewise.diagnosis.null import Null, Predictor
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
-from probewise.scene import KnownScene
-from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+from probewise.sensor import FAST_NODES
 
-__all__ = ["Fit", "Model", "fit", "start_with_more_gaussians", "starts_of_one_gaussian"]
+__all__ = ["Fit", "Model", "degrees_of_freedom", "fit", "start_with_more_gaussians", "starts_of_one_gaussian"]
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
@@ -28,18 +27,17 @@ _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 class Model:
     """A chain with its effects, in coordinates of standard normal prior.
 
-    Effects on the noise play no part here; they are in the whitener.
+    Effects on the noise play no part here; they are in its law.
     """
 
-    sensor: SensorCoordinates
+    sensor: Null
     effects: tuple[NamedEffect[Any], ...]
     plan: Plan
 
     @cached_property
-    def chain(self) -> Chain:
+    def chain(self) -> Predictor:
         """The sensor model itself."""
-        scene = _scene_of(self.plan)
-        return Chain(FreeMixture(self.sensor.n_gaussians), FreeLevels(), scene, self.effects, n_nodes=FAST_NODES)
+        return self.sensor.chain(self.plan, self.effects, n_nodes=FAST_NODES)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,12 +88,6 @@ class Model:
         return effect_scores(self.effects[-1], values)
 
 
-@lru_cache(maxsize=32)
-def _scene_of(plan: Plan) -> KnownScene:
-    """Build a plan's scene once for all models that look at it."""
-    return KnownScene(plan.patterns)
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The best point of a model: coordinates `z`, and at it the usable rows' predictions and slopes.
@@ -116,7 +108,7 @@ def fit(
     model: Model,
     recording: Recording,
     start: FloatArray,
-    whitener: Whitener,
+    law: NoiseLaw,
     *,
     sd_floor: float,
     max_steps: int = 30,
@@ -124,8 +116,8 @@ def fit(
 ) -> Fit:
     """Find the most probable point, the noise sd integrated out.
 
-    Maximises -(n/2) log RSS - |z|^2 / 2 over the box |z| <= 6. Each step differentiates in one
-    vectorised prediction and tries five dampings in another.
+    Maximises the log likelihood under the law of the noise, less |z|^2 / 2, over the box |z| <= 6.
+    Each step differentiates in one vectorised prediction and tries five dampings in another.
 
     Parameters
     ----------
@@ -133,8 +125,8 @@ def fit(
         What predicts and what was read.
     start
         Coordinates to start from, shape (n_params,).
-    whitener
-        The noise model.
+    law
+        The law of the noise.
     sd_floor
         Least believable sd of a reading's noise.
     max_steps
@@ -144,23 +136,24 @@ def fit(
     """
     usable = recording.usable
     readings = recording.readings[usable]
-    n_points = len(readings)
-    floor = n_points * sd_floor**2
 
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
-        whitened = whitener((readings - predicted).T)
-        rss = np.sum(whitened**2, axis=0) + floor
-        return np.asarray(0.5 * n_points * np.log(rss) + 0.5 * np.sum(z**2, axis=1))
+        whitened = law((readings - predicted).T)
+        sigma = law.scale(whitened, floor=sd_floor)
+        return np.asarray(law.misfit(whitened, sigma, floor=sd_floor) + 0.5 * np.sum(z**2, axis=1))
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
     predicted, slopes = (part[usable] for part in model.jacobian(z))
     best = float(objective(predicted[None, :], z[None, :])[0])
+    if not (np.isfinite(best) and np.isfinite(slopes).all()):  # nothing to go down from
+        return Fit(model, z, predicted, readings - predicted, slopes, np.inf, np.inf)
     for _ in range(max_steps):
-        whitened, turned = whitener(readings - predicted), whitener(slopes)
-        variance = (float(whitened @ whitened) + floor) / n_points
+        whitened, turned = law(readings - predicted)[:, None], law(slopes)
+        sigma = law.scale(whitened, floor=sd_floor)
+        variance = float(sigma[0]) ** 2 / law.information
         curvature = turned.T @ turned / variance + eye
-        downhill = turned.T @ whitened / variance - z
+        downhill = turned.T @ law.as_normal(whitened, sigma)[:, 0] / variance - z
         scale = np.diag(curvature)
         tries = np.stack([np.linalg.solve(curvature + np.diag(d * scale), downhill) for d in _DAMPINGS])
         tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
@@ -174,9 +167,22 @@ def fit(
         predicted, slopes = (part[usable] for part in model.jacobian(z))
         if gained < tolerance:
             break
-    whitened = whitener(readings - predicted)
-    sd = math.sqrt((float(whitened @ whitened) + floor) / n_points)
+    sd = float(law.scale(law(readings - predicted)[:, None], floor=sd_floor)[0])
     return Fit(model, z, predicted, readings - predicted, slopes, sd, best)
+
+
+def degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
+    """Count the readings that no parameter takes: n less the number of parameters that they, not the priors, settle.
+
+    Parameters
+    ----------
+    slopes
+        Of the whitened readings by the coordinates, (n_points, n_params).
+    sd
+        Noise of a whitened reading.
+    """
+    squares = np.linalg.svd(slopes / max(sd, 1e-150), compute_uv=False) ** 2
+    return max(len(slopes) - float(np.sum(squares / (1 + squares))), 1.0)
 
 
 def starts_of_one_gaussian(sensor: SensorCoordinates) -> FloatArray:
@@ -190,7 +196,7 @@ def _set_widths(z: FloatArray, step: float) -> FloatArray:
     return z
 
 
-def start_with_more_gaussians(found: SensorCoordinates, z: FloatArray, wanted: SensorCoordinates) -> FloatArray:
+def start_with_more_gaussians(found: Null, z: FloatArray, wanted: SensorCoordinates) -> FloatArray:
     """Split the heaviest Gaussian of a fit in several ways, shape (n_starts, wanted.n_params)."""
     theta = found.theta(z[None, : found.n_params])[0]
     n = found.n_gaussians

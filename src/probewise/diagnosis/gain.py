@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fit import Fit, fit
-from probewise.diagnosis.noise import white
+from probewise.diagnosis.fit import Fit, degrees_of_freedom, fit
+from probewise.diagnosis.noise import NoiseLaw
 from probewise.recordings.plan import Recording
 
 __all__ = ["HeldOut", "compare_scans", "held_out_gain"]
@@ -29,18 +29,19 @@ class HeldOut:
     by_scan: tuple[tuple[str, float], ...]
 
 
-def held_out_gain(null: Fit, repaired: Fit, recording: Recording, *, sd_floor: float) -> HeldOut:
+def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, *, sd_floor: float) -> HeldOut:
     """Refit both models without one scan at a time and compare how they predict it, reading by reading.
 
-    Scans of fewer than eight readings stay in; of more than ten longer ones, ten spread over the
-    recording are kept back in turn.
+    Each reading counts by itself, as the law of the noise has it. Scans of fewer than eight readings stay
+    in; of more than ten longer ones, ten spread over the recording are kept back in turn.
     """
     plan, usable = recording.plan, recording.usable
 
     def gain(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
         rows[np.flatnonzero(usable)[out]] = True
-        return _log_density(repaired, recording, rows, sd_floor) - _log_density(null, recording, rows, sd_floor)
+        repaired_one, null_one = (_log_density(f, recording, rows, law, out, sd_floor) for f in (repaired, null))
+        return repaired_one - null_one
 
     return compare_scans(plan.scan[usable], gain, plan.scan_names)
 
@@ -71,18 +72,31 @@ def compare_scans(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_
     return HeldOut(float(joined.mean()), sd, len(joined), by_scan)
 
 
-def _log_density(found: Fit, recording: Recording, out: BoolArray, sd_floor: float) -> FloatArray:
-    """Log predictive density of each reading of the rows `out`, by a refit to the others."""
-    readings = np.where(out, np.nan, recording.readings)
-    kept = Recording(recording.plan, readings, recording.source)
-    n_kept = int(kept.usable.sum())
-    without = fit(found.model, kept, found.z, white(n_kept), sd_floor=sd_floor, max_steps=4, tolerance=0.05)
-    rows = np.flatnonzero(out & recording.usable)
-    predicted, slopes = (part[rows] for part in found.model.jacobian(without.z))
-    p = slopes.shape[1]
-    variance = without.sd**2 * n_kept / max(n_kept - p, 1)
-    curvature = without.slopes.T @ without.slopes / variance + np.eye(p)
+def _log_density(
+    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray, sd_floor: float
+) -> FloatArray:
+    """Log predictive density of each reading kept back, by itself, by a refit to the others.
+
+    `rows` (n_points,) and `out` (n_usable,) are the same readings. What a law says of lost readings is the
+    same for every model of the mean, and left out.
+    """
+    kept = Recording(recording.plan, np.where(rows, np.nan, recording.readings), recording.source)
+    rest, own = law.take(~out), law.take(out)
+    without = fit(found.model, kept, found.z, rest, sd_floor=sd_floor, max_steps=4, tolerance=0.05)
+    asked = np.flatnonzero(rows & recording.usable)
+    predicted, slopes = (part[asked] for part in found.model.jacobian(without.z))
+    turned = rest(without.slopes)
+    free = degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
+    sigma_2 = without.sd**2 * rest.n_points / free
+    curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
-    total = variance + spread
-    miss = recording.readings[rows] - predicted
-    return np.asarray(-0.5 * np.log(2 * np.pi * total) - 0.5 * miss**2 / total)
+    miss = recording.readings[asked] - predicted
+    narrow, wide = (
+        _log_normal(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
+        for times, share in ((1.0, 1 - law.share), (law.times, law.share))
+    )
+    return np.asarray(np.logaddexp(narrow, wide) * own.kept)
+
+
+def _log_normal(miss: FloatArray, variance: FloatArray) -> FloatArray:
+    return np.asarray(-0.5 * np.log(2 * np.pi * variance) - 0.5 * miss**2 / variance)

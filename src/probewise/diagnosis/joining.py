@@ -10,6 +10,7 @@ import numpy as np
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Plan, Recording
+from probewise.sensor import COMMANDED
 
 __all__ = ["join"]
 
@@ -17,7 +18,8 @@ __all__ = ["join"]
 def join(recordings: Sequence[Recording]) -> Recording:
     """Set recordings behind each other: scans stay apart, patterns of one name but two descriptions too.
 
-    Only covariates that all recordings have are kept. Times stay as they are in each file.
+    Only covariates that all recordings have are kept; what is commanded (LED, height) is NaN, as at
+    calibration, where a recording does not say. Times stay as they are in each file.
 
     Raises
     ------
@@ -55,7 +57,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
         scans.append(plan.scan + len(scan_names))
         scan_names += [s if number == 0 else f"{s} ({number + 1})" for s in plan.scan_names]
     plans = [r.plan for r in recordings]
-    shared = set.intersection(*(set(p.covariates) for p in plans))
+    shared = set.intersection(*({*p.covariates, *COMMANDED} for p in plans)) & {k for p in plans for k in p.covariates}
     joined = Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
         y_mm=np.concatenate([p.y_mm for p in plans]),
@@ -66,7 +68,9 @@ def join(recordings: Sequence[Recording]) -> Recording:
         pattern=np.concatenate(codes),
         pattern_names=tuple(names),
         patterns=patterns,
-        covariates={k: np.concatenate([p.covariates[k] for p in plans]) for k in sorted(shared)},
+        covariates={
+            k: np.concatenate([p.covariates.get(k, np.full(len(p), np.nan)) for p in plans]) for k in sorted(shared)
+        },
         instrumentation=first.plan.instrumentation,
     )
     readings = np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings])

@@ -7,19 +7,24 @@ fit to pure noise, no refits. Every look is counted, because each draw takes eve
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, frozen
+from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.covariates import Covariate
-from probewise.diagnosis.evidence import Blocks, Linearised, block_log_bayes_factors
+from probewise.diagnosis.evidence import Linearised
+from probewise.effects import NamedEffect
 
-__all__ = ["Place", "global_p_value", "places", "windows"]
+__all__ = ["Place", "global_p_value", "places", "places_of_effect", "windows"]
 
 _LEAST_ROWS = 3
+_FELT = 0.05  # share of its greatest strength
+_PLAIN = 0.25  # a share of the first draws from which more of them would change nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,34 +56,43 @@ class Place:
         return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".png"
 
 
-def global_p_value(
-    problem: Linearised, columns: Sequence[FloatArray], families: Sequence[str], draws: FloatArray
-) -> float:
+def global_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:
     """Test that nothing is missing from the mean: the sum of all Bayes factors against its null law.
 
     Parameters
     ----------
     problem
         The fit under the noise model found.
-    columns, families
-        Every template looked at, and what it belongs to; families count alike.
+    banks
+        Every template looked at, labelled by what it belongs to; labels count alike.
     draws
-        Residuals under the null, shape (n_rows, n_draws).
+        Residuals under the null, shape (n_rows, n_draws). Where the first few show that nothing stands
+        out, the others are left alone.
 
     Returns
     -------
     Probability, under the null, of at least what was seen. Beyond the draws' reach the
     bound P(Bayes factor > b) < 1/b takes over.
     """
-    blocks = Blocks.of(problem, columns, families)
-    names, codes = np.unique(np.array(families), return_inverse=True)
+    families = [(number, label) for number, bank in enumerate(banks) for label in bank.labels]
+    names = list(dict.fromkeys(families))
+    codes = np.array([names.index(family) for family in families])
     log_weight = -np.log(np.bincount(codes)[codes]) - math.log(len(names))
-    residuals = np.concatenate([problem.residual[:, None], draws], axis=1)
-    scores = block_log_bayes_factors(blocks, residuals, problem.n_points)
-    total: FloatArray = logsumexp(scores + log_weight[:, None], axis=0)
-    above = int(np.sum(total[1:] >= total[0]))
-    p_value: float = (1 + above) / (1 + draws.shape[1])
-    return p_value if above else min(p_value, math.exp(-max(float(total[0]), 0.0)))
+
+    def total(residuals: FloatArray) -> FloatArray:
+        scores = np.concatenate([bank.log_bayes_factors(problem, residuals) for bank in banks])
+        return np.asarray(logsumexp(scores + log_weight[:, None], axis=0))
+
+    seen = float(total(problem.residual[:, None])[0])
+    n_draws = draws.shape[1]
+    if seen > math.log(10 * n_draws):
+        return math.exp(-seen)
+    above = np.zeros(0)
+    for first, last in ((0, n_draws // 5), (n_draws // 5, n_draws)):
+        above = np.append(above, total(draws[:, first:last]) >= seen)
+        if above.mean() > _PLAIN:
+            break
+    return float((1 + above.sum()) / (1 + len(above)))
 
 
 def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
@@ -129,7 +143,6 @@ def places(
     residuals: FloatArray,
     draws: FloatArray,
     *,
-    favoured: Sequence[str] = (),
     largest_p: float = 0.05,
 ) -> list[Place]:
     """Find the window of each covariate that stands out most, strongest first.
@@ -146,8 +159,6 @@ def places(
         Reading minus prediction, (n_points,), for the witness curves.
     draws
         Residuals under the null, (n_rows, n_draws).
-    favoured
-        Covariates in which the effect found shows: they come first among equal p-values.
     largest_p
         Windows less surprising than this are not reported.
     """
@@ -178,7 +189,50 @@ def places(
             scan, start, end = scan_names[int(kept[best][0])], None, None
         at, mean, sd = _curve(covariate, residuals, problem.sd)
         out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), at, mean, sd))
-    return sorted(out, key=lambda place: (place.p_value, place.covariate not in favoured, -place.z))
+    return sorted(out, key=lambda place: (place.p_value, -place.z))
+
+
+def places_of_effect(
+    effect: NamedEffect[Any],
+    change: FloatArray,
+    covariates: Sequence[Covariate],
+    residuals: FloatArray,
+    *,
+    p_value: float,
+    size: float,
+    sd: float,
+) -> list[Place]:
+    """Say where a named effect is: in the first of its covariates that varies here, where it has half its strength.
+
+    Parameters
+    ----------
+    effect
+        The effect; one that is bound to scans is in those.
+    change
+        What it makes of the readings, (n_points,).
+    covariates
+        Those of the recording.
+    residuals
+        Of the null, (n_points,), for the witness curve.
+    p_value, size
+        That nothing is missing, and lambda.
+    sd
+        Of the noise.
+    """
+    known = {c.name: c for c in covariates if c.scan is None}
+    name = next((name for name in effect.covariates if name in known), None)
+    if name is None or not np.any(change):
+        return []
+    covariate = known[name]
+    curve = _curve(covariate, residuals, sd)
+    if name == "scan" or (effect.scans and "scan" in effect.covariates and "scan" in known):
+        curve = _curve(known["scan"], residuals, sd)
+        return [Place("scan", scan, None, None, p_value, size, *curve) for scan in effect.scans]
+    strength = np.abs(change[covariate.rows])
+    # What sets in at a level is there from where it is first felt.
+    felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
+    values = covariate.values[felt]
+    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve)]
 
 
 def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -192,9 +246,3 @@ def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[Floa
         np.array([mine[p].mean() for p in parts]),
         np.array([sd / math.sqrt(len(p)) for p in parts]),
     )
-
-
-def families_of(effects: Mapping[str, Sequence[FloatArray]]) -> tuple[list[FloatArray], list[str]]:
-    """Flatten templates by name into columns and the name of each."""
-    columns = [c for entries in effects.values() for c in entries]
-    return columns, [name for name, entries in effects.items() for _ in entries]

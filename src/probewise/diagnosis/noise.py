@@ -1,23 +1,25 @@
-"""Is it only the noise? Whitening by a noise model, and tests of what is left.
+"""Is it only the noise? The law of a recording's noise, and tests of what is left.
 
-A wrong noise model makes false alarms by the dozen, and a missed effect of the mean looks like correlated
-noise; so every hypothesis about the mean is weighed under white and under each other noise model.
+A wrong law makes false alarms by the dozen, and a missed effect of the mean looks like correlated or
+heavy-tailed noise; so every hypothesis about the mean is weighed under white and under each other law.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.special import expit
 
-from probewise._arrays import FloatArray, IntArray
-from probewise.effects import NamedEffect
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.recordings.plan import Recording
-from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["NoiseModel", "Whitener", "noise_statistics", "steps_within_scans", "white"]
+__all__ = ["NoiseLaw", "Tail", "noise_statistics", "steps_within_scans", "white"]
+
+_EM_STEPS = 12
+_LEAST = 1e-150  # of a scale: readings that are all as predicted are no error
 
 
 def steps_within_scans(recording: Recording) -> IntArray:
@@ -32,21 +34,70 @@ def steps_within_scans(recording: Recording) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Whitener:
-    """Turn readings with correlated noise of uneven sd into independent ones of equal sd.
+class NoiseLaw:
+    """The law of all readings' noise, up to its overall sd.
 
-    `sd` (n_points,) is relative to the overall sd; `carry` (n_points,) is the correlation with the
-    previous reading, 0 for the first of a scan.
+    Whitening, a linear map, makes residuals independent and of one scale sigma; what is left of each is
+    normal, but with probability `share` `times` as wide: a heavy tail. Readings that are lost say nothing.
+
+    Parameters
+    ----------
+    sd
+        Sd of each reading relative to the overall one, (n_points,).
+    carry
+        Correlation with the previous reading, 0 for the first of a scan, (n_points,).
+    lost
+        Readings that hold nothing of what lies under the sensor, (n_points,).
+    share, times
+        The tail; none by default.
+    log_extra
+        What the law says beyond the density of the readings that are not lost: of those that are.
     """
 
     sd: FloatArray
     carry: FloatArray
+    lost: BoolArray
+    share: float = 0.0
+    times: float = 1.0
+    log_extra: float = 0.0
+    kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kept", 1.0 - self.lost)
+
+    @property
+    def n_points(self) -> int:
+        """Readings that are not lost."""
+        return len(self.sd) - int(self.lost.sum())
+
+    @property
+    def linear(self) -> tuple[bytes, bytes, bytes]:
+        """What the whitening depends on: laws of one whitening differ in their tails alone."""
+        return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes()
+
+    def alike(self, other: NoiseLaw) -> bool:
+        """Tell whether another law is as good as the same."""
+        return (
+            (self.share, self.times) == (other.share, other.times)
+            and np.array_equal(self.lost, other.lost)
+            and np.allclose(self.sd, other.sd, rtol=0.03)
+            and np.allclose(self.carry, other.carry, atol=0.03)
+        )
+
+    @property
+    def information(self) -> float:
+        """Fisher information of one whitened reading about its place, in units of 1 / sigma^2."""
+        return float(self.tail.information)
+
+    def take(self, rows: BoolArray) -> NoiseLaw:
+        """Keep the law of some readings, whole scans of them."""
+        return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows])
 
     def __call__(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns, shape (n_points,) or (n_points, n_columns)."""
+        """Whiten columns, shape (n_points,) or (n_points, n_columns); 0 for readings that are lost."""
         flat = columns.ndim == 1
         y = columns[:, None] if flat else columns
-        y = y / self.sd[:, None]
+        y = y * (self.kept / self.sd)[:, None]
         if np.any(self.carry):
             carry = self.carry[1:, None]
             y = np.concatenate([y[:1], (y[1:] - carry * y[:-1]) / np.sqrt(1 - carry**2)])
@@ -54,52 +105,131 @@ class Whitener:
 
     def log_det(self) -> float:
         """Return half the log determinant of the relative covariance."""
-        return float(np.log(self.sd).sum() + 0.5 * np.log1p(-(self.carry**2)).sum())
+        kept = ~self.lost
+        return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
+
+    @cached_property
+    def tail(self) -> Tail:
+        """The tail by itself."""
+        return Tail(self.share, self.times)
+
+    def scale(self, whitened: FloatArray, *, floor: float = 0.0) -> FloatArray:
+        """Most likely sigma of whitened residuals, (n_points, k) -> (k,); `floor` is added in quadrature."""
+        return self.tail.scale(whitened, self.n_points, floor=floor)
+
+    def misfit(self, whitened: FloatArray, sigma: FloatArray, *, floor: float = 0.0) -> FloatArray:
+        """Minus log likelihood of whitened residuals (n_points, k) at the sigma (k,) that `scale` gives: (k,).
+
+        Without n/2 log 2 pi.
+        """
+        return self.tail.misfit(whitened, sigma, self.n_points, floor=floor)
+
+    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Turn whitened residuals (n_points, k) into those of normal noise that say as much about the mean."""
+        return self.tail.as_normal(whitened, sigma)
+
+    def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw residuals as `as_normal` makes them, in units of their sd, (n_points, n_draws)."""
+        eps = rng.standard_normal((len(self.sd), n_draws))
+        if self.share:
+            eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
+            eps = self.as_normal(eps, np.ones(n_draws)) * math.sqrt(self.information)
+        return eps * self.kept[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseModel:
-    """A set of effects on the noise with equally weighted settings of their parameters.
+class Tail:
+    """Mix two normal densities of one mean: with probability `share` `times` as wide; one tail, or k of them (k,).
 
-    `settings` holds one row a node, the effects' parameters side by side; `whiteners` one a node.
+    All methods take whitened residuals, (n_points, k) or (n_points, 1).
     """
 
-    effects: tuple[NamedEffect[Any], ...]
-    settings: FloatArray
-    whiteners: tuple[Whitener, ...]
+    share: float | FloatArray
+    times: float | FloatArray
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its effects; () for white noise."""
-        return tuple(effect.name for effect in self.effects)
+    @cached_property
+    def is_normal(self) -> bool:
+        """Whether there is none."""
+        return bool(np.all(np.asarray(self.share) == 0))
 
-    @classmethod
-    def of(cls, effects: Sequence[NamedEffect[Any]], recording: Recording) -> NoiseModel:
-        """Lay out the nodes: every combination of the effects' banks."""
-        banks = [effect.bank()[:, 0, :] for effect in effects]
-        settings = np.zeros((1, 0))
-        for bank in banks:
-            settings = np.concatenate(
-                [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
-            )
-        usable, plan, steps = recording.usable, recording.plan, steps_within_scans(recording)
-        whiteners = []
-        for row in settings:
-            level = NoiseLevel(sd=np.ones((1, len(plan))), rho=np.zeros((1, 1)))
-            at = 0
-            for effect in effects:
-                n_params = len(effect.prior.names)
-                level = effect.apply(level, row[None, at : at + n_params], plan)
-                at += n_params
-            sd = np.broadcast_to(level.sd, (1, len(plan)))[0, usable]
-            carry = np.where(steps > 0, float(level.rho[0, 0]) ** np.maximum(steps, 1), 0.0)
-            whiteners.append(Whitener(sd, carry))
-        return cls(tuple(effects), settings, tuple(whiteners))
+    @cached_property
+    def information(self) -> FloatArray:
+        """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
+        return np.asarray(np.vectorize(_information, otypes=[np.float64])(self.share, self.times))
+
+    def scale(
+        self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
+    ) -> FloatArray:
+        """Most likely sigma, (k,), by expectation and maximisation; rows beyond `n_points` are 0 and do not count."""
+        if self.is_normal:
+            return np.asarray(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points + floor**2))
+        squares = whitened**2
+        if start is None:  # from the middle half of what is not lost, which the tail leaves alone
+            middle = len(whitened) - n_points // 2 - 1
+            sigma = np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745 + floor + _LEAST
+        else:
+            sigma = start
+        for _ in range(_EM_STEPS if start is None else 3):
+            weighed = self._weights(squares / sigma**2) * squares
+            sigma = np.sqrt(weighed.sum(axis=0) / n_points + floor**2) + _LEAST
+        return np.asarray(sigma)
+
+    def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int, *, floor: float = 0.0) -> FloatArray:
+        """Minus log likelihood at the most likely sigma (k,), without n/2 log 2 pi: (k,).
+
+        The floor counts as what is always left of each reading, so that laws with and without a tail compare.
+        """
+        if self.is_normal:
+            return np.asarray(n_points * (np.log(sigma) + 0.5))
+        squares = (whitened / sigma) ** 2
+        log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds(squares))
+        at_zero = np.logaddexp(0.0, self._log_odds(np.zeros((1, 1))))[0]
+        of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
+        always = 0.5 * (floor / sigma) ** 2
+        return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share) + always) - of_kept)
+
+    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Turn residuals into those of normal noise that say as much about the mean.
+
+        The score of the density over its information: of sd sigma / sqrt(information), and what lies far
+        out in the tail counts little (Huber 1981, section 6.7: pseudo-observations).
+        """
+        if self.is_normal:
+            return whitened
+        return np.asarray(whitened * self._weights((whitened / sigma) ** 2) / self.information)
+
+    def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+        """Give minus the second derivative of the log likelihood by log sigma, (k,)."""
+        squares = (whitened / sigma) ** 2
+        wide = expit(self._log_odds(squares))
+        less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
+        return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
+
+    def _log_odds(self, squares: FloatArray) -> FloatArray:
+        """Log odds that a residual is a wide one, by its square in units of sigma^2."""
+        share, times = np.asarray(self.share), np.asarray(self.times)
+        return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
+
+    def _weights(self, squares: FloatArray) -> FloatArray:
+        """Expect the precision of each residual, 1 for those of the narrow part."""
+        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * expit(self._log_odds(squares)))
 
 
-def white(n_points: int) -> Whitener:
+@lru_cache(maxsize=256)
+def _information(share: float, times: float) -> float:
+    if share == 0:
+        return 1.0
+    # The integrand reaches as far as the wide part does.
+    z = np.linspace(-6 * times, 6 * times, 4001)
+    narrow = (1 - share) * np.exp(-0.5 * z * z)
+    wide = share / times * np.exp(-0.5 * (z / times) ** 2)
+    score = z * (narrow + wide / times**2) / (narrow + wide)
+    return float(np.sum(score**2 * (narrow + wide)) * (z[1] - z[0]) / math.sqrt(2 * math.pi))
+
+
+def white(n_points: int) -> NoiseLaw:
     """Leave readings as they are."""
-    return Whitener(np.ones(n_points), np.zeros(n_points))
+    return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_))
 
 
 def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import PurePath
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.diagnosis.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.evidence import NoiseEvidence
-from probewise.diagnosis.fit import Fit
-from probewise.effects import Extent
+from probewise.diagnosis.fit import Fit, degrees_of_freedom
+from probewise.diagnosis.null import Predictor
+from probewise.effects import NUISANCES, Extent, NoiseEffect
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
-from probewise.scene import KnownScene
-from probewise.sensor import Chain, FreeLevels, FreeMixture
+from probewise.sensor import ACCURATE_NODES
 
 __all__ = ["ModelSamples", "sample_model"]
 
@@ -32,14 +33,16 @@ class ModelSamples:
     """Equally weighted posterior samples of a chain with effects.
 
     `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
-    `effects` names all effects, those on the noise too, in the order of their columns.
+    `effects` names all effects, those on the noise too, in the order of their columns; `nuisance` the
+    parameters that belong to this recording alone.
     """
 
-    chain: Chain
+    chain: Predictor
     theta: FloatArray
     noise_sd: FloatArray
     effects: tuple[str, ...]
     n_gaussians: int
+    nuisance: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", frozen(self.theta))
@@ -52,6 +55,7 @@ class ModelSamples:
 
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Make the sensor of it that predicts, drives the robot, and is written to sensor.json."""
+        kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
         from_chain = by_mass(self.theta, self.n_gaussians)
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_step_mm(recording))
         field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
@@ -66,8 +70,8 @@ class ModelSamples:
             rng=rng,
         )
         return FittedSensor(
-            names=self.chain.names,
-            samples=from_chain,
+            names=tuple(self.chain.names[i] for i in kept),
+            samples=from_chain[:, kept],
             n_gaussians=self.n_gaussians,
             noise_sd=self.noise_sd,
             field=field,
@@ -103,20 +107,23 @@ def sample_model(
     n_samples
         How many.
     """
-    n_points, p = found.slopes.shape
-    whitener = noise.whitener
-    turned, whitened = whitener(found.slopes), whitener(found.residuals)
-    rss = float(whitened @ whitened)
-    dof = max(n_points - p, 1)
-    curvature = turned.T @ turned * dof / max(rss, 1e-300) + np.eye(p)
+    p = found.slopes.shape[1]
+    law = noise.law
+    turned, whitened = law(found.slopes), law(found.residuals)[:, None]
+    sigma = law.scale(whitened)
+    dof = degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
+    variance = max(float(sigma[0]) ** 2 * law.n_points / dof / law.information, 1e-300)
+    curvature = turned.T @ turned / variance + np.eye(p)
     factor = np.linalg.inv(np.linalg.cholesky(curvature))
-    center = found.z + np.linalg.solve(curvature, turned.T @ whitened * dof / max(rss, 1e-300) - found.z)
+    normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
+    center = found.z + np.linalg.solve(curvature, turned.T @ normal / variance - found.z)
     z = np.clip(center + rng.standard_normal((n_samples, p)) @ factor, -FARTHEST, FARTHEST)
-    noise_sd = np.sqrt(np.full(n_samples, rss) / rng.chisquare(dof, n_samples))
+    noise_sd = float(sigma[0]) * np.sqrt(law.n_points / rng.chisquare(dof, n_samples))
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
-    effects = (*found.model.effects, *noise.noise.effects)
-    scene = KnownScene(recording.plan.patterns)
-    chain = Chain(FreeMixture(found.model.sensor.n_gaussians), FreeLevels(), scene, effects)
+    on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
+    effects = (*found.model.effects, *on_noise)
+    null = found.model.sensor
+    chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
     own = {
         effect.name: effect.spread(
             effect_values(effect, z[:, found.model.columns_of(effect.name)]), weights[effect.name], rng=rng
@@ -124,14 +131,20 @@ def sample_model(
         for effect in found.model.effects
     }
     theta = found.model.theta_of(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
-    if noise.noise.effects:
-        nodes = noise.noise.settings[rng.choice(len(noise.weights), n_samples, p=noise.weights)]
-        for k in range(nodes.shape[1]):
-            spacing = np.diff(np.unique(noise.noise.settings[:, k]))
-            nodes[:, k] += (rng.random(n_samples) - 0.5) * (spacing[0] if spacing.size else 0.0)
-        theta = np.concatenate([theta, nodes], axis=1)
+    nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
+    theta = np.concatenate([theta, *(_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
     names = tuple(effect.name for effect in chain.effects)
-    return ModelSamples(chain, theta, noise_sd, names, found.model.sensor.n_gaussians)
+    return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance)
+
+
+def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:
+    """Draw one effect's parameters about the nodes drawn, as far as half way to the next: (n_samples, n_params)."""
+    settings = noise.laid_out.settings[:, noise.noise.columns_of(effect.name)]
+    values, units = settings[nodes], effect.prior.to_unit_cube(settings)
+    gaps = np.array([np.diff(np.unique(np.round(column, 9))).min(initial=1.0) for column in units.T])
+    spread = np.array([len(np.unique(column)) > 1 for column in settings.T])
+    moved = np.clip(units[nodes] + (rng.random(values.shape) - 0.5) * gaps, 0.0, 1.0)
+    return np.where(spread, effect.prior.from_unit_cube(moved), values)
 
 
 def _step_mm(recording: Recording) -> float:

@@ -1,120 +1,58 @@
 """Score, weigh, combine: find the set of effects that explains the recording.
 
-Every subset of effects on the mean, under every noise model and several SSF orders. Templates screen,
-a beam of the best is refitted jointly and non-linearly, Laplace weighs.
+Every subset of effects on the mean, under every noise model and several SSF orders, and whatever has no
+name beside each of them. Templates screen, a beam of the best is refitted jointly and non-linearly,
+Laplace weighs.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.coordinates import SensorCoordinates, default_sensor
-from probewise.diagnosis.covariates import Covariate, covariates_of, slope_along_the_move
-from probewise.diagnosis.evidence import Blocks, Linearised, NoiseEvidence, block_log_bayes_factors, weigh
+from probewise.diagnosis.bank import Bank
+from probewise.diagnosis.bases import unknown_templates
+from probewise.diagnosis.convergence import require_finite
+from probewise.diagnosis.coordinates import default_sensor
+from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
+from probewise.diagnosis.evidence import Linearised, NoiseEvidence, weigh
 from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.noise import NoiseModel, Whitener, white
-from probewise.diagnosis.templates import (
-    EffectTemplates,
-    TemplateMemory,
-    UnknownTemplates,
-    subsets,
-    unknown_templates,
-)
-from probewise.effects import Extent, NamedEffect
+from probewise.diagnosis.noise import NoiseLaw, steps_within_scans, white
+from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.diagnosis.null import Null
+from probewise.diagnosis.odds import PriorOdds
+from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
+from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
+from probewise.diagnosis.weighed import STEERING, Candidate, Search, weighed
+from probewise.effects import VOCABULARY, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["Candidate", "PriorOdds", "Search", "search"]
+__all__ = ["search"]
 
 Names = tuple[str, ...]
 
-_BEST_ENTRIES = 2  # of each effect's bank, for pairs
-_STEERING = 3.0  # nats behind the best: a noise model further back does not say what to look for next
-
-
-@dataclass(frozen=True)
-class PriorOdds:
-    """What is believed of hypotheses before any reading.
-
-    Half of all recordings are clean. Of the mean: `clean_mean`, `unknown`, and the rest shared out over
-    combinations, by size, then evenly. Of the noise: `white`, the rest evenly over noise models.
-    """
-
-    clean_mean: float = 0.60
-    unknown: float = 0.06
-    by_size: tuple[float, ...] = (0.31, 0.025, 0.005)
-    white: float = 0.88
-
-    def log_mean(self, names: Names, n_effects: int) -> float:
-        """Log prior of a combination of effects on the mean."""
-        if not names:
-            return math.log(self.clean_mean)
-        return math.log(self.by_size[len(names) - 1] / math.comb(n_effects, len(names)))
-
-    def log_noise(self, names: Names, n_models: int) -> float:
-        """Log prior of a noise model, one of `n_models` with the white one."""
-        return math.log((1 - self.white) / max(n_models - 1, 1)) if names else math.log(self.white)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A combination of effects on the mean at one SSF order, refitted and weighed under each noise model."""
-
-    found: Fit
-    evidence: Mapping[Names, NoiseEvidence]
-    log_share: float  # in the evidence, for the discrete choices that its effects have made
-    weights: Mapping[str, FloatArray]  # of the variants among which each effect chose
-
-    @property
-    def names(self) -> Names:
-        """Its effects on the mean, sorted."""
-        return tuple(sorted(self.found.model.names))
-
-    @property
-    def n_gaussians(self) -> int:
-        """Its SSF order."""
-        return self.found.model.sensor.n_gaussians
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """Everything weighed: refitted candidates by (order, names), and the screened rest."""
-
-    recording: Recording
-    effects: Mapping[str, NamedEffect[Any]]
-    noise_models: Mapping[Names, NoiseModel]
-    sensors: Mapping[int, SensorCoordinates]
-    candidates: Mapping[tuple[int, Names], Candidate]
-    screened: Mapping[tuple[Names, Names], float]  # (mean, noise) -> log Bayes factor against the null
-    unknown: Mapping[Names, float]  # noise -> log Bayes factor of `unknown` against the null
-    order: int  # at which the search was made
-    prior: PriorOdds
-    sd_floor: float
-    covariates: tuple[Covariate, ...]
-    unknown_bases: UnknownTemplates
-    unknown_shares: Mapping[str, float]
-    templates: TemplateMemory
-    probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)  # (mean, noise); ("unknown",)
-    order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
-
-    def best(self, names: Names, noise: Names = ()) -> Candidate | None:
-        """Return the refitted candidate of these effects with the most evidence over orders."""
-        options = [c for (_, key), c in self.candidates.items() if key == names]
-        return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
+_WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
+# An effect may look like another Gaussian, and be explained better by its name at fewer of them.
+_RIVAL_ORDER = 100.0  # nats behind the best: an SSF order so far back is not searched
+_WORTH_GROWING = 20.0  # nats behind the best of its size: no combination grows from there
+_WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
+_WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
+_PAIRED = 12  # effects that pairs are screened of, the best alone
 
 
 def search(
     recording: Recording,
     effects: Mapping[str, NamedEffect[Any]],
     *,
-    sensor: SensorCoordinates | None,
+    sensor: Null | None,
     sd_floor: float,
     prior: PriorOdds | None = None,
     max_order: int = 3,
@@ -130,7 +68,7 @@ def search(
     effects
         The vocabulary to search, by name.
     sensor
-        The prior of the sensor; None: calibrated from the recording alone.
+        What is believed of the sensor, or of any other model; None: calibrated from the recording alone.
     sd_floor
         Least believable noise sd.
     prior
@@ -149,7 +87,7 @@ class _Searcher:
 
     recording: Recording
     effects: Mapping[str, NamedEffect[Any]]
-    sensor: SensorCoordinates | None
+    sensor: Null | None
     sd_floor: float
     prior: PriorOdds
     max_order: int
@@ -162,93 +100,145 @@ class _Searcher:
         self.templates = TemplateMemory(self.usable)
         self.extent = Extent.of(self.recording)
         self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
-        on_noise = [n for n, e in self.effects.items() if e.stage is Stage.NOISE]
-        self.noise_models = {
-            names: NoiseModel.of([self.effects[n] for n in names], self.recording) for names in subsets(on_noise, 2)
-        }
+        self.noise_effects = {n: cast(NoiseEffect, e) for n, e in self.effects.items() if e.stage is Stage.NOISE}
+        self.certain = self._certain()
+        open_names = [n for n in self.noise_effects if n != Quantisation.name]
+        single = [self._with_certain(names) for names in subsets(open_names, 1)]
+        self.noise_models = {names: self._noise_model(names) for names in single}
         self.candidates: dict[tuple[int, Names], Candidate] = {}
-        self.sensors: dict[int, SensorCoordinates] = {}
+        self.sensors: dict[int, Null] = {}
+        self.about_null: dict[tuple[Names, Names], float] = {}  # (mean, noise) -> log evidence
+        self.about_parts: dict[tuple[Names, Names], float] = {}
+        self.unknown: dict[tuple[int, Names, Names], float] = {}
         self.unknown_shares: dict[str, float] = {}
         self.not_felt: set[Names] = set()
 
     def run(self) -> Search:
-        order = self._null_fits()
-        null = self.candidates[order, ()]
+        self._null_fits()
+        self._pair_noises()
+        null = max(self._nulls(), key=lambda c: c.log_z)
         level = null.found.predicted
         slope = slope_along_the_move(null.found.model, null.found.z)[self.usable]
-        covariates = tuple(covariates_of(self.recording.plan, self.usable, level, slope))
-        bases = unknown_templates(covariates, level - level.min(), self.n_points)
-        screened, unknown = self._screen(null, bases)
-        self._grow_beam(order, screened)
-        search = Search(
-            self.recording,
-            self.effects,
-            self.noise_models,
-            self.sensors,
-            self.candidates,
-            screened,
-            unknown,
-            order,
-            self.prior,
-            self.sd_floor,
-            covariates,
-            bases,
-            self.unknown_shares,
-            self.templates,
-        )
-        self._refit_what_matters(search, screened)
-        self._other_orders(search)
-        return weighed(search)
+        self.covariates = tuple(covariates_of(self.recording.plan, self.usable, level, slope))
+        starts = np.flatnonzero(steps_within_scans(self.recording) == 0)
+        self.bases = unknown_templates(self.covariates, level - level.min(), slope, starts)
+        if self.depth > 1:
+            self._screen_pairs(null)
+        self._grow_beam()
+        self._weigh_unknown(self._nulls())
+        self._refit_what_matters()
+        self._other_orders()
+        refitted = [c for c in self.candidates.values() if c.names]
+        self._weigh_unknown(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
+        return self._weighed_up()
 
-    def _fit(self, model: Model, starts: FloatArray, whitener: Whitener, max_steps: int = 30) -> Fit:
+    def _weighed_up(self) -> Search:
+        return weighed(
+            Search(
+                self.recording,
+                self.effects,
+                self.noise_models,
+                self.certain,
+                self.sensors,
+                self.candidates,
+                self._screened(),
+                self.unknown,
+                self.prior,
+                self.sd_floor,
+                self.covariates,
+                self.bases,
+                self.unknown_shares,
+                self.templates,
+            )
+        )
+
+    def _screened(self) -> dict[tuple[Names, Names], float]:
+        """Log evidence of what was not refitted, by screening.
+
+        About a fit that holds part of it a combination is judged better than about the null; there, what
+        refits have made of its parts since is put right.
+        """
+        refitted = {names for _, names in self.candidates}
+        out = {}
+        for (names, noise), value in self.about_null.items():
+            parts = [p for p in itertools.combinations(names, len(names) - 1) if p in refitted]
+            gains = [
+                max(c.evidence[noise].log_z for (_, key), c in self.candidates.items() if key == part)
+                - self.about_null.get((part, noise), np.inf)
+                for part in parts
+            ]
+            out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
+        out |= self.about_parts
+        return {key: value for key, value in out.items() if key[0] not in refitted}
+
+    def _certain(self) -> Names:
+        """Name what needs no weighing: that all readings are multiples of a coarse step is no chance."""
+        readings = self.recording.readings[self.usable]
+        coarse = lattice_step(readings) > Quantisation.seen_above * rough_sd(self.recording)
+        return (Quantisation.name,) if Quantisation.name in self.noise_effects and coarse else ()
+
+    def _with_certain(self, names: Names) -> Names:
+        return tuple(sorted({*names, *self.certain}))
+
+    def _noise_model(self, names: Names, likely: Mapping[str, tuple[FloatArray, float]] | None = None) -> NoiseModel:
+        return NoiseModel(tuple(self.noise_effects[n] for n in names), self.recording, likely or {})
+
+    def _log_noise(self, names: Names) -> float:
+        uncertain = tuple(n for n in names if n not in self.certain)
+        return self.prior.log_noise(uncertain, len(self.noise_effects))
+
+    def _nulls(self) -> list[Candidate]:
+        return [c for (_, names), c in self.candidates.items() if not names]
+
+    def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> Fit:
         """Go a few steps from each start, then all the way from the best."""
         if len(starts) > 1:
-            tried = [
-                fit(model, self.recording, start, whitener, sd_floor=self.sd_floor, max_steps=5) for start in starts
-            ]
+            tried = [fit(model, self.recording, start, law, sd_floor=self.sd_floor, max_steps=5) for start in starts]
             starts = min(tried, key=lambda f: f.objective).z[None, :]
-        return fit(model, self.recording, starts[0], whitener, sd_floor=self.sd_floor, max_steps=max_steps)
+        return require_finite(fit(model, self.recording, starts[0], law, sd_floor=self.sd_floor, max_steps=max_steps))
+
+    def _weigh_all(self, found: Fit, log_share: float) -> dict[Names, NoiseEvidence]:
+        plain = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
+        return {k: replace(evidence, log_z=evidence.log_z + log_share) for k, evidence in plain.items()}
 
     def _weighed(
         self,
         model: Model,
         starts: FloatArray,
+        law: NoiseLaw,
         *,
         log_share: float = 0.0,
         weights: Mapping[str, FloatArray] | None = None,
         max_steps: int = 30,
     ) -> Candidate:
-        """Fit with white noise, weigh under every noise model, refit where another one is more probable."""
-
-        def weighed_by_all(found: Fit) -> dict[Names, NoiseEvidence]:
-            plain = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
-            return {k: replace(evidence, log_z=evidence.log_z + log_share) for k, evidence in plain.items()}
-
-        found = self._fit(model, starts, white(self.n_points), max_steps)
-        evidence = weighed_by_all(found)
-        score = {k: e.log_z + self.prior.log_noise(k, len(self.noise_models)) for k, e in evidence.items()}
-        best = max(score, key=lambda k: score[k])
-        if best:
-            found = self._fit(model, found.z[None, :], evidence[best].whitener, max_steps)
-            evidence = weighed_by_all(found)
-        return Candidate(found, evidence, log_share, weights or {})
+        """Fit under a law of the noise, weigh under every noise model, refit where another one is more probable."""
+        found = self._fit(model, starts, law, max_steps)
+        for _ in range(2):
+            evidence = self._weigh_all(found, log_share)
+            best = max(evidence, key=lambda k: evidence[k].log_z + self._log_noise(k))
+            if evidence[best].law.alike(law):
+                break
+            law = evidence[best].law
+            found = self._fit(model, found.z[None, :], law, max_steps)
+        else:
+            evidence = self._weigh_all(found, log_share)
+        return Candidate(found, law, evidence, log_share, weights or {})
 
     def _keep(self, candidate: Candidate) -> Candidate:
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
-    def _null_fits(self) -> int:
-        """Fit the null at each SSF order; one more is always a rival. Return the order of most evidence."""
-        plan = self.recording.plan
+    def _null_fits(self) -> None:
+        """Fit the null at each SSF order; one more is always a rival."""
+        plan, law = self.recording.plan, white(self.n_points)
         if self.sensor is not None:
-            n = self.sensor.n_gaussians
-            self.sensors[n] = self.sensor
-            self._keep(self._weighed(Model(self.sensor, (), plan), np.zeros((1, self.sensor.n_params))))
-            return n
+            self.sensors[self.sensor.n_gaussians] = self.sensor
+            self._keep(self._weighed(Model(self.sensor, (), plan), self.sensor.starts, law))
+            return
         first = default_sensor(self.extent, 1)
         self.sensors[1] = first
-        last = self._keep(self._weighed(Model(first, (), plan), starts_of_one_gaussian(first)))
-        log_z = {1: _best_log_z(last)}
+        last = self._keep(self._weighed(Model(first, (), plan), starts_of_one_gaussian(first), law))
+        log_z = {1: last.log_z}
         for n in range(2, self.max_order + 2 if self.max_order > 1 else 2):
             # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
             if log_z[n - 1] < max(log_z.values()) - 3:
@@ -256,141 +246,170 @@ class _Searcher:
             wanted = default_sensor(self.extent, n)
             self.sensors[n] = wanted
             starts = start_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
-            last = self._keep(self._weighed(Model(wanted, (), plan), starts))
-            log_z[n] = _best_log_z(last)
-        return max(log_z, key=lambda k: log_z[k])
+            last = self._keep(self._weighed(Model(wanted, (), plan), starts, self._law_of(last)))
+            log_z[n] = last.log_z
+
+    def _law_of(self, candidate: Candidate) -> NoiseLaw:
+        """Give the most probable law of the noise about a fit."""
+        evidence = candidate.evidence
+        return evidence[max(evidence, key=lambda k: evidence[k].log_z + self._log_noise(k))].law
+
+    def _pair_noises(self) -> None:
+        """Where one fault of the noise stands out, look for a second one beside it."""
+        null = max(self._nulls(), key=lambda c: c.log_z)
+        plain = self._with_certain(())
+        single = {k: e for k, e in null.evidence.items() if k != plain}
+        first = max(single, key=lambda k: single[k].log_z, default=plain)
+        if first == plain or single[first].log_z < null.evidence[plain].log_z + _WORTH_A_PAIR:
+            return
+        (name,) = (n for n in first if n not in self.certain)
+        likely = {name: single[first].likely_nodes(name)}
+        best = max(e.log_z + self._log_noise(k) for k, e in null.evidence.items())
+        for other in single:
+            both = tuple(sorted({*first, *other}))
+            if other == first:
+                continue
+            model = self._noise_model(both, likely | self.noise_models[other].every_third())
+            value = weigh(null.found, model, sd_floor=self.sd_floor).log_z
+            if value + self._log_noise(both) > best - _WORTH_A_PAIR:
+                self.noise_models[both] = model
+        for candidate in self._nulls():
+            self._keep(replace(candidate, evidence=self._weigh_all(candidate.found, candidate.log_share)))
+
+    def _log_prior(self, names: Names) -> float:
+        return self.prior.log_mean(names, len(self.mean_effects))
+
+    def _coincidence(self, n_gaussians: int) -> float:
+        """Give the nats against effects beside so few Gaussians, where the null alone has more."""
+        best = max(self._nulls(), key=lambda c: c.log_z).n_gaussians
+        return self.prior.coincidence * max(best - n_gaussians, 0)
 
     def _templates(self, found: Fit, names: Sequence[str]) -> dict[str, EffectTemplates]:
         return {n: self.templates.of(found, self.mean_effects[n]) for n in names}
 
-    def _screen(
-        self, null: Candidate, bases: UnknownTemplates
-    ) -> tuple[dict[tuple[Names, Names], float], dict[Names, float]]:
-        """Weigh all combinations about the null by templates, under every noise model's best node."""
+    def _screen_pairs(self, null: Candidate) -> None:
+        """Weigh all pairs about the null by templates, under the noise models that steer."""
         templates = self._templates(null.found, list(self.mean_effects))
-        screened: dict[tuple[Names, Names], float] = {}
-        unknown: dict[Names, float] = {}
-        for noise, evidence in null.evidence.items():
-            problem = Linearised.of(null.found, evidence.whitener)
-            singles = {n: _log_bayes_factors(problem, t.columns) for n, t in templates.items()}
-            for name, scores in singles.items():
-                screened[(name,), noise] = _log_mean(scores)
-            if self.depth > 1:
-                for pair, value in _screened_pairs(problem, templates, singles).items():
-                    screened[pair, noise] = value
-            if not bases.columns:
-                unknown[noise] = 0.0
+        for noise, evidence in null.steering():
+            problem = Linearised.of(null.found, evidence.law)
+            singles = score_effects(problem, self.templates.bank(null.found, list(self.mean_effects.values())))
+            ranked = sorted(singles, key=lambda name: -float(singles[name].max()))[:_PAIRED]
+            if not ranked or log_mean(singles[ranked[0]]) < _WORTH_PAIRING:
                 continue
-            by_family = _by_family(_log_bayes_factors(problem, bases.columns), bases.families)
-            unknown[noise] = float(logsumexp(list(by_family.values()))) - math.log(len(by_family))
-            if evidence is max(null.evidence.values(), key=lambda e: e.log_z):
-                self.unknown_shares = {
-                    k: math.exp(v - logsumexp(list(by_family.values()))) for k, v in by_family.items()
-                }
-        return screened, unknown
+            singles = {name: singles[name] for name in ranked}
+            for pair, value in score_pairs(problem, {n: templates[n] for n in ranked}, singles).items():
+                self.about_null[pair, noise] = evidence.log_z + value
 
-    def _grow_beam(self, order: int, screened: dict[tuple[Names, Names], float]) -> None:
+    def _grow_beam(self) -> None:
         """Refit the best combinations of each size, each grown from the best of the size before."""
-        null = self.candidates[order, ()]
-        reference = {k: e.log_z for k, e in null.evidence.items()}
-        grown: dict[Names, tuple[float, Candidate]] = {(): (0.0, null)}
+        best = max(self._nulls(), key=lambda c: c.log_z)
+        grown = [c for c in self._nulls() if c.n_gaussians <= best.n_gaussians and c.log_z > best.log_z - _RIVAL_ORDER]
         for size in range(1, min(self.depth, len(self.mean_effects)) + 1):
             wishes: dict[Names, tuple[float, Candidate, str]] = {}
-            for parent in grown.values():
-                self._wish(parent[1], reference, wishes)
+            for parent in grown:
+                self._wish(parent, wishes)
             if size == 2:
-                for (names, noise), value in screened.items():
-                    if len(names) == 2 and value > wishes.get(names, (-np.inf,))[0]:
-                        held = grown.get(names[:1]) or grown.get(names[1:])
-                        if held is not None:
-                            added = names[1] if held[1].names == names[:1] else names[0]
-                            wishes[names] = (value + reference[noise] - max(reference.values()), held[1], added)
-            ranked = sorted(wishes, key=lambda names: -wishes[names][0])
-            best_so_far = max(score for score, _ in grown.values())
-            grown = {}
-            for rank, names in enumerate(ranked[: self.beam]):
-                score, parent_candidate, added = wishes[names]
+                self._wish_for_pairs(grown, wishes)
+            odds = {names: score + self._log_prior(names) for names, (score, _, _) in wishes.items()}
+            ranked = sorted(odds, key=lambda names: -odds[names])
+            best_so_far = max(c.log_z + self._log_prior(c.names) for c in grown)
+            grown = []
+            # A user's own effect was named to be tried, however far it leads from where screening is linear.
+            own = [names for names in ranked if size == 1 and names[0] not in VOCABULARY]
+            for rank, names in enumerate(dict.fromkeys([*ranked[: self.beam], *own])):
                 # A combination that screening puts this far behind cannot come to matter.
-                if score < best_so_far - 3 and (size > 1 or rank > 0):
+                if odds[names] < best_so_far - STEERING and (size > 1 or rank > 0) and names not in own:
                     continue
-                candidate = self._refit(parent_candidate, added, screened)
-                if candidate is None:
-                    continue
-                gain = max(e.log_z - max(reference.values()) for e in candidate.evidence.values())
-                grown[names] = (gain, candidate)
+                _, parent, added = wishes[names]
+                candidate = self._refit(parent, added)
+                if candidate is not None:
+                    grown.append(candidate)
             if not grown:
                 break
+            best_grown = max(c.log_z for c in grown)
+            grown = [c for c in grown if c.log_z > best_grown - _WORTH_GROWING]
 
-    def _refit(self, parent: Candidate, added: str, screened: dict[tuple[Names, Names], float]) -> Candidate | None:
+    def _wish(self, parent: Candidate, wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
+        """Screen every effect that a fit does not hold yet, by its templates about the null."""
+        null = self.candidates[parent.n_gaussians, ()]
+        bank = self.templates.bank(null.found, list(self.mean_effects.values()))
+        against = 0.0 if parent.names else self._coincidence(parent.n_gaussians)
+        for noise, evidence in parent.steering():
+            scores = score_effects(Linearised.of(parent.found, evidence.law), bank)
+            for name, own in scores.items():
+                if name in parent.names:
+                    continue
+                names = tuple(sorted((*parent.names, name)))
+                score = evidence.log_z + log_mean(own) - against
+                known = self.about_parts if parent.names else self.about_null
+                known[names, noise] = max(score, known.get((names, noise), -np.inf))
+                if score > wishes.get(names, (-np.inf,))[0]:
+                    wishes[names] = (score, parent, name)
+
+    def _wish_for_pairs(self, grown: list[Candidate], wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
+        """Add pairs of which neither effect leads alone."""
+        held = {c.names: c for c in grown}
+        for (names, _), value in self.about_null.items():
+            if len(names) == 2 and value > wishes.get(names, (-np.inf,))[0]:
+                for part, added in ((names[:1], names[1]), (names[1:], names[0])):
+                    if part in held:
+                        wishes[names] = (value, held[part], added)
+                        break
+
+    def _refit(self, parent: Candidate, added: str) -> Candidate | None:
         """Refit a candidate with one more effect and keep it, or note that the effect is not felt."""
         candidate, scores = self._extend(parent, added)
-        if _acts(candidate, parent):
+        if _acts(candidate, parent, self.sd_floor):
             return self._keep(candidate)
         # Laplace fails where an effect is too small to be felt and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
         names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():
-            screened[names, noise] = min(value, 0.0) + screened.get((parent.names, noise), 0.0)
+            against = 0.0 if parent.names else self._coincidence(parent.n_gaussians)
+            self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
         self.not_felt.add(names)
         return None
 
-    def _refit_what_matters(self, search: Search, screened: dict[tuple[Names, Names], float]) -> None:
+    def _refit_what_matters(self) -> None:
         """Refit whatever the screening alone would give some probability, the most probable first."""
         for _ in range(6):
             merged: dict[Names, float] = {}
-            for (names, _noise), p in weighed(search).probabilities.items():
-                if names not in ((), ("unknown",)) and names not in self.not_felt:
+            refitted = {names for _, names in self.candidates}
+            for (names, _noise), p in self._weighed_up().probabilities.items():
+                if names not in ((), ("unknown",)) and names not in self.not_felt and names not in refitted:
                     merged[names] = merged.get(names, 0.0) + p
-            still_open = [n for n, p in merged.items() if p > 0.02 and (search.order, n) not in self.candidates]
+            still_open = [n for n, p in merged.items() if p > 0.02]
             if not still_open:
                 return
             names = max(still_open, key=lambda n: merged[n])
-            parts = [part for part in subsets(names, len(names) - 1) if (search.order, part) in self.candidates]
-            held = self.candidates[search.order, parts[-1]]
+            parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
+            held = max(parts, key=lambda c: (len(c.names), c.log_z))
             for added in [n for n in names if n not in held.names]:
-                grown = self._refit(held, added, screened)
+                grown = self._refit(held, added)
                 if grown is None:
                     self.not_felt.add(names)
-                    for noise in held.evidence:
-                        without = screened.get((held.names, noise), 0.0)
-                        screened[names, noise] = min(screened.get((names, noise), np.inf), without)
+                    for noise, evidence in held.evidence.items():
+                        known = self.about_parts.get((names, noise), np.inf)
+                        self.about_parts[names, noise] = min(known, evidence.log_z)
                     break
                 held = grown
-
-    def _wish(
-        self,
-        parent: Candidate,
-        reference: Mapping[Names, float],
-        wishes: dict[Names, tuple[float, Candidate, str]],
-    ) -> None:
-        """Screen every effect that a fit does not hold yet."""
-        missing = [n for n in self.mean_effects if n not in parent.names]
-        templates = self._templates(parent.found, missing)
-        best = max(e.log_z for e in parent.evidence.values())
-        for evidence in parent.evidence.values():
-            if evidence.log_z < best - _STEERING:
-                continue
-            problem = Linearised.of(parent.found, evidence.whitener)
-            for name in missing:
-                scores = _log_bayes_factors(problem, templates[name].columns)
-                score = _log_mean(scores) + evidence.log_z - max(reference.values())
-                names = tuple(sorted((*parent.names, name)))
-                if score > wishes.get(names, (-np.inf,))[0]:
-                    wishes[names] = (score, parent, name)
 
     def _extend(self, parent: Candidate, name: str) -> tuple[Candidate, dict[Names, float]]:
         """Refit with one more effect, from the best entries of its bank; give the closed-form scores too."""
         effect = self.mean_effects[name]
         templates = self.templates.of(parent.found, effect)
-        by_noise: dict[Names, float] = {}
-        for noise, evidence in parent.evidence.items():
-            scores = _log_bayes_factors(Linearised.of(parent.found, evidence.whitener), templates.columns)
-            by_noise[noise] = _log_mean(scores)
-        best = max(parent.evidence.values(), key=lambda e: e.log_z)
-        problem = Linearised.of(parent.found, best.whitener)
-        scores = _log_bayes_factors(problem, templates.columns)
+        own = Bank.of(templates.columns, [name] * len(templates.columns), self.n_points)
+        by_noise = {
+            noise: log_mean(score_effects(Linearised.of(parent.found, evidence.law), own)[name])
+            for noise, evidence in parent.steering()
+        }
+        law = self._law_of(parent)
+        problem = Linearised.of(parent.found, law)
+        scores = score_effects(problem, own)[name]
         leader = int(np.argmax(scores))
         log_share = parent.log_share + templates.log_share(leader, scores)
+        if not parent.names:
+            log_share -= self._coincidence(parent.n_gaussians)
         model = parent.found.model.with_effect(templates.variant(leader))
         starts = []
         rivals = np.flatnonzero(templates.choice == templates.choice[leader])
@@ -401,118 +420,67 @@ class _Searcher:
             setting = effect.start(templates.settings[at], amount)
             z = parent.found.z + problem.absorbed(parent.found, columns @ amount)
             starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
+        if self.sensor is not None and len(self.sensor.starts) > 1:
+            # A null with several basins: with the effect the best may be another one than without.
+            starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
         weights = {**parent.weights, name: templates.weights(scores)}
-        return self._weighed(model, np.stack(starts), log_share=log_share, weights=weights), by_noise
+        return self._weighed(model, np.stack(starts), law, log_share=log_share, weights=weights), by_noise
 
-    def _other_orders(self, search: Search) -> None:
+    def _other_orders(self) -> None:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
         if self.sensor is not None:
             return
-        first = weighed(search)
+        first = self._weighed_up()
         ranked = sorted(first.probabilities, key=lambda key: -first.probabilities[key])
         leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:2]
         for names in leaders:
-            if sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-3:
-                continue
-            source = self.candidates.get((search.order, names))
-            if source is None:
+            source = max(
+                (c for (_, key), c in self.candidates.items() if key == names), key=lambda c: c.log_z, default=None
+            )
+            if source is None or sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-3:
                 continue
             for n, sensor in self.sensors.items():
-                if n == search.order or n > search.order + 1:
+                if (n, names) in self.candidates or n > source.n_gaussians + 1:
                     continue
                 null = self.candidates[n, ()]
-                effects = source.found.model.effects
-                model = Model(sensor, effects, self.recording.plan)
+                model = Model(sensor, source.found.model.effects, self.recording.plan)
                 own = source.found.z[source.found.model.sensor.n_params :]
                 start = np.concatenate([null.found.z, own])[None, :]
                 candidate = self._weighed(
-                    model, start, log_share=source.log_share, weights=source.weights, max_steps=15
+                    model,
+                    start,
+                    self._law_of(source),
+                    log_share=source.log_share + self._coincidence(source.n_gaussians) - self._coincidence(n),
+                    weights=source.weights,
+                    max_steps=15,
                 )
-                if _acts(candidate, null):
+                if _acts(candidate, null, self.sd_floor):
                     self._keep(candidate)
 
-
-def weighed(search: Search) -> Search:
-    """Turn evidences into probabilities of (mean, noise) hypotheses, summed over SSF orders."""
-    prior, n_effects = search.prior, sum(e.stage is not Stage.NOISE for e in search.effects.values())
-    orders = sorted(search.sensors)
-    log_order = -math.log(len(orders))
-    log_p: dict[tuple[Names, Names], float] = {}
-    null_at = search.candidates[search.order, ()]
-    for noise in search.noise_models:
-        log_noise = prior.log_noise(noise, len(search.noise_models))
-        clean = [search.candidates[n, ()].evidence[noise].log_z for n in orders if (n, ()) in search.candidates]
-        log_clean = float(logsumexp(clean)) + log_order
-        log_p[(), noise] = log_clean + prior.log_mean((), n_effects) + log_noise
-        log_p[("unknown",), noise] = (
-            null_at.evidence[noise].log_z + log_order + search.unknown[noise] + math.log(prior.unknown) + log_noise
-        )
-        refitted = {names for _, names in search.candidates if names}
-        log_z: dict[Names, float] = {(): null_at.evidence[noise].log_z}
-        for names in refitted:
-            values = [c.evidence[noise].log_z for (_, key), c in search.candidates.items() if key == names]
-            log_z[names] = float(logsumexp(values))
-            log_p[names, noise] = log_z[names] + log_order + prior.log_mean(names, n_effects) + log_noise
-        for (names, model), value in search.screened.items():
-            if model == noise and names not in refitted:
-                # Screening says what is gained over the best part that was refitted.
-                part = max((part for part in subsets(names, len(names) - 1) if part in log_z), key=log_z.__getitem__)
-                gained = value - search.screened.get((part, noise), 0.0)
-                log_p[names, noise] = log_z[part] + gained + log_order + prior.log_mean(names, n_effects) + log_noise
-    total = float(logsumexp(list(log_p.values())))
-    clean_by_order = {
-        n: float(logsumexp([search.candidates[n, ()].evidence[k].log_z for k in search.noise_models])) for n in orders
-    }
-    norm = float(logsumexp(list(clean_by_order.values())))
-    return replace(
-        search,
-        probabilities={key: math.exp(value - total) for key, value in log_p.items()},
-        order_probabilities={n: math.exp(v - norm) for n, v in clean_by_order.items()},
-    )
+    def _weigh_unknown(self, candidates: Sequence[Candidate]) -> None:
+        """Weigh something unknown beside each candidate."""
+        best = -np.inf
+        for candidate in candidates:
+            for noise, evidence in candidate.steering():
+                by_family = score_unknown(Linearised.of(candidate.found, evidence.law), self.bases)
+                if not by_family:
+                    continue
+                value = evidence.log_z + log_mean(np.array(list(by_family.values())))
+                if not candidate.names:
+                    value -= self._coincidence(candidate.n_gaussians)
+                self.unknown[candidate.n_gaussians, candidate.names, noise] = value
+                if value > best and not candidate.names:
+                    best = value
+                    total = logsumexp(list(by_family.values()))
+                    self.unknown_shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
 
-def _acts(candidate: Candidate, parent: Candidate) -> bool:
+def _acts(candidate: Candidate, parent: Candidate, sd_floor: float) -> bool:
     """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
-    n_points = len(candidate.found.residuals)
-    return 2 * n_points * math.log(parent.found.sd / candidate.found.sd) > 3.0
+    law = candidate.law
 
+    def misfit(found: Fit) -> float:
+        whitened = law(found.residuals)[:, None]
+        return float(law.misfit(whitened, law.scale(whitened, floor=sd_floor), floor=sd_floor)[0])
 
-def _best_log_z(candidate: Candidate) -> float:
-    return max(e.log_z for e in candidate.evidence.values())
-
-
-def _log_bayes_factors(problem: Linearised, columns: Sequence[FloatArray]) -> FloatArray:
-    blocks = Blocks.of(problem, columns, [""] * len(columns))
-    return block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_points)[:, 0]
-
-
-def _by_family(values: FloatArray, families: Sequence[str]) -> dict[str, float]:
-    """Average Bayes factors within each covariate."""
-    names = np.array(families)
-    return {
-        f: float(logsumexp(values[names == f])) - math.log(int(np.sum(names == f))) for f in dict.fromkeys(families)
-    }
-
-
-def _log_mean(scores: FloatArray) -> float:
-    return float(logsumexp(scores)) - math.log(len(scores))
-
-
-def _screened_pairs(
-    problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
-) -> dict[Names, float]:
-    """Weigh pairs: as if each effect stood alone, and what their best entries gain or lose together."""
-    best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
-    pairs = [pair for pair in subsets(list(templates), 2) if len(pair) == 2]
-    entries = [(a, b, i, j) for a, b in pairs for i in best[a] for j in best[b]]
-    columns = [np.concatenate([templates[a].columns[i], templates[b].columns[j]], axis=1) for a, b, i, j in entries]
-    together = _log_bayes_factors(problem, columns)
-    apart = np.array([singles[a][i] + singles[b][j] for a, b, i, j in entries])
-    out: dict[Names, float] = {}
-    at = 0
-    for a, b in pairs:
-        block = slice(at, at + len(best[a]) * len(best[b]))
-        at = block.stop
-        gained = float(logsumexp(together[block]) - logsumexp(apart[block]))
-        out[a, b] = _log_mean(singles[a]) + _log_mean(singles[b]) + gained
-    return out
+    return 2 * (misfit(parent.found) - misfit(candidate.found)) > 3.0

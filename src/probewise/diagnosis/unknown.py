@@ -8,13 +8,13 @@ and covariates; it names no physics, so the sensor written to sensor.json does n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.evidence import SCALES, Blocks, Linearised, block_log_bayes_factors
+from probewise.diagnosis.bank import Bank
+from probewise.diagnosis.evidence import SCALES, Linearised
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.gain import HeldOut, compare_scans
 
@@ -32,7 +32,7 @@ class Correction:
     held_out: HeldOut
 
 
-def correct(found: Fit, problem: Linearised, bases: Sequence[FloatArray], scan: IntArray) -> Correction:
+def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Correction:
     """Correct a fit by the most telling basis.
 
     Parameters
@@ -40,16 +40,15 @@ def correct(found: Fit, problem: Linearised, bases: Sequence[FloatArray], scan: 
     found, problem
         The null, and its linearisation under the noise model found.
     bases
-        Templates, each (n_points, k).
+        What may be missing.
     scan
         Scan of each usable row, for keeping scans back, shape (n_points,).
     """
-    blocks = Blocks.of(problem, bases, [""] * len(bases))
-    scores = block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_points)[:, 0]
+    scores = bases.log_bayes_factors(problem)[:, 0]
     # Among bases of about equal evidence the one of fewest columns: what needs an amplitude for each scan
     # says nothing of the next scan.
     rivals = np.flatnonzero(scores > scores.max() - _ABOUT_EQUAL)
-    columns = bases[min(map(int, rivals), key=lambda i: (bases[i].shape[1], -float(scores[i])))]
+    columns = bases[min(map(int, rivals), key=lambda i: (int(bases.widths[i]), -float(scores[i])))]
     norms = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns[:, norms > 0] / norms[norms > 0]
     everything = np.ones(len(found.residuals), dtype=np.bool_)

@@ -22,7 +22,7 @@ from probewise.effects.known import Known
 from probewise.effects.lattice import Quantisation, lattice_step
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.moves import in_scans
-from probewise.effects.noise import CorrelatedNoise, SignalDependentNoise
+from probewise.effects.noise import CorrelatedNoise, DriftingNoise, SignalDependentNoise
 from probewise.effects.noise_law import NoiseRows, draw_readings, log_density
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
@@ -30,7 +30,7 @@ from probewise.effects.readings import Hysteresis, Lag
 from probewise.effects.response import Nonlinearity
 from probewise.effects.saturation import Saturation
 from probewise.effects.tilt import SensorTilt
-from probewise.effects.vocabulary import NamedEffect
+from probewise.effects.vocabulary import NamedEffect, NoiseEffect
 from probewise.effects.waves import Flicker, PeriodicPositionError
 
 VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
@@ -63,13 +63,21 @@ VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
             EdgeShadow,
             Halo,
             Glint,
+            Quantisation,
+            SignalDependentNoise,
             CorrelatedNoise,
+            Outliers,
+            Dropouts,
         )
     }
 )
 """Every effect that the diagnosis weighs, by name."""
 
+NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
+"""What may be wrong with the noise and has no name in the vocabulary, by a name of our own."""
+
 __all__ = [
+    "NUISANCES",
     "VOCABULARY",
     "AlbedoGradient",
     "AlbedoPatch",
@@ -78,6 +86,7 @@ __all__ = [
     "Backlash",
     "BatterySag",
     "CorrelatedNoise",
+    "DriftingNoise",
     "Dropouts",
     "EdgeBlur",
     "EdgeMisplacement",
@@ -95,6 +104,7 @@ __all__ = [
     "Lag",
     "LogHeavyTailed",
     "NamedEffect",
+    "NoiseEffect",
     "NoiseRows",
     "Nonlinearity",
     "OffsetDrift",

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_law import NoiseRows
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
@@ -23,7 +23,7 @@ _RIVAL = (0.02, 6.0)  # share and size of the heavy tail that the test of it is 
 
 
 @dataclass(frozen=True)
-class Outliers(NamedEffect[NoiseLevel]):
+class Outliers(NoiseEffect):
     """A heavy tail: with probability `share` a reading's noise is `size` times as wide."""
 
     name: ClassVar[str] = "outliers"
@@ -64,13 +64,13 @@ class Outliers(NamedEffect[NoiseLevel]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how many readings are far off, and how far."""
         return (
-            f"{give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
-            f"{give_or_take(mean[1], sd[1])} times as wide as the others: outliers"
+            f"outliers: {give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
+            f"{give_or_take(mean[1], sd[1])} times as wide as the others"
         )
 
 
 @dataclass(frozen=True)
-class Dropouts(NamedEffect[NoiseLevel]):
+class Dropouts(NoiseEffect):
     """Readings lost: with probability `share` a reading is `value`, whatever lies under the sensor."""
 
     lowest: float = -50.0
@@ -101,6 +101,17 @@ class Dropouts(NamedEffect[NoiseLevel]):
         ends = (self.lowest + 0.01, self.highest - 0.01)
         return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
 
+    def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Take the value that most readings far off share, two at least, at twelve shares; none without one."""
+        far = (rows.predicted + rows.sd * residuals)[np.abs(residuals) > _FAR]
+        # As floats differ in their last digits, the value is one of the readings, not their mean.
+        same = np.abs(far[:, None] - far) <= 1e-6 * rows.sd
+        if not far.size or same.sum(axis=0).max() < 2:
+            return np.zeros((0, 2))
+        value = far[int(np.argmax(same.sum(axis=0)))]
+        shares = LogUniform(2e-3, 0.2).from_unit((np.arange(12) + 0.5) / 12)
+        return np.stack([shares, np.full(12, value)], axis=1)
+
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Count the readings far from their prediction that are all equal: (n_points, n_draws) -> (n_draws,)."""
         readings = rows.predicted[:, None] + rows.sd * residuals
@@ -113,6 +124,6 @@ class Dropouts(NamedEffect[NoiseLevel]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how many readings are lost, and to which value."""
         return (
-            f"{give_or_take(mean[0], sd[0], factor=100)} % of the readings are lost: they read "
+            f"readings are lost: {give_or_take(mean[0], sd[0], factor=100)} % of them read "
             f"{give_or_take(mean[1], sd[1])} whatever lies under the sensor"
         )

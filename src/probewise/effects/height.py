@@ -15,6 +15,7 @@ from probewise.effects.moves import in_scans, mountings
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
+from probewise.sensor.commanded import raised
 from probewise.sensor.stages import Footprint, Stage
 
 __all__ = ["HeightGradient", "HeightOffset"]
@@ -49,7 +50,7 @@ class HeightGradient(NamedEffect[Footprint]):
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         """Widen and dim the footprint along X."""
-        return _raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
+        return raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
 
     def bank(self) -> FloatArray:
         """One setting: linear in the slope."""
@@ -94,7 +95,7 @@ class HeightOffset(NamedEffect[Footprint]):
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         """Widen and dim the footprint in those scans."""
-        return _raised(value, 1 + theta * in_scans(plan, self.scans) / _height_mm(plan))
+        return raised(value, 1 + theta * in_scans(plan, self.scans) / _height_mm(plan))
 
     def variants(self) -> tuple[Self, ...]:
         """Choose the mounting or the scan."""
@@ -113,19 +114,3 @@ class HeightOffset(NamedEffect[Footprint]):
 
 def _height_mm(plan: Plan) -> float:
     return plan.instrumentation.height_mm or _USUAL_MM
-
-
-def _raised(footprint: Footprint, ratio: FloatArray) -> Footprint:
-    """Scale the footprint by h/h0, (n_samples, n_points), and dim it by its square."""
-    # No arm drives its sensor into the table: what a fit tries there must only be finite.
-    ratio = np.clip(ratio, 0.1, 10.0)
-    k = ratio[:, :, None]
-    return replace(
-        footprint,
-        u_mm=footprint.u_mm * k,
-        v_mm=footprint.v_mm * k,
-        var_u=footprint.var_u * k**2,
-        var_v=footprint.var_v * k**2,
-        cov_uv=footprint.cov_uv * k**2,
-        brightness=footprint.brightness / ratio**2,
-    )

@@ -11,18 +11,16 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_law import NoiseRows
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
 __all__ = ["Quantisation", "lattice_step"]
 
-_SEEN_ABOVE = 0.3  # noise sd: a finer lattice, as of printing, is no effect
-
 
 @dataclass(frozen=True)
-class Quantisation(NamedEffect[NoiseLevel]):
+class Quantisation(NoiseEffect):
     """Rounded readings: step round(reading / step), after the noise."""
 
     smallest: float = 0.05
@@ -33,6 +31,8 @@ class Quantisation(NamedEffect[NoiseLevel]):
     units: ClassVar[tuple[str, ...]] = ("reading",)
     covariates: ClassVar[tuple[str, ...]] = ("lattice",)
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    seen_above: ClassVar[float] = 0.3
+    """Noise sd: a finer lattice, as of printing, is no effect."""
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -55,11 +55,16 @@ class Quantisation(NamedEffect[NoiseLevel]):
         n_nodes = 16
         return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
+    def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Take the step of the lattice that the readings are on; none where it is too fine to matter."""
+        step = lattice_step(rows.predicted + rows.sd * residuals)
+        return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
+
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Step of the readings' lattice in noise sd, 0 where it is too fine to matter: -> (n_draws,)."""
         readings = rows.predicted[:, None] + rows.sd * residuals
         steps = np.array([lattice_step(column) for column in readings.T]) / rows.sd
-        return np.where(steps > _SEEN_ABOVE, steps, 0.0)
+        return np.where(steps > self.seen_above, steps, 0.0)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how coarse the readings are."""

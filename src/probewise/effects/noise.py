@@ -11,16 +11,16 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_law import NoiseRows
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["CorrelatedNoise", "SignalDependentNoise"]
+__all__ = ["CorrelatedNoise", "DriftingNoise", "SignalDependentNoise"]
 
 
 @dataclass(frozen=True)
-class CorrelatedNoise(NamedEffect[NoiseLevel]):
+class CorrelatedNoise(NoiseEffect):
     """Noise with a memory, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
 
     lowest: float = -0.5
@@ -48,7 +48,7 @@ class CorrelatedNoise(NamedEffect[NoiseLevel]):
 
     def bank(self) -> FloatArray:
         """Equally weighted nodes of the prior, close enough to integrate over a posterior of a thousand readings."""
-        n_nodes = 36
+        n_nodes = 28
         return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
@@ -69,7 +69,7 @@ class CorrelatedNoise(NamedEffect[NoiseLevel]):
 
 
 @dataclass(frozen=True)
-class SignalDependentNoise(NamedEffect[NoiseLevel]):
+class SignalDependentNoise(NoiseEffect):
     """Noise that grows with the light: variance x (1 + ratio u), u the seen white fraction."""
 
     least: float = 0.05
@@ -97,7 +97,7 @@ class SignalDependentNoise(NamedEffect[NoiseLevel]):
 
     def bank(self) -> FloatArray:
         """Equally weighted nodes of the prior."""
-        n_nodes = 16
+        n_nodes = 10
         return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
@@ -111,3 +111,49 @@ class SignalDependentNoise(NamedEffect[NoiseLevel]):
             f"the variance of the noise on white is {give_or_take(1 + mean[0], sd[0])} times that on black: "
             "the noise grows with the light"
         )
+
+
+@dataclass(frozen=True)
+class DriftingNoise(NoiseEffect):
+    """Noise that grows or calms down in time: sd x growth^(time / duration), evenly on a logarithmic scale.
+
+    No physics of the sensor, and no name of the vocabulary's: it keeps tests of the mean honest.
+    """
+
+    least: float = 0.2
+    most: float = 5.0
+
+    name: ClassVar[str] = "drifting_noise"
+    stage: ClassVar[Stage] = Stage.NOISE
+    units: ClassVar[tuple[str, ...]] = ("1",)
+    covariates: ClassVar[tuple[str, ...]] = ("time",)
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Need no scale: a growth is a pure number."""
+        return cls()
+
+    @cached_property
+    def prior(self) -> Product:
+        """The sd at the end over that at the start, over its orders of magnitude."""
+        return Product({"growth": LogUniform(self.least, self.most)})
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Scale the noise of each reading by its time."""
+        elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
+        return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
+
+    def bank(self) -> FloatArray:
+        """Equally weighted nodes of the prior."""
+        n_nodes = 10
+        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
+
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Correlation of the squares with the order of taking: residuals (n_points, n_draws) -> (n_draws,)."""
+        tilt = np.arange(len(residuals)) - 0.5 * (len(residuals) - 1)
+        return np.asarray(np.abs(tilt @ residuals**2) / np.mean(residuals**2, axis=0) / np.linalg.norm(tilt))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how the noise has changed."""
+        return f"the noise is {give_or_take(mean[0], sd[0])} times as loud at the end as at the start"

@@ -36,7 +36,9 @@ class AmbientGradient(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the readings' range over the longest scan as typical."""
+        """Take a hundredth of the readings' range over the longest scan as typical, where the place changes at all."""
+        if np.ptp(extent.plan.x_mm) == np.ptp(extent.plan.y_mm) == 0:
+            return None
         return cls(typical_per_mm=0.01 * extent.span / extent.length_mm)
 
     @cached_property

@@ -8,9 +8,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.sensor.stages import Effect
+from probewise.effects.noise_law import NoiseRows
+from probewise.sensor.stages import Effect, NoiseLevel
 
-__all__ = ["NamedEffect", "give_or_take"]
+__all__ = ["NamedEffect", "NoiseEffect", "give_or_take"]
 
 V = TypeVar("V")
 
@@ -85,6 +86,21 @@ class NamedEffect(Effect[V], Protocol[V]):
         for k in self.amplitudes:
             setting[k] = amounts @ entry[:, k]
         return np.asarray(setting)
+
+
+class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
+    """An effect on the noise: nothing of it is seen in the mean of the readings."""
+
+    def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Lay out equally weighted nodes of the prior about a fit, (n_nodes, n_params); none where it cannot be.
+
+        `residuals` (n_points,) are in units of the noise sd.
+        """
+        return self.bank()[:, 0, :]
+
+    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+        """Measure it: residuals (n_points, n_draws) in units of the noise sd -> (n_draws,), large where it shows."""
+        ...
 
 
 def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:

@@ -5,6 +5,7 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 """
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
+from probewise.sensor.commanded import COMMANDED, raised
 from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, seen
 from probewise.sensor.naive import NaiveSensor
@@ -35,6 +36,7 @@ from probewise.sensor.stages import (
 
 __all__ = [
     "ACCURATE_NODES",
+    "COMMANDED",
     "FAST_NODES",
     "AnyEffect",
     "Chain",
@@ -60,6 +62,7 @@ __all__ = [
     "mean_mixture",
     "mixture_names",
     "mixture_of_field",
+    "raised",
     "response",
     "seen",
     "seen_discrete",

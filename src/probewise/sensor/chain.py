@@ -14,6 +14,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
+from probewise.sensor.commanded import height_ratio, is_commanded, light_of, raised_as_commanded
 from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, Spot, seen_by_one, turned
 from probewise.sensor.ssf import FieldSSF, SSFModel
@@ -140,7 +141,8 @@ class Chain:
             If the plan has a pattern that the scene lacks, or theta names no proper SSF.
         """
         view = self.look(theta, plan)
-        return self.read(view, theta, plan) if self.effects else self._scaled(view.seen, theta)
+        plain = not self.effects and not is_commanded(plan)
+        return self._scaled(view.seen, theta) if plain else self.read(view, theta, plan)
 
     def read(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
         """Turn what is seen into readings, (n_samples, n_points): the way from SEEN on, as `predict` goes it.
@@ -150,7 +152,7 @@ class Chain:
         apply = self._applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
         i_min, i_max = self._levels(theta)
-        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * view.brightness * seen)
+        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * light_of(plan) * view.brightness * seen)
         for stage in (Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             reading = apply(stage, reading)
         shape = (len(theta), len(plan))
@@ -177,8 +179,10 @@ class Chain:
         require_columns(theta, self.names)
         layout = self._layout_of(theta, plan)
         if isinstance(self.ssf, FieldSSF):
+            if height_ratio(plan) is not None:
+                raise ParameterError("plan", "a commanded height_mm", "none with a FieldSSF; use mixture_of_field")
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
-        plain = self.ssf.footprint(theta[:, : len(self.ssf.names)])
+        plain = raised_as_commanded(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
         seen = response(layout, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)

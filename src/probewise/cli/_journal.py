@@ -1,0 +1,70 @@
+"""The journal of an `explore` run as a recording over a shape that is not known."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probewise.errors import FileError
+
+if TYPE_CHECKING:
+    from probewise.calibration import FittedSensor
+    from probewise.recordings import Instrumentation, Recording
+    from probewise.scene import Shape
+
+__all__ = ["is_journal", "journal_recording"]
+
+
+def is_journal(path: Path) -> bool:
+    """Tell a journal from a recording by its name."""
+    return path.suffix == ".jsonl"
+
+
+def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
+    """Read a journal: its readings, by that sensor, and what was believed to lie on the field.
+
+    Raises
+    ------
+    FileError
+        If it is no journal, has no reading, or its shape is none that `explore` makes.
+    """
+    from probewise.experiment import read_journal
+
+    journal = read_journal(path)
+    if not journal.entries:
+        raise FileError(path, "no reading", "a journal with at least one measurement")
+    recording = journal.recording(instrumentation=_instrumentation(path, sensor, journal.settings))
+    return replace(recording, notes=(*recording.notes, *journal.notes)), _shape_of(path, journal.settings)
+
+
+def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:
+    """Take the sensor's, with the rounding and the range that the run declared."""
+    try:
+        step = settings["options"]["step"]
+        low, high = settings["options"]["reading_range"]
+        declared = [None if value is None else float(value) for value in (step, low, high)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(path, f"unusable options ({error!r})", "as explore writes them", row=1) from error
+    return replace(sensor.instrumentation, step=declared[0], min=declared[1], max=declared[2])
+
+
+def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
+    """Build the shape that the first line names, by trying those of the command line."""
+    from probewise.experiment import SHAPES, shape_named
+    from probewise.scene import Field
+
+    allowed = f"shapes as explore has them: {', '.join(SHAPES)}"
+    try:
+        written, size = settings["shape"], settings["field"]
+        field = Field(float(size["width_mm"]), float(size["height_mm"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(path, f"unusable settings ({error!r})", allowed, row=1) from error
+    for n in range(1, len(SHAPES) + 1):
+        for names in itertools.permutations(SHAPES, n):
+            shape: Shape = shape_named(names, field)
+            if repr(shape) == written:
+                return shape
+    raise FileError(path, f"shape {written}", allowed, row=1, column="shape")

@@ -1,0 +1,71 @@
+"""`probewise audit`: before any data, what a plan cannot see, cannot tell apart, and what would cure that."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import Verb, add_quiet, check_out_directory, say, staged
+
+if TYPE_CHECKING:
+    from probewise.diagnosis import PlanAudit
+
+__all__ = ["VERB"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument("plan", type=Path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
+    parser.add_argument(
+        "--sensor", type=Path, metavar="S.json", help="the sensor as calibrated; without, a typical one is expected"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="directory for audit.json, audit.png, report.html and the plan that cures; without, only the text",
+    )
+    add_quiet(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Audit, say it on one screen, and write it where asked."""
+    from probewise.calibration import read_sensor
+    from probewise.diagnosis import audit_plan
+    from probewise.recordings import read_plan
+
+    out = None if arguments.out is None else check_out_directory(arguments.out)
+    plan = read_plan(arguments.plan)
+    sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+    noise_sd = None if sensor is None else float(sensor.noise_sd.mean())
+    audit = audit_plan(plan, sensor=sensor, noise_sd=noise_sd)
+    say(audit.summary(), quiet=arguments.quiet)
+    if out is not None:
+        _write(audit, out, arguments.plan.name)
+        say(f"written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _write(audit: PlanAudit, out: Path, source: str) -> None:
+    import json
+
+    from probewise.diagnosis import CURE_PLAN, audit_json
+    from probewise.recordings import write_plan
+    from probewise.report import audit as report
+
+    drawn = report.figures(audit)
+    with staged(out) as stage:
+        text = json.dumps(audit_json(audit), allow_nan=False, indent=1)
+        (stage / "audit.json").write_text(text + "\n", encoding="utf-8")
+        for name, png in drawn.items():
+            (stage / name).write_bytes(png)
+        (stage / "report.html").write_text(report.write_page(audit, drawn, source=source), encoding="utf-8")
+        if audit.cure_plan is not None:
+            write_plan(audit.cure_plan, stage / CURE_PLAN)
+    if audit.cure_plan is None:
+        for name in (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name):  # of an earlier run
+            (out / name).unlink(missing_ok=True)
+
+
+VERB = Verb("audit", "Say before any data what a plan cannot see and cannot tell apart.", add_arguments, run)

@@ -1,0 +1,163 @@
+"""What the arm could be told to do next: repeat, reverse, respeed, rotate, relight, raise.
+
+The first three need nothing but the arm; the last three need what the recording's `controls` list.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.recordings.plan import Plan
+from probewise.sensor import COMMANDED
+
+__all__ = ["Command", "behind", "commands", "minutes_of", "rescheduled"]
+
+BREAK_S = 30.0  # to turn the sensor, or to change what lies under it
+MOST_READINGS = 102
+_LEAST_ROWS = 8
+_MOST_SCANS = 6
+_TURN_DEG = 45.0
+_RAISE = 1.25  # of the height that the recording names
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """One scan that the arm could take: which of the six R's, words for it, its readings."""
+
+    kind: str
+    description: str
+    plan: Plan
+
+
+def commands(plan: Plan, *, strides: Sequence[int] = (1,)) -> list[Command]:
+    """List what could be done with the scans of a plan, each pose of a scan once.
+
+    Parameters
+    ----------
+    plan
+        What was measured, or is to be.
+    strides
+        Take every reading of a scan, every fourth, ...: a list for each.
+    """
+    controls = plan.instrumentation.controls
+    height_mm = plan.instrumentation.height_mm
+    gap_s, start_s = _reading_s(plan), float(plan.time_s.max(initial=0.0)) + BREAK_S
+    out: list[Command] = []
+    for scan in _distinct_scans(plan):
+        name = plan.scan_names[int(plan.scan[scan[0]])]
+        degrees = math.degrees(float(plan.orientation_rad[scan[0]]))
+        for stride in strides:
+            rows = scan[::stride][:MOST_READINGS]
+            if rows.size < _LEAST_ROWS:
+                continue
+            label = name if stride == 1 else f"{name}_{stride}"
+            every = "" if stride == 1 else f", every {stride}th reading"
+            once = rescheduled(plan, rows, start_s, gap_s, label)
+            both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
+            out += [
+                Command("repeat", f"take scan {name} again{every}", _named(once, "again")),
+                Command(
+                    "reverse",
+                    f"take scan {name} backwards{every}",
+                    rescheduled(plan, rows[::-1], start_s, gap_s, f"{label}_reversed"),
+                ),
+                Command(
+                    "respeed",
+                    f"scan {name} forth and back at double speed{every}",
+                    rescheduled(plan, both, start_s, gap_s, f"{label}_both"),
+                ),
+            ]
+            if "orientation_deg" in controls:
+                turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
+                words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
+                out.append(Command("rotate", words, _named(turned, "turned")))
+            if "led" in controls:
+                dark = _commanded(once, "led", 0.0)
+                out.append(Command("relight", f"take scan {name} with the LED off{every}", _named(dark, "dark")))
+            if "height_mm" in controls and height_mm is not None:
+                high = _commanded(once, "height_mm", _RAISE * height_mm)
+                words = f"take scan {name} with the sensor at {_RAISE * height_mm:.4g} mm{every}"
+                out.append(Command("raise", words, _named(high, "raised")))
+    return out
+
+
+def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
+    """Set plans of the same patterns behind a plan.
+
+    A covariate that the others lack keeps its last value there, such as a battery's; what is commanded
+    (the LED, the height) is as at calibration where a plan does not say.
+    """
+    plans = [plan, *more]
+    starts = np.cumsum([0, *(len(p.scan_names) for p in plans)])
+    commanded = {name for p in plans for name in p.covariates if name in COMMANDED}
+    return replace(
+        plan,
+        x_mm=np.concatenate([p.x_mm for p in plans]),
+        y_mm=np.concatenate([p.y_mm for p in plans]),
+        orientation_rad=np.concatenate([p.orientation_rad for p in plans]),
+        time_s=np.concatenate([p.time_s for p in plans]),
+        scan=np.concatenate([p.scan + start for p, start in zip(plans, starts, strict=False)]),
+        scan_names=tuple(name for p in plans for name in p.scan_names),
+        pattern=np.concatenate([p.pattern for p in plans]),
+        covariates={
+            name: np.concatenate([_covariate(p, name, plan) for p in plans]) for name in {*plan.covariates, *commanded}
+        },
+    )
+
+
+def minutes_of(plan: Plan) -> float:
+    """Estimate how long a plan takes, with the break before it."""
+    return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
+
+
+def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
+    """Take rows of a plan as one new scan, in their order, from `start_s` on, commanded as they were."""
+    taken = plan.take(rows)
+    controls = plan.instrumentation.controls
+    return replace(
+        taken,
+        time_s=np.asarray(start_s + gap_s * np.arange(len(rows)), dtype=np.float64),
+        scan=np.zeros(len(rows), dtype=np.int64),
+        scan_names=(name,),
+        covariates={k: v for k, v in taken.covariates.items() if k in COMMANDED or k in controls},
+    )
+
+
+def _named(plan: Plan, how: str) -> Plan:
+    return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
+
+
+def _commanded(plan: Plan, name: str, value: float) -> Plan:
+    return replace(plan, covariates={**plan.covariates, name: np.full(len(plan), value)})
+
+
+def _covariate(plan: Plan, name: str, first: Plan) -> FloatArray:
+    known = plan.covariates.get(name)
+    if known is not None:
+        return known
+    # Where nothing is commanded the sensor is as it was calibrated, which NaN says.
+    last = np.nan if name in COMMANDED else first.covariates[name][-1]
+    return np.full(len(plan), last)
+
+
+def _distinct_scans(plan: Plan) -> list[IntArray]:
+    """Row numbers of the first scans of all that move and differ in pattern, orientation or ends."""
+    seen: dict[tuple[object, ...], IntArray] = {}
+    for rows in plan.rows_by_scan():
+        if rows.size < _LEAST_ROWS or not plan.direction[rows].any():
+            continue
+        places = ((round(float(plan.x_mm[r]), 3), round(float(plan.y_mm[r]), 3)) for r in (rows[0], rows[-1]))
+        key = (int(plan.pattern[rows[0]]), round(float(plan.orientation_rad[rows[0]]), 4), *sorted(places))
+        seen.setdefault(key, rows)
+    return list(seen.values())[:_MOST_SCANS]
+
+
+def _reading_s(plan: Plan) -> float:
+    gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
+    gaps = gaps[gaps > 0]
+    return float(np.median(gaps)) if gaps.size else 1.0

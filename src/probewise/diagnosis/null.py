@@ -1,0 +1,92 @@
+"""What is believed to be the whole truth until shown otherwise, and how the diagnosis talks to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from probewise._arrays import FloatArray
+from probewise.effects import NamedEffect
+from probewise.recordings.plan import Plan
+from probewise.sensor import AnyEffect
+
+__all__ = ["Null", "Predictor"]
+
+
+class Predictor(Protocol):
+    """A model with its effects: a sensor's chain, or a user's own simulator.
+
+    Columns of theta are named by `names`: the model's own, then each effect's in the order of `effects`.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, one a column of theta."""
+        ...
+
+    @property
+    def effects(self) -> tuple[AnyEffect, ...]:
+        """Its effects, in the order in which they act."""
+        ...
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        ...
+
+    def look(self, theta: FloatArray, plan: Plan) -> Any:
+        """Go the way up to the stage SEEN; of one hypothesis or of all."""
+        ...
+
+    def read(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Go on from what `look` gave, with the effects from SEEN on: (n_samples, n_points)."""
+        ...
+
+
+class Null(Protocol):
+    """A model to be diagnosed, in coordinates in which its prior is a standard normal.
+
+    The sensor of the paper (`SensorCoordinates`), a sensor over a shape that is not known
+    (`SensorAndShape`), or any simulator (`OwnModel`).
+    """
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        ...
+
+    @property
+    def n_gaussians(self) -> int:
+        """Number of Gaussians of its SSF; 0 where it has none."""
+        ...
+
+    @property
+    def log_multiplicity(self) -> float:
+        """Log of the number of equal peaks of the posterior."""
+        ...
+
+    @property
+    def starts(self) -> FloatArray:
+        """Coordinates to fit from, (n_starts, n_params)."""
+        ...
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """Names of parameters that belong to this recording alone, such as a shape's: no sensor model keeps them."""
+        ...
+
+    @property
+    def least_readings(self) -> int:
+        """Fewest usable readings that a verdict is given on."""
+        ...
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """Tell whether an effect acts at a stage that this model has."""
+        ...
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates, (n_samples, n_params), to the columns that precede the effects'."""
+        ...
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Predictor:
+        """Build the model of a plan's readings, with effects; `n_nodes` over curved edges, as `sensor.Chain` has it."""
+        ...

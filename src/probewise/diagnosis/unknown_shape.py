@@ -1,0 +1,168 @@
+"""A sensor over a shape that is not known: the shape's parameters are nuisance parameters of the null."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import ndtr
+
+from probewise._arrays import FloatArray, frozen
+from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, known_scene, sensor_from_posterior
+from probewise.diagnosis.engine import SensorPrior
+from probewise.diagnosis.verdict import Diagnosis
+from probewise.effects import NamedEffect
+from probewise.errors import ParameterError
+from probewise.priors import Prior
+from probewise.recordings.patterns import Polygon
+from probewise.recordings.plan import Plan, Recording
+from probewise.scene import AnyOf, Region, Shape, outlines
+from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+
+__all__ = ["SensorAndShape"]
+
+_N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
+
+
+@dataclass(frozen=True, eq=False)
+class SensorAndShape:
+    """A calibrated sensor, and the prior of what lies under it wherever no pattern is described.
+
+    `starts` (n_starts, n_params) are coordinates near the readings' best explanations; see `of`.
+    """
+
+    sensor: SensorCoordinates
+    shape: Shape
+    starts: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "starts", frozen(self.starts))
+
+    @classmethod
+    def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:
+        """Take a calibrated sensor's posterior and a shape's prior, and look for shapes that fit the readings.
+
+        A set of shapes is settled first: the one that fits best.
+
+        Parameters
+        ----------
+        sensor
+            As calibrated.
+        shape
+            What may lie there.
+        recording
+            What was read.
+        rng
+            Source of randomness, for the search.
+        """
+        samples = np.asarray(sensor.samples, dtype=np.float64)
+        known = sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
+        members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
+        found = [_likely(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
+        best = min(range(len(members)), key=lambda k: found[k][0])
+        return cls(known, members[best], found[best][1])
+
+    @property
+    def n_params(self) -> int:
+        """The sensor's and the shape's."""
+        return self.sensor.n_params + len(self.shape.prior.names)
+
+    @property
+    def n_gaussians(self) -> int:
+        """The sensor's."""
+        return self.sensor.n_gaussians
+
+    @property
+    def log_multiplicity(self) -> float:
+        """The sensor's."""
+        return self.sensor.log_multiplicity
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """The shape's parameters."""
+        return self.shape.prior.names
+
+    @property
+    def least_readings(self) -> int:
+        """Three for each parameter of the shape, and three more; the sensor is known."""
+        return 3 * len(self.shape.prior.names) + 3
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """All that the sensor does."""
+        return self.sensor.admits(effect)
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates, (n_samples, n_params), to the sensor's columns, then the shape's."""
+        k = self.sensor.n_params
+        return np.concatenate([self.sensor.theta(z[:, :k]), self.shape.prior.from_unit_cube(ndtr(z[:, k:]))], axis=1)
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        """Build the chain over the shape, and over the patterns that are described."""
+        scene = _ShapeAmongPatterns(self.shape, plan)
+        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, tuple(effects), n_nodes=n_nodes)
+
+    def with_described_field(self, diagnosis: Diagnosis) -> Diagnosis:
+        """Describe the shape in the next plan as it is believed to be now, so that the plan can be written and read."""
+        asked, names = diagnosis.next_measurement, list(diagnosis.repaired.chain.names)
+        if asked is None:
+            return diagnosis
+        own = [names.index(name) for name in self.nuisance]
+        believed = diagnosis.repaired.theta[:, own].mean(axis=0)
+        outline = outlines(self.shape.region(believed[None, :]))[0]
+        shape = Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
+        plan = asked.plan
+        patterns = {name: plan.patterns.get(name, shape) for name in plan.pattern_names}
+        return replace(diagnosis, next_measurement=replace(asked, plan=replace(plan, patterns=patterns)))
+
+
+@dataclass(frozen=True, eq=False)
+class _ShapeAmongPatterns:
+    """A scene of known patterns, and of one unknown shape under every other name."""
+
+    shape: Shape
+    plan: Plan
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The shape's parameters."""
+        return self.shape.prior.names
+
+    @property
+    def prior(self) -> Prior:
+        """The shape's prior."""
+        return self.shape.prior
+
+    def regions(self, theta: FloatArray) -> Mapping[str, Region]:
+        """Region by pattern name, theta (n_samples, n_params of the shape)."""
+        known = known_scene(self.plan).regions(theta)
+        unknown = self.shape.region(theta)
+        return {name: known.get(name, unknown) for name in self.plan.pattern_names}
+
+
+def _likely(null: SensorAndShape, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
+    """Look for shapes that fit, the sensor as it is believed to be: sum of squares of the best, and the best four.
+
+    Draws of the prior, of which the best are kept and scattered more and more narrowly.
+    """
+    usable = recording.usable
+    if not usable.any():
+        raise ParameterError("usable readings", 0, "at least one; the recording holds none")
+    k = null.sensor.n_params
+    chain = null.chain(recording.plan, (), n_nodes=FAST_NODES)
+
+    def misfit(own: FloatArray) -> FloatArray:
+        z = np.concatenate([np.zeros((len(own), k)), own], axis=1)
+        predicted = chain.predict(null.theta(z), recording.plan)[:, usable]
+        return np.asarray(np.sum((recording.readings[usable] - predicted) ** 2, axis=1))
+
+    own = rng.standard_normal((_N_DRAWS, null.n_params - k))
+    values = misfit(own)
+    for shrink in 0.5 ** np.arange(_N_ROUNDS):
+        elite = np.argsort(values)[:_N_ELITE]
+        near = own[elite[rng.integers(_N_ELITE, size=_N_DRAWS)]]
+        near = np.clip(near + 0.5 * shrink * rng.standard_normal(near.shape), -FARTHEST, FARTHEST)
+        own, values = np.concatenate([own[elite], near]), np.concatenate([values[elite], misfit(near)])
+    best = np.argsort(values)[:4]
+    return float(values[best[0]]), np.concatenate([np.zeros((4, k)), own[best]], axis=1)

@@ -1,0 +1,147 @@
+"""What a search has weighed: combinations refitted, the rest by screening, all turned into probabilities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.bank import Bank
+from probewise.diagnosis.covariates import Covariate
+from probewise.diagnosis.evidence import NoiseEvidence
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.noise import NoiseLaw
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.null import Null
+from probewise.diagnosis.odds import PriorOdds
+from probewise.diagnosis.templates import TemplateMemory
+from probewise.effects import NamedEffect
+from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
+
+__all__ = ["STEERING", "Candidate", "Search", "weighed"]
+
+Names = tuple[str, ...]
+
+STEERING = 3.0
+"""Nats behind the best: a noise model further back does not say what to look for next."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A combination of effects on the mean at one SSF order, refitted and weighed under each noise model."""
+
+    found: Fit
+    law: NoiseLaw  # of the noise, under which it was fitted
+    evidence: Mapping[Names, NoiseEvidence]
+    log_share: float  # in the evidence, for the discrete choices that its effects have made
+    weights: Mapping[str, FloatArray]  # of the variants among which each effect chose
+
+    @property
+    def names(self) -> Names:
+        """Its effects on the mean, sorted."""
+        return tuple(sorted(self.found.model.names))
+
+    @property
+    def n_gaussians(self) -> int:
+        """Its SSF order."""
+        return self.found.model.sensor.n_gaussians
+
+    @property
+    def log_z(self) -> float:
+        """Log evidence under the noise model of the most."""
+        return max(e.log_z for e in self.evidence.values())
+
+    def steering(self) -> Iterator[tuple[Names, NoiseEvidence]]:
+        """List the noise models that are not far behind the best, and the plainest.
+
+        What is missing from the mean can look like noise of any kind, and be seen under plain noise alone.
+        """
+        best, plain = self.log_z, min(self.evidence, key=len)
+        return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Everything weighed: refitted candidates by (order, names), and the screened rest.
+
+    Hypotheses are pairs (mean, noise) of names; the mean ("unknown",) is what has no name, alone or beside others.
+    """
+
+    recording: Recording
+    effects: Mapping[str, NamedEffect[Any]]
+    noise_models: Mapping[Names, NoiseModel]
+    certain: Names  # effects on the noise that the readings show without doubt
+    sensors: Mapping[int, Null]
+    candidates: Mapping[tuple[int, Names], Candidate]
+    screened: Mapping[tuple[Names, Names], float]  # (mean, noise) -> log evidence
+    unknown: Mapping[tuple[int, Names, Names], float]  # (order, mean, noise) -> log evidence
+    prior: PriorOdds
+    sd_floor: float
+    covariates: tuple[Covariate, ...]
+    unknown_bases: Bank
+    unknown_shares: Mapping[str, float]
+    templates: TemplateMemory
+    probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
+    order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
+
+    def best(self, names: Names, noise: Names) -> Candidate | None:
+        """Return the refitted candidate of these effects with the most evidence over orders."""
+        options = [c for (_, key), c in self.candidates.items() if key == names]
+        return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
+
+    def beside(self, noise: Names) -> Names:
+        """Name the effects on the mean beside which something unknown most probably is; () for none."""
+        n_effects = sum(e.stage is not Stage.NOISE for e in self.effects.values())
+        scores = {
+            names: value + self.prior.log_unknown(names, n_effects)
+            for (_, names, own), value in self.unknown.items()
+            if own == noise
+        }
+        return max(scores, key=lambda names: scores[names], default=())
+
+    @property
+    def order(self) -> int:
+        """SSF order of the most probable explanation, named or not: that at which the null is tested."""
+        by_order: dict[int, float] = {}
+        n_effects = sum(e.stage is not Stage.NOISE for e in self.effects.values())
+        terms = [(n, c.log_z + self.prior.log_mean(names, n_effects)) for (n, names), c in self.candidates.items()]
+        for (n, names, _), value in self.unknown.items():
+            terms.append((n, value + self.prior.log_unknown(names, n_effects)))
+        for n, value in terms:
+            by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
+        return max(by_order, key=lambda n: by_order[n])
+
+
+def weighed(search: Search) -> Search:
+    """Turn evidences into probabilities of (mean, noise) hypotheses, summed over SSF orders."""
+    prior, n_effects = search.prior, sum(e.stage is not Stage.NOISE for e in search.effects.values())
+    n_noises = sum(e.stage is Stage.NOISE for e in search.effects.values())
+    log_order = -math.log(len(search.sensors))
+    log_z: dict[tuple[Names, Names], float] = {}
+    for (_, names), candidate in search.candidates.items():
+        for noise, evidence in candidate.evidence.items():
+            log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
+    log_p = {key: value + prior.log_mean(key[0], n_effects) for key, value in log_z.items()}
+    for (_, names, noise), value in search.unknown.items():
+        key = ("unknown",), noise
+        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names, n_effects)))
+    for (names, noise), value in search.screened.items():
+        log_p[names, noise] = value + prior.log_mean(names, n_effects)
+    for names, noise in log_p:
+        uncertain = tuple(n for n in noise if n not in search.certain)
+        log_p[names, noise] += log_order + prior.log_noise(uncertain, n_noises)
+    total = float(logsumexp(list(log_p.values())))
+    nulls = {n: c for (n, names), c in search.candidates.items() if not names}
+    clean_by_order = {n: float(logsumexp([e.log_z for e in c.evidence.values()])) for n, c in nulls.items()}
+    norm = float(logsumexp(list(clean_by_order.values())))
+    return replace(
+        search,
+        probabilities={key: math.exp(value - total) for key, value in log_p.items()},
+        order_probabilities={n: math.exp(v - norm) for n, v in clean_by_order.items()},
+    )

@@ -1,0 +1,72 @@
+"""The covariates of a diagnosis as people read them, and their values row by row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis import Diagnosis, Place
+from probewise.diagnosis.covariates import covariates_of
+from probewise.report.words import unit_name
+
+__all__ = ["category_names", "covariate_label", "covariate_values"]
+
+UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
+WORDS = {
+    "level": "predicted reading",
+    "slope": "slope of the predicted reading along the move",
+    "place": "place along the scans",
+    "direction": "direction of the move",
+    "orientation": "orientation of the sensor",
+    "edge_distance": "distance from the edge",
+}
+_STEP_MM = 0.25
+
+
+def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
+    """Name a covariate with its unit; `unit` is the reading's."""
+    units = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
+    said = WORDS.get(name, name.replace("_", " "))
+    if scan is not None and name != "scan":
+        said += f", scan {scan}"
+    return said + (f" ({units[name]})" if name in units else "")
+
+
+def covariate_values(diagnosis: Diagnosis, place: Place) -> FloatArray:
+    """Give each row's value of the covariate of a place, (n_points,); NaN for rows that it does not speak of."""
+    plan = diagnosis.recording.plan
+    usable = np.flatnonzero(diagnosis.recording.usable)
+    level, slope = diagnosis.predicted_before[usable], _slope(diagnosis)[usable]
+    out = np.full(len(plan), np.nan)
+    for covariate in covariates_of(plan, usable, level, slope):
+        # Of the covariate `scan` a place names the scan that stands out; all others are shown beside it.
+        if covariate.name == place.covariate and (covariate.scan == place.scan or place.covariate == "scan"):
+            out[usable[covariate.rows]] = covariate.values
+    return out
+
+
+def category_names(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
+    """Name the values of a covariate that has no scale: scans, directions, orientations; None for all others."""
+    match place.covariate:
+        case "scan":
+            return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
+        case "direction":
+            return {-1.0: "backwards", 1.0: "forwards"}
+        case "orientation":
+            angles = np.unique(np.round(np.degrees(diagnosis.recording.plan.orientation_rad), 6))
+            return {float(angle): f"{angle:g}°" for angle in angles} if len(angles) <= 24 else None
+        case _:
+            return None
+
+
+def _slope(diagnosis: Diagnosis) -> FloatArray:
+    """Differentiate the calibrated model's prediction along each row's move, per mm."""
+    plan, known = diagnosis.recording.plan, diagnosis.null
+    ahead, behind = (
+        replace(plan, x_mm=plan.x_mm + s * plan.direction[:, 0], y_mm=plan.y_mm + s * plan.direction[:, 1])
+        for s in (_STEP_MM, -_STEP_MM)
+    )
+    theta = known.theta.mean(axis=0, keepdims=True)
+    return np.asarray((known.chain.predict(theta, ahead)[0] - known.chain.predict(theta, behind)[0]) / (2 * _STEP_MM))

@@ -1,0 +1,60 @@
+"""What a plan sees of every effect, and what it cannot tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import FloatArray
+from probewise.report.plots.canvas import BLUE, COPPER, GREY, ORANGE, AxesGrid, grid_of_axes, tidy
+
+__all__ = ["audit_matrix"]
+
+COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
+
+
+def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArray, *, alias: float) -> AxesGrid:
+    """Draw how much of each effect survives, and beside it how well each is imitated by each other.
+
+    Parameters
+    ----------
+    names, sights
+        Effects, and whether each is "fine", "aliased" or "invisible".
+    cosines
+        Row imitated by column, (n_effects, n_effects); the surviving share on the diagonal.
+    alias
+        Cosine from which two are not told apart: marked.
+
+    Returns
+    -------
+    The two axes, shape (1, 2).
+    """
+    order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(sights[k]), -cosines[k, k]))
+    labels = [names[k].replace("_", " ") for k in order]
+    at = np.arange(len(order))
+    axes = grid_of_axes(1, 2, size_in=(11.0, 0.8 + 0.27 * len(order)), width_ratios=[1, 2.6], sharey=True)
+    bars, matrix = axes[0]
+    bars.barh(at, np.diag(cosines)[order], color=[COLOUR[sights[k]] for k in order], height=0.7)
+    bars.set_yticks(at, labels)
+    bars.invert_yaxis()
+    bars.set_xlim(0, 1)
+    for sight, colour in COLOUR.items():
+        if sight in sights:
+            bars.barh([np.nan], [0], color=colour, label=sight)
+    bars.legend(frameon=False, fontsize="small", loc="lower right")
+    tidy(bars, x="surviving share of its trace", y="")
+    _matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
+    return axes
+
+
+def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) -> None:
+    shown = np.where(np.eye(len(labels), dtype=np.bool_), np.nan, cosines)
+    image = ax.imshow(shown, cmap=COPPER, vmin=0, vmax=1, aspect="auto")
+    rows, columns = np.nonzero(np.nan_to_num(shown) >= alias)
+    ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
+    ax.set_xticks(np.arange(len(labels)), labels, rotation=90, fontsize="small")
+    ax.tick_params(left=False)
+    ax.figure.colorbar(image, ax=ax, label="how well the row is imitated by the column (cosine)", shrink=0.7)
+    tidy(ax, x="", y="", title="circles: not told apart at λ = 8")

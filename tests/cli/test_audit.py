@@ -1,0 +1,77 @@
+"""`probewise audit`: one screen, four files, and one line for what cannot be used."""
+
+import json
+
+import pytest
+
+from probewise.cli import main
+from probewise.effects import VOCABULARY
+from probewise.recordings import read_plan
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def no_constant(name):
+    raise ValueError(f"{name} is no JSON number")
+
+
+def test_an_audit_names_the_aliases_of_one_way_scans_and_the_scans_that_cure_them(recording_file, tmp_path, capsys):
+    out = tmp_path / "new" / "audit"
+    assert run("audit", recording_file, "--out", out) == 0
+    said = capsys.readouterr().out
+    assert len(said.splitlines()) <= 25
+    found = json.loads((out / "audit.json").read_text(), parse_constant=no_constant)
+    effects = {effect["name"]: effect for effect in found["effects"]}
+    assert set(effects) == set(VOCABULARY)
+    assert effects["hysteresis"]["sight"] == "invisible"
+    assert "edge_misplacement" in {like["effect"] for like in effects["backlash"]["alike"]}
+    cure = found["cure"]
+    assert cure["readings"] == len(read_plan(out / cure["plan"])) == sum(s["readings"] for s in cure["scans"])
+    cured = {name for scan in cure["scans"] for name in scan["cures"]}
+    after = {effect["name"]: effect["sight"] for effect in found["after"]}
+    assert "lag" in cured
+    assert all(after[name] == "fine" for name in cured)
+    assert (out / "audit.png").read_bytes().startswith(b"\x89PNG")
+    assert "would cure" in (out / "report.html").read_text()
+
+
+def test_without_a_directory_nothing_is_written(recording_file, tmp_path, capsys):
+    recording_file.write_text("\n".join(recording_file.read_text().splitlines()[:27]) + "\n")
+    before = sorted(tmp_path.rglob("*"))
+    assert run("audit", recording_file) == 0
+    assert "backlash" in capsys.readouterr().out
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_calibrated_sensor_makes_a_common_rotation_visible(recording_file, sensor_file, tmp_path):
+    out = tmp_path / "audit"
+    assert run("audit", recording_file, "--sensor", sensor_file, "--out", out, "--quiet") == 0
+    effects = {effect["name"]: effect for effect in json.loads((out / "audit.json").read_text())["effects"]}
+    assert effects["orientation_error"]["sight"] != "invisible"
+
+
+@pytest.mark.parametrize("harm", ["no file", "no json", "unknown pattern", "no rows", "nan place", "damaged sensor"])
+def test_input_that_cannot_be_used_is_refused_in_one_line(harm, recording_file, tmp_path, capsys):
+    more = []
+    match harm:
+        case "no file":
+            recording_file.unlink()
+        case "no json":
+            recording_file.with_suffix(".json").unlink()
+        case "unknown pattern":
+            recording_file.write_text(recording_file.read_text().replace("boundary", "nobody"))
+        case "no rows":
+            recording_file.write_text(recording_file.read_text().splitlines()[0] + "\n")
+        case "nan place":
+            recording_file.write_text(recording_file.read_text().replace("-50", "nan"))
+        case "damaged sensor":
+            more = ["--sensor", tmp_path / "damaged.json"]
+            more[1].write_text("{")
+    assert run("audit", recording_file, *more, "--out", tmp_path / "out") == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("probewise audit: ")
+    assert captured.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,122 @@
+"""`probewise diagnose` on the journal of a run: the shape is not known, the sensor may be wrong all the same."""
+
+import json
+
+import numpy as np
+import pytest
+
+from probewise.calibration import read_sensor
+from probewise.cli import main
+from probewise.experiment import experiment_for
+from probewise.recordings import Disc, Instrumentation, Plan, read_plan
+from probewise.scene import Circle, Field, KnownScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+
+CENTRE_MM, RADIUS_MM = (520.0, 240.0), 80.0
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def poses(n=26):
+    """Places about the edge of the circle, as a run visits them, some far inside and far out."""
+    rng = np.random.default_rng(5)
+    angle = rng.uniform(0, 2 * np.pi, n)
+    from_centre = np.where(np.arange(n) % 4 == 0, rng.uniform(0, 200, n), RADIUS_MM + rng.normal(0, 6, n))
+    return CENTRE_MM[0] + from_centre * np.cos(angle), CENTRE_MM[1] + from_centre * np.sin(angle)
+
+
+@pytest.fixture
+def journal_file(sensor_file, tmp_path):
+    """A journal of 26 readings in whole units; the electronics give no more than 50 of 60."""
+    sensor = read_sensor(sensor_file)
+    experiment = experiment_for(sensor, Circle(Field()), Field())
+    x_mm, y_mm = poses()
+    n = len(x_mm)
+    one = np.zeros(n, dtype=int)
+    plan = Plan(
+        x_mm=x_mm,
+        y_mm=y_mm,
+        orientation_rad=np.zeros(n),
+        time_s=5.0 * np.arange(n),
+        scan=one,
+        scan_names=("field",),
+        pattern=one,
+        pattern_names=("field",),
+        patterns={"field": Disc(CENTRE_MM, RADIUS_MM)},
+        instrumentation=Instrumentation(),
+    )
+    ssf = FixedMixture.from_parameters(sensor.samples.mean(axis=0)[:6])
+    exact = Chain(ssf, FixedLevels(10.0, 60.0), KnownScene(plan.patterns)).predict(np.empty((1, 0)), plan)[0]
+    noise = 0.5 * np.random.default_rng(6).standard_normal(n)
+    readings = np.round(np.minimum(exact, 50.0) + noise)
+    lines = [{"format": "journal/1", **experiment.settings(np.random.SeedSequence(1))}]
+    lines += [
+        {
+            "index": k + 1,
+            "pose": {"x_mm": float(x_mm[k]), "y_mm": float(y_mm[k]), "orientation_rad": 0.0},
+            "time_s": 5.0 * k,
+            "reading": float(readings[k]),
+            "covariates": {},
+        }
+        for k in range(n)
+    ]
+    path = tmp_path / "journal.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return path
+
+
+def test_a_robot_says_in_mid_run_that_its_sensor_model_is_wrong(journal_file, sensor_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run("diagnose", journal_file, "--sensor", sensor_file, "--out", out) == 0
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["verdict"] == "named", capsys.readouterr().out
+    assert found["combination"] == ["saturation"]
+    (level,) = (p for p in found["effects"][0]["parameters"] if p["name"] == "level")
+    assert level["interval95"][0] < 50.0 < level["interval95"][1]
+    repaired = read_sensor(out / "sensor.json")
+    assert not {"x_mm", "y_mm", "radius_mm"} & set(repaired.names)
+    assert repaired.effects == ("saturation",)
+    plan = read_plan(out / "next_plan.csv")  # its field is described as it is believed to be
+    assert len(plan) == found["next_measurement"]["readings"]
+
+
+def refused(capsys, *arguments):
+    assert run(*arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_a_journal_needs_the_sensor_of_its_run(journal_file, tmp_path, capsys):
+    assert "--sensor" in refused(capsys, "diagnose", journal_file, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_unknown_shapes_at_once_are_refused(journal_file, sensor_file, tmp_path, capsys):
+    arguments = ("diagnose", journal_file, journal_file, "--sensor", sensor_file, "--out", tmp_path / "out")
+    assert "one at a time" in refused(capsys, *arguments)
+
+
+@pytest.mark.parametrize("harm", ["empty", "no reading", "other shape", "no field", "no options"])
+def test_a_journal_that_cannot_be_used_is_refused_in_one_line(harm, journal_file, sensor_file, tmp_path, capsys):
+    first, *rest = journal_file.read_text().splitlines()
+    settings = json.loads(first)
+    match harm:
+        case "empty":
+            journal_file.write_text("")
+        case "no reading":
+            rest = []
+        case "other shape":
+            settings["shape"] = "Spiral()"
+        case "no field":
+            del settings["field"]
+        case "no options":
+            del settings["options"]
+    if harm != "empty":
+        journal_file.write_text("\n".join([json.dumps(settings), *rest]) + "\n")
+    arguments = ("diagnose", journal_file, "--sensor", sensor_file, "--out", tmp_path / "out")
+    assert "journal.jsonl" in refused(capsys, *arguments)
+    assert not (tmp_path / "out").exists()

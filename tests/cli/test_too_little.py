@@ -1,0 +1,74 @@
+"""Readings that say nothing, and models that do not arrive: said so, never guessed."""
+
+import json
+
+import pytest
+
+from probewise.cli import main
+from probewise.errors import NotConvergedError
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def keep_rows(path, n):
+    path.write_text("\n".join(path.read_text().splitlines()[: n + 1]) + "\n")
+
+
+def set_all(path, reading):
+    header, *rows = path.read_text().splitlines()
+    at = header.split(",").index("reading")
+    changed = [",".join([*row.split(",")[:at], reading, *row.split(",")[at + 1 :]]) for row in rows]
+    path.write_text("\n".join([header, *changed]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"), [("one reading", "1 usable readings are too few"), ("few", "are too few"), ("equal", "are equal")]
+)
+def test_too_little_to_say_anything_is_a_verdict_of_its_own(harm, said, recording_file, tmp_path, capsys):
+    match harm:
+        case "one reading":
+            keep_rows(recording_file, 1)
+        case "few":
+            keep_rows(recording_file, 20)
+        case "equal":
+            keep_rows(recording_file, 40)
+            set_all(recording_file, "30")
+    out = tmp_path / "out"
+    assert run("diagnose", recording_file, "--out", out) == 0
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert found["verdict"] == "cannot_tell"
+    assert found["combination"] == []
+    assert said in found["reason"]
+    assert said in (out / "report.html").read_text()
+
+
+def test_a_fit_that_does_not_arrive_gives_no_verdict(recording_file, tmp_path, monkeypatch, capsys):
+    def never(*_, **__):
+        raise NotConvergedError("the fit of the model did not converge")
+
+    monkeypatch.setattr("probewise.diagnosis.engine.require_converged", never)
+    assert run("diagnose", recording_file, "--out", tmp_path / "out") == 1
+    said = capsys.readouterr()
+    assert said.err == "probewise diagnose: the fit of the model did not converge\n"
+    assert said.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("verb", ["predict", "audit"])
+def test_a_plan_over_a_pattern_that_its_description_lacks_is_refused(
+    verb, recording_file, sensor_file, tmp_path, capsys
+):
+    description = recording_file.with_suffix(".json")
+    content = json.loads(description.read_text())
+    del content["patterns"]["quadrant_a"]
+    description.write_text(json.dumps(content))
+    arguments = {
+        "predict": ("predict", sensor_file, recording_file, "--out", tmp_path / "p.csv"),
+        "audit": ("audit", recording_file, "--out", tmp_path / "out"),
+    }[verb]
+    assert run(*arguments) == 2
+    said = capsys.readouterr().err
+    assert "quadrant_a" in said
+    assert said.count("\n") == 1

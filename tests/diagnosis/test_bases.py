@@ -1,0 +1,46 @@
+"""Bases for what has no name: each kind of mismatch is in the span of one of them, or nearly so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.bases import unknown_templates
+from probewise.diagnosis.covariates import covariates_of
+from probewise.recordings import two_way_plan
+
+PLAN = two_way_plan()
+N = len(PLAN)
+SIGNAL = 25.0 * (1 + np.tanh(PLAN.x_mm / 8))
+FORTH = np.sign(PLAN.direction[:, 0])
+IN_X = 25.0 / 8 / np.cosh(PLAN.x_mm / 8) ** 2  # the signal's slope in the lab frame
+SLOPE = IN_X * np.where(FORTH == 0, 1.0, FORTH)  # and along the move
+STARTS = np.flatnonzero(np.diff(PLAN.scan, prepend=-1))
+BASES = unknown_templates(covariates_of(PLAN, np.arange(N), SIGNAL, SLOPE), SIGNAL, SLOPE, STARTS)
+TEMPLATES = [BASES[k] for k in range(len(BASES.widths))]
+TIME = (PLAN.time_s - PLAN.time_s.min()) / np.ptp(PLAN.time_s)
+MISMATCHES = {
+    "a rail bent along X": IN_X * (PLAN.x_mm / 50) ** 2,
+    "a slip along X at a moment": IN_X * (TIME > 0.5),
+    "a gain that wanders in time": SIGNAL * np.sin(9 * TIME),
+    "a wave in time": np.sin(20 * TIME),
+    "a bend of the response": SIGNAL * (SIGNAL.max() - SIGNAL),
+    "a gain for each angle": SIGNAL * np.cos(2 * PLAN.orientation_rad),
+    "a start of each scan": np.exp(-(np.arange(N) - np.repeat(STARTS, np.diff(STARTS, append=N))) / 2),
+    "the brightest so far": np.concatenate([np.maximum.accumulate(part) for part in np.split(SIGNAL, STARTS[1:])]),
+}
+
+
+@pytest.mark.parametrize("mismatch", MISMATCHES.values(), ids=MISMATCHES)
+def test_some_basis_holds_it(mismatch):
+    left = []
+    for columns in TEMPLATES:
+        amount = np.linalg.lstsq(columns, mismatch)[0]
+        left.append(float(np.sum((mismatch - columns @ amount) ** 2) / np.sum(mismatch**2)))
+    assert min(left) < 0.1
+
+
+def test_every_basis_is_of_the_rows_and_has_a_family():
+    assert len(BASES.widths) == len(BASES.labels)
+    assert BASES.columns.shape == (N, BASES.widths.sum())
+    assert all(np.isfinite(columns).all() and np.any(columns) for columns in TEMPLATES)

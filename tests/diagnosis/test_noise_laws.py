@@ -1,0 +1,155 @@
+"""Laws of the noise against densities written down, quadrature and draws."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from probewise.diagnosis.evidence import weigh
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.noise import NoiseLaw, Tail, white
+from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
+from probewise.recordings import Recording, paper_plan
+
+PLAN = paper_plan()
+N = len(PLAN)
+SD = 0.6
+MEAN = 35.0 + 25.0 * np.tanh(PLAN.x_mm / 8)
+
+
+def heavy(share: float, times: float, n: int = 50) -> NoiseLaw:
+    return NoiseLaw(np.ones(n), np.zeros(n), np.zeros(n, dtype=np.bool_), share, times)
+
+
+def found_with(noise: np.ndarray, slope: np.ndarray | None = None) -> tuple[Fit, Recording]:
+    """Make a fit of one parameter at its prior's centre."""
+    slopes = np.zeros((N, 1)) if slope is None else slope[:, None]
+    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(log_multiplicity=0.0)))
+    return Fit(model, np.zeros(1), MEAN, noise, slopes, SD, 0.0), Recording(PLAN, MEAN + noise)
+
+
+def log_mixture(z: np.ndarray, share: float, times: float) -> np.ndarray:
+    return np.logaddexp(math.log1p(-share) + norm.logpdf(z), math.log(share) + norm.logpdf(z, scale=times))
+
+
+@pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
+def test_the_misfit_is_minus_the_log_density(share, times):
+    z = np.random.default_rng(0).normal(size=(50, 3)) * [1.0, 2.0, 5.0]
+    sigma = np.array([1.0, 1.5, 2.0])
+    found = heavy(share, times).misfit(z, sigma) + 25 * math.log(2 * math.pi)
+    wanted = -np.sum(log_mixture(z / sigma, share, times) - np.log(sigma), axis=0)
+    np.testing.assert_allclose(found, wanted)
+
+
+def test_the_scale_is_where_the_misfit_is_least():
+    z = np.random.default_rng(1).normal(size=(50, 1))
+    z[:3] *= 9
+    law = heavy(0.05, 8.0)
+    sigma = law.scale(z)
+    trial = sigma * np.linspace(0.8, 1.25, 451)
+    misfits = np.array([float(law.misfit(z, np.array([s]))[0]) for s in trial])
+    assert trial[misfits.argmin()] == pytest.approx(float(sigma[0]), rel=1e-2)
+
+
+def test_a_tail_that_is_not_there_is_none():
+    """With the floor of the scale too: white and nearly white noise are to have the same evidence."""
+    z = np.random.default_rng(2).normal(size=(50, 2))
+    thin, none = heavy(1e-12, 3.0), white(50)
+    for floor in (0.0, 0.3):
+        sigma = none.scale(z, floor=floor)
+        np.testing.assert_allclose(thin.scale(z, floor=floor), sigma, rtol=1e-6)
+        np.testing.assert_allclose(thin.misfit(z, sigma, floor=floor), none.misfit(z, sigma, floor=floor), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
+def test_pseudo_observations_say_as_much_as_the_density_does(share, times):
+    """Their mean follows a shift of the noise one to one, and their variance is one over the information."""
+    rng = np.random.default_rng(3)
+    n = 400_000
+    z = rng.normal(size=n) * np.where(rng.random(n) < share, times, 1.0)
+    tail = Tail(share, times)
+    one = np.ones(1)
+    plain, moved = (tail.as_normal((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
+    assert np.var(plain) == pytest.approx(1 / float(tail.information), rel=0.02)
+    assert np.abs(plain).max() < 10
+
+
+def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
+    lost = np.zeros(50, dtype=np.bool_)
+    lost[7] = True
+    law = NoiseLaw(np.ones(50), np.zeros(50), lost, 0.05, 8.0)
+    drawn = law.draws(4000, rng=np.random.default_rng(0))
+    assert drawn[~lost].std() == pytest.approx(1.0, rel=0.02)
+    np.testing.assert_array_equal(drawn[7], 0.0)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [None, CorrelatedNoise(), SignalDependentNoise(), DriftingNoise(), Outliers()],
+    ids=lambda e: type(e).__name__,
+)
+def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
+    """Route two: a grid over both, for each node."""
+    rng = np.random.default_rng(4)
+    slope = rng.normal(size=N)
+    noise = SD * rng.normal(size=N) * np.where(rng.random(N) < 0.03, 6.0, 1.0)
+    found, recording = found_with(noise, slope)
+    evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording), sd_floor=1e-6)
+    step = np.linspace(-0.2, 0.2, 161)
+    log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
+    for node in (0, len(evidence.laid_out.laws) // 2):
+        law = evidence.laid_out.laws[node]
+        whitened = law(noise)[:, None] - law(slope)[:, None] * step
+        total = []
+        for s in log_sigma:
+            z = whitened / math.exp(s)
+            density = log_mixture(z, law.share, law.times) if law.share else norm.logpdf(z)
+            total.append(logsumexp(density.sum(axis=0) - N * s + norm.logpdf(step)))
+        cell = (step[1] - step[0]) * (log_sigma[1] - log_sigma[0])
+        by_grid = float(logsumexp(total)) + math.log(cell) - law.log_det()
+        own = evidence.log_z_nodes[node] - evidence.laid_out.log_weights[node]
+        assert own == pytest.approx(by_grid, abs=0.05)
+
+
+def test_readings_lost_to_one_value_are_no_wide_ones():
+    rng = np.random.default_rng(5)
+    noise = SD * rng.normal(size=N)
+    lost = np.array([30, 90, 200, 310])
+    noise[lost] = -MEAN[lost]
+    found, recording = found_with(noise)
+    log_z = {
+        type(e).__name__: weigh(found, NoiseModel((e,), recording), sd_floor=1e-6).log_z
+        for e in (Dropouts(), Outliers())
+    }
+    plain = weigh(found, NoiseModel((), recording), sd_floor=1e-6).log_z
+    assert log_z["Dropouts"] > log_z["Outliers"] + 3 > plain + 50
+    law = weigh(found, NoiseModel((Dropouts(),), recording), sd_floor=1e-6).law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
+
+
+def test_where_nothing_is_lost_there_is_no_such_law():
+    found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
+    evidence = weigh(found, NoiseModel((Dropouts(),), recording), sd_floor=1e-6)
+    assert evidence.log_z == -math.inf
+    assert evidence.laid_out.laws == ()
+
+
+def test_a_law_of_some_scans_is_that_of_the_whole():
+    found, recording = found_with(np.zeros(N))
+    law = NoiseModel((CorrelatedNoise(),), recording).laws(found.predicted).laws[20]
+    rows = PLAN.scan == 1
+    r = np.random.default_rng(7).normal(size=N)
+    np.testing.assert_allclose(law.take(rows)(r[rows]), law(r)[rows])
+
+
+def test_the_rough_sd_needs_no_model():
+    _, recording = found_with(SD * np.random.default_rng(8).normal(size=N))
+    assert rough_sd(recording) == pytest.approx(SD, rel=0.2)

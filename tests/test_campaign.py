@@ -99,3 +99,17 @@ def test_a_worker_that_dies_loses_nothing(tmp_path):
     kept = read_campaign(path).results
     assert kept == {f"task {k}": square(k) for k in range(5)}
     assert run_campaign(square, TASKS, path=path, settings=SETTINGS) == {key: square(k) for key, k in TASKS.items()}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no advisory locks")
+def test_two_campaigns_do_not_write_to_one_file(tmp_path):
+    """A task of the first begins the second; the first goes on undisturbed."""
+    path = tmp_path / "campaign.jsonl"
+
+    def again(k: int) -> dict[str, float]:
+        with pytest.raises(FileError, match="another process is writing to it"):
+            run_campaign(square, {"other": 3}, path=path, settings={})
+        return square(k)
+
+    assert run_campaign(again, {"own": 2}, path=path, settings={}) == {"own": square(2)}
+    assert list(read_campaign(path).results) == ["own"]

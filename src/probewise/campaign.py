@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ def run_campaign(
     Raises
     ------
     FileError
-        If the file belongs to another campaign, or is damaged before its last line.
+        If the file belongs to another campaign, is damaged before its last line, or is being written to.
     NotConvergedError
         If the executor's workers die; all that ended before is kept.
     """
@@ -127,7 +128,7 @@ def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str,
 
 
 class _Lines:
-    """Append lines, each on disk before the next; a torn end is cut off first."""
+    """Append lines, each on disk before the next; a torn end is cut off first, and no other process may write."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:
         if fresh:
@@ -136,6 +137,7 @@ class _Lines:
 
     def __enter__(self) -> Self:
         self._file: BinaryIO = self._path.open("r+b")
+        _lock(self._file, self._path)
         content = self._file.read()
         self._file.truncate(self._file.seek(content.rfind(b"\n") + 1))
         return self
@@ -157,6 +159,19 @@ class _Lines:
         self._file.flush()
         os.fsync(self._file.fileno())
         return line
+
+
+def _lock(file: BinaryIO, path: Path) -> None:
+    """Keep other processes from writing to a file as long as it is open; Windows has no such lock."""
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise FileError(path, "another process is writing to it", "one campaign a file at a time") from error
 
 
 @contextlib.contextmanager

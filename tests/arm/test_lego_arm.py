@@ -150,6 +150,12 @@ def test_a_place_out_of_reach_moves_nothing(bench):
     assert not bench.paper.drives()
 
 
+def test_another_height_than_that_of_reading_is_refused(bench):
+    with bench.arm as arm, pytest.raises(ReachError, match="at which this arm reads"):
+        arm.measure(Pose(500.0, 200.0, float(arm.orientation_rad(np.array([[500.0, 200.0]]))[0]), 40.0))
+    assert not bench.paper.drives()
+
+
 def test_another_orientation_than_the_arm_gives_is_refused(bench):
     with bench.arm as arm, pytest.raises(ReachError, match="no wrist"):
         arm.measure(Pose(300.0, 200.0, 1.0))

@@ -490,3 +490,12 @@ def test_worth_a_second_saves_travel(small):
         return np.hypot(*np.diff(places, axis=0).T).mean()
 
     assert way(PerSecond()) < 0.8 * way(InformationGain())
+
+
+def test_a_run_that_nothing_within_reach_can_advance_stops_and_says_so(small):
+    """Four places and a sensor that says yes or no: when all are read, a further reading tells nothing."""
+    arm = small.arm(sensor=small.sensor(0.0), reach_mm=30.0)
+    result = run(arm, small.experiment(blur_mm=0.0, grid=COARSE), rng=rng(), max_readings=20)
+    assert "every reading within reach promises the same" in result.stop_reason
+    assert len(result.steps) <= 4
+    assert not result.reached

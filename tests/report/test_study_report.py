@@ -6,9 +6,10 @@ import io
 import numpy as np
 import pytest
 
+from probewise.experiment import least_readings
 from probewise.report import plots
 from probewise.report import study as report
-from probewise.study import REFERENCE, Row, Study
+from probewise.study import REFERENCE, Row, Study, experiment_of
 
 ROWS = [REFERENCE, Row(model="naive")]
 
@@ -54,6 +55,15 @@ def test_the_csv_holds_every_number_and_its_bounds(study):
         assert float(row["mean"]) == pytest.approx(summary.mean.value, rel=1e-5)
         assert float(row["mean_low"]) < float(row["mean"]) < float(row["mean_high"])
         assert "cpu" not in ",".join(row)
+
+
+def test_the_bound_stands_beside_what_was_measured(study):
+    """Bits over capacity, of the rows whose robot knows its sensor."""
+    least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
+    shown = str(report.table_of_bounds(study))
+    assert f"{least.search:.1f} = " in shown
+    assert f"{least.refinement:.1f} = " in shown
+    assert ROWS[1].name not in shown
 
 
 def test_each_curve_is_the_median_of_its_runs():

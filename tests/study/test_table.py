@@ -39,6 +39,7 @@ def test_a_miss_counts_as_the_limit_and_says_nothing_of_what_comes_after_white()
     assert found.mean.value == pytest.approx((8 + 14 + 100) / 3)
     assert found.median.value == 14
     assert found.after_white.value == pytest.approx((5 + 11) / 2)
+    assert found.to_white.value == pytest.approx((3 + 3 + 100) / 3)
     assert found.reached.value == pytest.approx(2 / 3)
     assert found.held.value == pytest.approx(2 / 3)
     assert found.bits_each.value == pytest.approx(np.mean([20 / 8, 20 / 14, 0.2]))

@@ -14,11 +14,12 @@ __all__ = ["Instrument", "Pose", "Reading"]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the sensor is to stand, lab frame."""
+    """Where the sensor is to stand, lab frame; `height_mm` above the surface, None: where the arm reads by default."""
 
     x_mm: float
     y_mm: float
     orientation_rad: float = 0.0
+    height_mm: float | None = None
 
 
 @dataclass(frozen=True)

@@ -129,6 +129,10 @@ class LegoArm:
         place = np.array([[pose.x_mm, pose.y_mm]])
         if not self.geometry.holds(place)[0]:
             raise ReachError("pose", pose, self.geometry.sentence())
+        if pose.height_mm not in (None, self.geometry.read_height_mm):
+            raise ReachError(
+                "height_mm", pose.height_mm, f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
+            )
         stands = float(self.orientation_rad(place)[0])
         if not abs(float(wrapped(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
             raise ReachError(

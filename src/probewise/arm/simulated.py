@@ -53,7 +53,7 @@ class SimulatedArm:
     scale
         The conversion to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
     height_mm
-        Height of the sensor above the surface when it reads.
+        Height of the sensor above the surface when it reads and the pose does not say.
     start_s
         What the clock shows at the start, to go on where an earlier run ended.
     """
@@ -137,11 +137,14 @@ class SimulatedArm:
         place = np.array([[pose.x_mm, pose.y_mm]])
         if not (math.isfinite(pose.orientation_rad) and self.reach.holds(place)[0]):
             raise ReachError("pose", pose, f"{self.reach.sentence()}, at a finite orientation")
+        height_mm = self._height_mm if pose.height_mm is None else pose.height_mm
+        if not 0 < height_mm < math.inf:
+            raise ReachError("height_mm", height_mm, "above the surface: finite, greater than 0")
         self._time_s += float(self.travel_s(self._pose, place)[0])
         self._pose = pose
-        value = self._light(pose, self._time_s, self._height_mm)
+        value = self._light(pose, self._time_s, height_mm)
         value = value if self._scale is None else self._scale.convert(value)
-        return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": self._height_mm})
+        return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": height_mm})
 
 
 def _pairs(places_mm: FloatArray) -> FloatArray:

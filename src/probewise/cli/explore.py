@@ -20,7 +20,7 @@ from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Instrument, Reading
-    from probewise.experiment import Step
+    from probewise.experiment import Model, Step
     from probewise.scene import Field
 
 __all__ = ["VERB"]
@@ -63,6 +63,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--live", action="store_true", help="show the robot's view in a browser while it works (DIR/live.html)"
     )
     parser.add_argument(
+        "--both-models",
+        action="store_true",
+        help="show beside the robot's view what the other sensor model makes of the same readings",
+    )
+    parser.add_argument(
         "--utility",
         default="finishing",
         metavar="NAME",
@@ -90,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import experiment as posing
     from probewise.calibration import read_sensor
     from probewise.cli._geometry import parse_truth
-    from probewise.experiment import Exploration, explore
+    from probewise.experiment import Exploration, beside, explore
     from probewise.inquiry import utility_named
     from probewise.recordings import write_bytes_atomically, write_text_atomically
     from probewise.report import exploration as report
@@ -102,16 +107,19 @@ def run(arguments: argparse.Namespace) -> int:
     geometry = geometry_of(arguments) if port is not None or arguments.geometry is not None else None
     field = _field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
-    run_rng, truth_rng = np.random.default_rng(arguments.seed).spawn(2)
+    run_rng, truth_rng, other_rng = np.random.default_rng(arguments.seed).spawn(3)
+    shape, utility = posing.shape_named(arguments.shape, field), utility_named(arguments.utility)
     experiment = posing.experiment_for(
         sensor,
-        posing.shape_named(arguments.shape, field),
+        shape,
         field,
         model=arguments.model,
-        utility=utility_named(arguments.utility),
+        utility=utility,
         learn_sensor=arguments.learn_sensor,
         batch=arguments.batch,
     )
+    other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
+    other = posing.experiment_for(sensor, shape, field, model=other_model, utility=utility)
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
     arm: Instrument
@@ -134,6 +142,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = out / "frames"
     folder.mkdir(parents=True, exist_ok=True)
     steps: list[Step] = []
+    others: list[Step] = []
     frames, readings = [], []
 
     def kept() -> str:
@@ -144,11 +153,20 @@ def run(arguments: argparse.Namespace) -> int:
         arm,
         tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
     ):
-        for step in explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal):
+        own = explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal)
+        seen = posing.Field.under(arm, other.grid)
+        pairs = beside(own, other, seen, rng=other_rng) if arguments.both_models else ((step, None) for step in own)
+        for step, shadow in pairs:
             steps.append(step)
             pose = step.reading.pose
             readings.append((pose.x_mm, pose.y_mm, step.reading.value))
-            frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
+            if shadow is None:
+                frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
+            else:
+                others.append(shadow)
+                views = {arguments.model: (step, experiment), other_model: (shadow, other)}
+                titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
+                frames.append(report.frame_of_both(titled, readings, levels=levels, truth_mm=truth_mm))
             write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
             if arguments.live:
                 write_text_atomically(out / "live.html", report.live_page(step, frames[-1]))
@@ -158,7 +176,14 @@ def run(arguments: argparse.Namespace) -> int:
             bar.update()
     result = Exploration(experiment, tuple(steps))
     with staged(out) as stage:
-        page = report.write_page(result, frames, seed=arguments.seed, model=arguments.model, truth=known)
+        page = report.write_page(
+            result,
+            frames,
+            seed=arguments.seed,
+            model=arguments.model,
+            truth=known,
+            beside={other_model: others} if others else None,
+        )
         (stage / "report.html").write_text(page, encoding="utf-8")
         (stage / "run.gif").write_bytes(gif(frames))
     say(result.summary(), quiet=arguments.quiet)

@@ -1,6 +1,7 @@
 """The autonomous experiment: measure, infer, inquire, and write down each measurement (paper, section 2.2 and 2.3)."""
 
 from probewise.experiment.asking import Field
+from probewise.experiment.beside import beside
 from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import (
     Belief,
@@ -44,6 +45,7 @@ __all__ = [
     "Step",
     "arm_over",
     "begin",
+    "beside",
     "experiment_for",
     "explore",
     "least_readings",

@@ -64,7 +64,9 @@ def inquire(
         cost_s = designs.cost_s(field.travel_s(at.pose, experiment.grid.places_mm), read_s)
     plan = designs.plan(PATTERN, time_s=0.0 if at is None else at.time_s)
     standing = np.tile(field.orientation_rad, len(designs.combinations))
-    plan = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + standing)
+    plan = dataclasses.replace(
+        plan, orientation_rad=plan.orientation_rad + standing, instrumentation=experiment.instrumentation
+    )
     drawn = posterior.samples(experiment.n_samples, rng=rng)
     drawn.flags.writeable = False
     prospect = Prospect(
@@ -93,5 +95,7 @@ def next_poses(
     orientation_rad = prospect.plan.orientation_rad  # as the sensor will really stand there
     designs = [(experiment.designs[row], float(orientation_rad[row])) for row in rows]
     return tuple(
-        Pose(design.x_mm, design.y_mm, standing) for design, standing in designs for _ in range(design.repeats)
+        Pose(design.x_mm, design.y_mm, standing, dict(design.settings).get("height_mm"))
+        for design, standing in designs
+        for _ in range(design.repeats)
     )

@@ -230,7 +230,14 @@ def _or_nan(value: float | None) -> float:
 
 
 def _pose(line: Mapping[str, Any]) -> Pose:
-    return Pose(float(line["x_mm"]), float(line["y_mm"]), float(line["orientation_rad"]))
+    height_mm = line.get("height_mm")
+    place = (float(line["x_mm"]), float(line["y_mm"]), float(line["orientation_rad"]))
+    return Pose(*place, None if height_mm is None else float(height_mm))
+
+
+def _pose_line(pose: Pose) -> dict[str, float]:
+    """Write a pose; a height only where it was chosen."""
+    return {name: value for name, value in dataclasses.asdict(pose).items() if value is not None}
 
 
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
@@ -287,7 +294,7 @@ class JournalWriter:
         """Write a reading, the first part of its line."""
         line = {
             "index": index,
-            "pose": dataclasses.asdict(reading.pose),
+            "pose": _pose_line(reading.pose),
             "time_s": reading.time_s,
             "reading": _or_null(reading.value),
             "covariates": {name: _or_null(value) for name, value in reading.covariates.items()},
@@ -300,7 +307,7 @@ class JournalWriter:
             "mean": dict(belief.mean),
             "sd": dict(belief.sd),
             "bits": belief.bits,
-            "next": dataclasses.asdict(belief.next_pose),
+            "next": _pose_line(belief.next_pose),
         }
         self._write(BELIEF + json.dumps(line, allow_nan=False) + "}\n")
 

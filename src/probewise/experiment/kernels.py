@@ -21,7 +21,7 @@ __all__ = ["LocalKernels"]
 _MOST_KERNELS = 250
 _NEIGHBOURS = 10  # for each parameter, so that their covariance is known
 _RIDGE = 1e-6  # of the overall covariance, so that none is singular
-_BLOCK = 1024
+_BLOCK = 256  # points at a time: their densities stay in the cache
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,20 @@ from probewise.experiment.journal import recording_of
 from probewise.experiment.particles import Block
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inference.student_t import StudentT
-from probewise.inquiry import Designs, Finishing, Forecast, Goal, Grid, InformationGain, Readout, Utility, forecast_of
+from probewise.inquiry import (
+    AskedForecast,
+    Designs,
+    Finishing,
+    Forecast,
+    Goal,
+    Grid,
+    InformationGain,
+    Readout,
+    Utility,
+    forecast_of,
+)
 from probewise.priors import Joint, Prior
+from probewise.recordings.plan import Instrumentation
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf
 from probewise.sensor.stages import SensorModel
@@ -76,6 +88,9 @@ class Experiment:
         What readings are whole multiples of (None: they are not rounded), and the least and greatest there are.
     orientations_rad, repeats
         How the sensor may be turned, and how many readings may be taken on the spot.
+    heights_mm, calibrated_height_mm
+        How high above the surface it may read, where that may be chosen, and the height at which it was calibrated:
+        another scales its footprint and dims its signal (see `sensor.commanded`).
     batch
         Readings that are chosen together, for their joint information; greater than 1 only with the default
         utility or `InformationGain`.
@@ -107,6 +122,8 @@ class Experiment:
     reading_range: tuple[float, float] = (-math.inf, math.inf)
     orientations_rad: tuple[float, ...] = (0.0,)
     repeats: tuple[int, ...] = (1,)
+    heights_mm: tuple[float, ...] = ()
+    calibrated_height_mm: float | None = None
     batch: int = 1
     stop_sd_mm: float = 4.0
     stop_probability: float = 0.95
@@ -128,6 +145,12 @@ class Experiment:
             raise ParameterError("n_particles", self.n_particles, "100 or more, and no fewer than n_samples")
         if self.batch < 1 or (self.batch > 1 and self.utility not in (Finishing(), InformationGain())):
             raise ParameterError("batch", self.batch, "1, or more with the utility Finishing() or InformationGain()")
+        if bool(self.heights_mm) != (self.calibrated_height_mm is not None):
+            raise ParameterError(
+                "calibrated_height_mm", self.calibrated_height_mm, "a height where heights_mm may be chosen, else None"
+            )
+        if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
+            raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
         if self.model.names != self.prior.names:
             raise ParameterError(
                 "model.names",
@@ -162,7 +185,13 @@ class Experiment:
     @cached_property
     def designs(self) -> Designs:
         """The readings that may be taken."""
-        return Designs(self.grid, self.orientations_rad, self.repeats)
+        settings = (("height_mm", self.heights_mm),) if self.heights_mm else ()
+        return Designs(self.grid, self.orientations_rad, self.repeats, settings)
+
+    @cached_property
+    def instrumentation(self) -> Instrumentation:
+        """What a plan of this sensor says of it."""
+        return Instrumentation(height_mm=self.calibrated_height_mm)
 
     @cached_property
     def goal(self) -> Goal | None:
@@ -174,12 +203,13 @@ class Experiment:
 
     @cached_property
     def forecast(self) -> Forecast:
-        """What predicts for many hypotheses at once, made when first asked for."""
-        return forecast_of(self.model)
+        """What predicts for many hypotheses at once, made when first asked for; a table knows one height only."""
+        return AskedForecast(self.model) if self.heights_mm else forecast_of(self.model)
 
     def problem(self, readings: Sequence[Reading]) -> SensorProblem:
         """Set up the inference from these readings."""
-        return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording_of(readings))
+        recording = recording_of(readings, instrumentation=self.instrumentation)
+        return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     def blocks(self, theta: FloatArray) -> tuple[Block, ...]:
         """Split hypotheses by shape: each uses the sensor's parameters and its own."""
@@ -222,6 +252,8 @@ class Experiment:
                 "reading_range": [None if math.isinf(end) else end for end in self.reading_range],
                 "orientations_rad": list(self.orientations_rad),
                 "repeats": list(self.repeats),
+                "heights_mm": list(self.heights_mm),
+                "calibrated_height_mm": self.calibrated_height_mm,
                 "batch": self.batch,
                 "stop_sd_mm": self.stop_sd_mm,
                 "stop_probability": self.stop_probability,

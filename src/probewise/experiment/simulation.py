@@ -190,7 +190,8 @@ def arm_over(
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:
         rng = np.random.default_rng([seed, next(number)])
-        return world.read(surface, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng)
+        place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
+        return world.read(surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
     reach = Reach((field.width_mm, field.height_mm)) if workspace is None else workspace
-    return SimulatedArm(light, reach=reach, start_s=taken[-1].time_s if taken else 0.0)
+    return SimulatedArm(light, reach=reach, height_mm=world.height_mm, start_s=taken[-1].time_s if taken else 0.0)

@@ -87,8 +87,13 @@ class Designs:
 
     def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
         """Lay out one possible reading a design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
+        return replace(self._layout, pattern_names=(pattern_name,), time_s=np.full(len(self), time_s))
+
+    @cached_property
+    def _layout(self) -> Plan:
+        """The plan of all designs but for its time and the name of its pattern: thousands of names are made once."""
         n_places, n_designs = self.grid.n_places, len(self)
-        once = self.grid.plan(pattern_name, time_s=time_s)
+        once = self.grid.plan("")
         rows = np.tile(np.arange(n_places), len(self.combinations))
 
         def column(values: list[float]) -> FloatArray:

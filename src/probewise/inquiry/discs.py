@@ -32,7 +32,8 @@ _PROBE_MM = 80.0  # how far from the edge the model is asked at all
 _FLAT = 1e-5  # share of the levels' difference by which a level counts as that far from any edge
 _DIRECTIONS = 128
 _BENDS = 8
-_BLOCK = 256  # hypotheses at a time: the places near their edges stay in the cache
+_TINY = 1e-30
+_ROWS = 3  # of the grid at a time: what is weighed there stays in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,8 @@ class DiscTable:
         fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
         asked = np.stack([_asked(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
         asked = np.concatenate([asked, asked[:, :1]], axis=1)
-        return cls(dark, bright, margin, bends, frozen(CubicSpline(coarse, asked, axis=-1)(fine)))
+        levels = np.ascontiguousarray(CubicSpline(coarse, asked, axis=-1)(fine))  # so that it is flat for free
+        return cls(dark, bright, margin, bends, frozen(levels))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,18 +100,18 @@ class DiscTable:
         require_columns(theta, NAMES)
         away_x, away_y = plan.x_mm - theta[:, :1], plan.y_mm - theta[:, 1:2]
         distance = np.hypot(away_x, away_y) - theta[:, 2:]
-        out = np.where(distance <= 0.0, self.bright, self.dark)
-        near = np.abs(distance) < self.margin_mm
-        if not near.any():
+        out = np.asarray(self.dark + (self.bright - self.dark) * (distance <= 0.0), dtype=np.float64)
+        near = np.flatnonzero(np.abs(distance) < self.margin_mm)
+        if not near.size:
             return out
-        hypothesis, point = np.nonzero(near)
+        hypothesis, point = np.divmod(near, len(plan))
         cosine, sine = np.cos(plan.orientation_rad)[point], np.sin(plan.orientation_rad)[point]
-        x, y = away_x[near], away_y[near]
+        x, y, distance = (values.ravel()[near] for values in (away_x, away_y, distance))
         angle = _pseudo_angle(cosine * x + sine * y, cosine * y - sine * x)
         n_bends, n_directions, n_distances = self.levels.shape
         bend, along_bend = _cell((1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._per_bend, n_bends)
         turn, along_turn = _cell(angle * ((n_directions - 1) / 4.0), n_directions)
-        step, along = _cell((distance[near] + self.margin_mm) * self._per_mm, n_distances)
+        step, along = _cell((distance + self.margin_mm) * self._per_mm, n_distances)
         corner = (bend[hypothesis] * n_directions + turn) * n_distances + step
         along_bend = along_bend[hypothesis]
         flat = self.levels.reshape(-1)
@@ -123,7 +125,7 @@ class DiscTable:
             return np.asarray(low + along_turn * (between(first + n_distances) - low))
 
         low = ring(corner)
-        out[near] = low + along_bend * (ring(corner + n_directions * n_distances) - low)
+        np.put(out, near, low + along_bend * (ring(corner + n_directions * n_distances) - low))
         return out
 
     def mass(
@@ -149,25 +151,25 @@ class DiscTable:
         n_levels = len(levels)
         per_level = 1.0 / (levels[1] - levels[0])
         ends = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64)
-        nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int32)
+        nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int16)
         margin = self._margin_of(nearest, ends)
-        inside = np.zeros((grid.n_y, grid.n_x + 1))
-        keys, shares = [], []
-        for start in range(0, len(theta), _BLOCK):
-            block = slice(start, start + _BLOCK)
-            spans = _Spans.of(theta[block], grid, margin)
-            inside += spans.inside(weight[block])
+        mass = np.empty((grid.n_places, n_levels))
+        turn = turn_rad.reshape(grid.n_y, grid.n_x)
+        for start in range(0, grid.n_y, _ROWS):
+            rows = slice(start, start + _ROWS)
+            spans = _Spans.of(theta, grid, rows, margin)
+            own = mass[start * grid.n_x : (start + _ROWS) * grid.n_x]
             if margin > 0.0:
-                ring = spans.ring(theta[block])
-                keys.append(ring.place * n_levels + nearest.reshape(-1)[self._entry(ring, turn_rad)])
-                shares.append(weight[block][ring.hypothesis])
-        size = grid.n_places * n_levels
-        near = np.bincount(np.concatenate(keys), np.concatenate(shares), minlength=size) if keys else np.zeros(size)
-        mass = np.asarray(near, dtype=np.float64).reshape(grid.n_places, n_levels)
-        bright = np.cumsum(inside, axis=1)[:, :-1].ravel()
-        dark = weight.sum() - bright - mass.sum(axis=1)
-        mass[:, ends[1]] += bright
-        mass[:, ends[0]] += dark
+                ring = spans.ring()
+                key = ring.place * n_levels + nearest.reshape(-1)[self._entry(ring, turn[rows].ravel())]
+                near = np.bincount(key, weight[ring.hypothesis], minlength=own.size)
+                own[:] = near.reshape(own.shape)
+            else:
+                own[:] = 0.0
+            bright = spans.inside(weight)
+            dark = weight.sum() - bright - own.sum(axis=1)
+            own[:, ends[1]] += bright
+            own[:, ends[0]] += dark
         return mass
 
     def _margin_of(self, nearest: IntArray, ends: IntArray) -> float:
@@ -210,69 +212,69 @@ class DiscTable:
 
 @dataclass(frozen=True, eq=False)
 class _Spans:
-    """Grid columns that each disc covers in each row, (n_samples, n_y): first and last, in all and deep inside."""
+    """Where discs cross some rows of a grid, (n_spans,) each: which row, which disc, and columns there.
+
+    The row, counted from the first of them, is `up_mm` above the disc's centre. Columns from `first` to `last`
+    are in the disc or near its edge, those from `inner_first` to `inner_last` deep inside; where none is, these
+    are `last` + 1 and `last`. Single precision holds a place to a ten-thousandth of a millimetre.
+    """
 
     grid: Grid
+    n_rows: int
+    row: IntArray
+    hypothesis: IntArray
+    x_mm: FloatArray
+    up_mm: FloatArray
+    radius_mm: FloatArray
     first: IntArray
     last: IntArray
     inner_first: IntArray
     inner_last: IntArray
 
     @classmethod
-    def of(cls, theta: FloatArray, grid: Grid, margin_mm: float) -> Self:
-        x, radius = theta[:, :1], theta[:, 2:]
-        up = grid.y_mm - theta[:, 1:2]
-        per_mm = (grid.n_x - 1) / grid.width_mm
+    def of(cls, theta: FloatArray, grid: Grid, rows: slice, margin_mm: float) -> Self:
+        x, y, radius = theta.astype(np.float32).T
+        every_up = grid.y_mm[rows, None].astype(np.float32) - y
+        row, hypothesis = np.nonzero(np.abs(every_up) <= radius + np.float32(margin_mm))
+        x, radius, up = x[hypothesis], radius[hypothesis], every_up[row, hypothesis]
+        per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
 
         def columns(reach: FloatArray) -> tuple[IntArray, IntArray]:
-            square = reach * np.abs(reach) - up * up
-            half = np.sqrt(np.maximum(square, 0.0))
-            half[square < 0.0] = -2.0 / per_mm  # no column lies that far within itself
-            first = np.ceil(np.maximum((x - half) * per_mm, 0.0)).astype(np.int64)
-            last = np.floor(np.minimum((x + half) * per_mm, grid.n_x - 1.0)).astype(np.int64)
-            np.maximum(last, -1, out=last)
+            half = np.sqrt(np.maximum(reach * reach - up * up, 0.0))
+            first = np.ceil(np.maximum((x - half) * per_mm, 0.0)).astype(np.int32)
+            last = np.floor(np.clip((x + half) * per_mm, -1.0, grid.n_x - 1.0)).astype(np.int32)
             return np.minimum(first, last + 1), last
 
-        first, last = columns(radius + margin_mm)
-        inner_first, inner_last = columns(radius - margin_mm)
-        return cls(grid, first, last, inner_first, inner_last)
+        first, last = columns(radius + np.float32(margin_mm))
+        inner = np.maximum(radius - np.float32(margin_mm), 0.0)
+        inner_first, inner_last = columns(inner)
+        none = np.flatnonzero((np.abs(up) >= inner) | (inner_first > inner_last))
+        inner_first[none], inner_last[none] = last[none] + 1, last[none]
+        return cls(grid, len(every_up), row, hypothesis, x, up, radius, first, last, inner_first, inner_last)
 
-    def inside(self, share: FloatArray) -> FloatArray:
-        """Weight that begins (and, below zero, ends) at each column of each row, (n_y, n_x + 1)."""
-        n_y, width = self.grid.n_y, self.grid.n_x + 1
-        row = np.arange(n_y) * width
-        own = np.repeat(share, n_y)
-        begins = np.bincount((row + self.inner_first).ravel(), own, minlength=n_y * width)
-        ends = np.bincount((row + self.inner_last + 1).ravel(), own, minlength=n_y * width)
-        return np.asarray((begins - ends).reshape(n_y, width))
+    def inside(self, weight: FloatArray) -> FloatArray:
+        """Weight of the discs that each place of the rows lies deep in, (n_rows * n_x,)."""
+        width = self.grid.n_x + 1
+        own, size = weight[self.hypothesis], self.n_rows * width
+        begins = np.bincount(self.row * width + self.inner_first, own, minlength=size)
+        ends = np.bincount(self.row * width + self.inner_last + 1, own, minlength=size)
+        return np.cumsum((begins - ends).reshape(self.n_rows, width), axis=1)[:, :-1].ravel()
 
-    def ring(self, theta: FloatArray) -> _Ring:
-        """Pairs of hypothesis and place in the ring about the edge."""
-        used = np.flatnonzero(self.first <= self.last)
-        first, last = self.first.ravel()[used], self.last.ravel()[used]
-        inner_first, inner_last = self.inner_first.ravel()[used], self.inner_last.ravel()[used]
-        some = inner_first <= inner_last
-        left_last = np.where(some, inner_first - 1, last)
-        right_first = np.where(some, inner_last + 1, last + 1)
-        first = np.concatenate([first, right_first])
-        count = np.concatenate([left_last, last]) - first + 1
-        hypothesis, row = np.divmod(np.tile(used, 2), self.grid.n_y)
-        first = first - (np.cumsum(count) - count)
-        running = np.arange(int(count.sum()), dtype=np.int32)
-        column = np.repeat(first.astype(np.int32), count) + running
-        spacing = self.grid.width_mm / (self.grid.n_x - 1)
-
-        def each(values: FloatArray) -> FloatArray:
-            return np.repeat(values.astype(np.float32), count)
-
-        # Single precision holds a place to a ten-thousandth of a millimetre.
-        return _Ring(
-            np.repeat(hypothesis, count),
-            np.repeat(row.astype(np.int32) * self.grid.n_x, count) + column,
-            column.astype(np.float32) * np.float32(spacing) - each(theta[hypothesis, 0]),
-            each(self.grid.y_mm[row] - theta[hypothesis, 1]),
-            each(theta[hypothesis, 2]),
-        )
+    def ring(self) -> _Ring:
+        """Pairs of hypothesis and place in the ring about the edge: left of what is deep inside, then right of it."""
+        n = len(self.row)
+        count = np.concatenate([self.inner_first - self.first, self.last - self.inner_last])
+        begin = np.concatenate([self.first, self.inner_last + 1])
+        # Repeating is the slow step: it is done once, and everything else is looked up.
+        part = np.repeat(np.arange(2 * n), count)
+        column = (begin - np.cumsum(count, dtype=np.int32) + count)[part]
+        column += np.arange(len(part), dtype=np.int32)
+        part[int(count[:n].sum()) :] -= n
+        x = column.astype(np.float32)
+        x *= np.float32(self.grid.width_mm / (self.grid.n_x - 1))
+        x -= self.x_mm[part]
+        column += (self.row * self.grid.n_x).astype(np.int32)[part]
+        return _Ring(self.hypothesis[part], column, x, self.up_mm[part], self.radius_mm[part])
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,8 +290,8 @@ class _Ring:
 
 def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
     """Grow from 0 to 4 around the origin as an angle does, without a trigonometric function."""
-    across = x / np.maximum(np.abs(x) + np.abs(y), 1e-300)
-    return np.asarray(np.where(y >= 0.0, 1.0 - across, 3.0 + across))
+    across = x / np.maximum(np.abs(x) + np.abs(y), _TINY)
+    return np.asarray(2.0 - np.copysign(1.0 + across, y))
 
 
 def _direction(pseudo_angle: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.discs import DiscTable
 from probewise.inquiry.grid import Grid
+from probewise.inquiry.sight import Sight
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
@@ -90,7 +91,7 @@ class _DiscOutlook:
     levels: FloatArray
 
     def mass(self, weight: FloatArray) -> FloatArray:
-        """See `Outlook.mass`: one map for each way that the sensor stands; no other setting plays a part."""
+        """See `Outlook.mass`: one map for each way that the sensor stands; the table knows no other setting."""
         some = weight > 0
         maps: dict[bytes, FloatArray] = {}
         for turn in self.turns_rad:
@@ -142,7 +143,14 @@ def forecast_of(model: SensorModel) -> Forecast:
 
 
 def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
-    """Ask every hypothesis at every row of a long plan, block by block: (n_samples, n_points)."""
+    """Ask every hypothesis at every row of a long plan where it can show: (n_samples, n_points)."""
+    sight = Sight.of(model, theta, plan)
+    if sight is not None:
+        out = np.full((len(theta), len(plan)), sight.beside)
+        for rows, shown in sight.parts(plan):
+            if shown.size:
+                out[np.ix_(shown, rows)] = model.predict(theta[shown], plan.take(rows))
+        return out
     out = np.empty((len(theta), len(plan)))
     for start in range(0, len(plan), _BLOCK):
         block = np.arange(start, min(start + _BLOCK, len(plan)))

@@ -17,6 +17,7 @@ from probewise.recordings.plan import Plan
 __all__ = ["Goal", "Prospect"]
 
 _CELL = 0.75  # width of a cell, in sds of noise, of readings that are not rounded: hides 2 % of a nat, everywhere alike
+_SETTLED = 1.0 - 1e-7  # share of the hypotheses that predict one level, from which on it is certain
 _BLOCK = 512  # designs whose readings are weighed at a time: they stay in the cache
 
 
@@ -103,9 +104,14 @@ class Prospect:
         `mass` may be that of some hypotheses only; it is taken to one.
         """
         out = np.zeros(len(self.rows))
+        level = mass.argmax(axis=1)
+        settled = mass[np.arange(len(mass)), level] >= _SETTLED * mass.sum(axis=1)
         for rows, chance in self._chances:
-            for start in range(0, len(rows), _BLOCK):
-                block = rows[start : start + _BLOCK]
+            known = rows[settled[rows]]
+            out[known] = entropy_bits(chance)[level[known]]
+            rest = rows[~settled[rows]]
+            for start in range(0, len(rest), _BLOCK):
+                block = rest[start : start + _BLOCK]
                 part = mass[block].astype(np.float32)
                 part /= part.sum(axis=1, keepdims=True)
                 out[block] = entropy_bits(part @ chance)

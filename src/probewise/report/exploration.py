@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray
 from probewise.experiment import Experiment, Exploration, Step
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import information_gained, playing_field, png, posterior_widths
+from probewise.report.plots import grid_of_axes, information_gained, playing_field, png, posterior_widths
 from probewise.report.words import count, number, signed
 from probewise.scene import AnyOf, outlines
 
-__all__ = ["answer", "errors_text", "frame", "live_page", "steps_table", "view", "write_page"]
+__all__ = ["answer", "errors_text", "frame", "frame_of_both", "live_page", "steps_table", "view", "write_page"]
 
 
 def view(
@@ -72,6 +72,24 @@ def frame(
 ) -> bytes:
     """Draw the picture of one step as a PNG."""
     return png(view(step, experiment, readings, levels=levels, truth_mm=truth_mm), dpi=90)
+
+
+def frame_of_both(
+    views: Sequence[tuple[str, Step, Experiment]],
+    readings: Sequence[tuple[float, float, float]],
+    *,
+    levels: tuple[float, float],
+    truth_mm: FloatArray | None = None,
+) -> bytes:
+    """Draw what several sensor models make of the same readings side by side (the paper's panels) as a PNG.
+
+    Each view is a title, a step and the experiment it belongs to; the rest is as in `view`.
+    """
+    axes = grid_of_axes(1, len(views), size_in=(7.2 * len(views), 4.2))
+    for ax, (title, step, experiment) in zip(axes[0], views, strict=True):
+        known = f"{title}, {count(step.number, 'reading')}, {number(step.bits, 1)} bits"
+        view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
+    return png(axes, dpi=75)
 
 
 def live_page(step: Step, picture: bytes) -> str:
@@ -133,7 +151,13 @@ def steps_table(run: Exploration) -> Markup:
 
 
 def write_page(
-    run: Exploration, frames: Sequence[bytes], *, seed: int, model: str, truth: Mapping[str, float] | None = None
+    run: Exploration,
+    frames: Sequence[bytes],
+    *,
+    seed: int,
+    model: str,
+    truth: Mapping[str, float] | None = None,
+    beside: Mapping[str, Sequence[Step]] | None = None,
 ) -> str:
     """Write the whole page.
 
@@ -147,7 +171,10 @@ def write_page(
         Seed of the run and name of the sensor model.
     truth
         Parameters of what lay there, by name, where it is known.
+    beside
+        What other sensor models made of the same readings, step by step, by name of the model.
     """
+    runs = {f"{model} model": run.steps} | {f"{name} model": steps for name, steps in (beside or {}).items()}
     facts = [
         ("sensor model", model),
         ("stopped because", run.stop_reason),
@@ -158,7 +185,6 @@ def write_page(
     ]
     if truth:
         facts.insert(2, ("error against the truth", errors_text(run.last, truth)))
-    name = f"{model} model"
     sections = [
         Section("The run", (definition_list(facts), *(paragraph(f"Doubtful: {note}.") for note in run.notes))),
         Section(
@@ -167,13 +193,14 @@ def write_page(
                 figure(
                     png(
                         posterior_widths(
-                            {name: np.array([s.widest_mm for s in run.steps])}, target_mm=run.experiment.stop_sd_mm
+                            {name: np.array([s.widest_mm for s in steps]) for name, steps in runs.items()},
+                            target_mm=run.experiment.stop_sd_mm,
                         )
                     ),
                     "Widest posterior sd after each reading, and the precision asked for.",
                 ),
                 figure(
-                    png(information_gained({name: np.array([s.bits for s in run.steps])})),
+                    png(information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()})),
                     "Information about the shape: prior minus posterior differential entropy.",
                 ),
                 steps_table(run),
@@ -191,6 +218,7 @@ def write_page(
         "The robot's view of the field: in copper where a reading would tell most, blue the 50 hypotheses drawn from "
         "what is believed, squares the readings by their brightness, green the place chosen next"
         + (", dashed white what really lies there." if truth else ".")
+        + (f" Beside it what the {' and the '.join(beside)} model makes of the same readings." if beside else "")
     )
     return page("The robot's search", answer=answer(run), key_figure=figure(frames[-1], caption), sections=sections)
 

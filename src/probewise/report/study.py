@@ -5,20 +5,23 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 
+from probewise.experiment import least_readings
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import png, readings_needed, widths_of_runs
 from probewise.report.words import count, number
-from probewise.study import REFERENCE, Estimate, Row, Study, Summary
+from probewise.study import REFERENCE, Estimate, Row, Study, Summary, experiment_of
 
-__all__ = ["answer", "table_csv", "table_of_rows", "write_page"]
+__all__ = ["answer", "table_csv", "table_of_bounds", "table_of_rows", "write_page"]
 
 _COLUMNS: tuple[tuple[str, str], ...] = (
     ("reached", "share that reached the precision, 95 % interval"),
     ("mean", "mean readings, standard error (a miss counted as the limit)"),
     ("median", "median readings, 95 % interval"),
+    ("to_white", "mean readings up to the first on white, standard error (none counted as the limit)"),
     ("after_white", "mean readings after the first on white, standard error"),
     ("bits_each", "bits a reading, standard error"),
     ("held", "share of 95 % intervals that hold the truth, standard error"),
@@ -44,6 +47,7 @@ def table_of_rows(study: Study) -> Markup:
         "reached",
         "mean",
         "median (95 %)",
+        "to white",
         "after white",
         "bits a reading",
         "error (mm)",
@@ -53,6 +57,19 @@ def table_of_rows(study: Study) -> Markup:
         "cpu a decision (s)",
     )
     return table(header, (_line(row, found) for row, found in study.table().items()))
+
+
+def table_of_bounds(study: Study) -> Markup:
+    """Build the table of the fewest readings that any strategy could do with on average, beside what was measured."""
+    lines = []
+    for row, found in study.table().items():
+        if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
+            least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
+            search = _over(least.search_bits, least.search_capacity_bits)
+            refinement = _over(least.refinement_bits, least.capacity_bits)
+            lines.append((row.name, search, _shown(found.to_white), refinement, _shown(found.after_white)))
+    header = ("row", "to white, at least (bits over bits a reading)", "measured", "from there, at least", "measured")
+    return table(header, lines)
 
 
 def table_csv(study: Study) -> str:
@@ -88,6 +105,11 @@ def write_page(study: Study, *, command: str) -> str:
             "Widest posterior sd against the number of readings: median and middle 68 % of the runs.",
         )
         sections.insert(0, Section("How fast", (drawn,)))
+    bounds = paragraph(
+        "Bits needed over the most that a reading can carry. Until the first reading on white that is a yes or no, "
+        "yes as often as the best place is covered; from there to the precision asked for, the sensor's capacity."
+    )
+    sections.append(Section("The least that any strategy needs", (table_of_bounds(study), bounds)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
     return page("How many measurements?", answer=answer(study), key_figure=needed, sections=sections)
 
@@ -108,6 +130,7 @@ def _line(row: Row, found: Summary) -> tuple[str, ...]:
         f"{number(100 * found.reached.high, 1)})",
         _shown(found.mean),
         f"{found.median.value:g} ({found.median.low:g} to {found.median.high:g})",
+        _shown(found.to_white),
         _shown(found.after_white),
         _shown(found.bits_each, 2),
         number(found.error_mm, 1),
@@ -116,6 +139,10 @@ def _line(row: Row, found: Summary) -> tuple[str, ...]:
         _shown(found.arm_s, 0),
         number(found.cpu_s, 2),
     )
+
+
+def _over(bits: float, capacity_bits: float) -> str:
+    return f"{number(bits / capacity_bits, 1)} = {number(bits, 1)} / {number(capacity_bits, 2)}"
 
 
 def _shown(estimate: Estimate, digits: int = 1) -> str:

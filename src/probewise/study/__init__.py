@@ -8,7 +8,7 @@ from probewise.study.circles import POPULATIONS, Population, noise_of
 from probewise.study.rows import REFERENCE, Row, standard_rows
 from probewise.study.run import Study, read_study, run_study
 from probewise.study.table import Estimate, Summary, share_within, summarise
-from probewise.study.trial import Trial, experiment_of, run_trial
+from probewise.study.trial import Trial, arm_of, experiment_of, run_trial
 
 __all__ = [
     "POPULATIONS",
@@ -19,6 +19,7 @@ __all__ = [
     "Study",
     "Summary",
     "Trial",
+    "arm_of",
     "experiment_of",
     "noise_of",
     "read_study",

@@ -46,6 +46,8 @@ class Summary:
         Share of runs that came to know every length within the limit of readings, with its 95 % interval.
     mean, median
         Readings needed, a miss counted as the limit; the mean's standard error, the median's 95 % interval.
+    to_white
+        Readings up to the first one on white, a run without one counted as the limit.
     after_white
         Readings after the first one on white, of runs that reached the end.
     bits_each
@@ -68,6 +70,7 @@ class Summary:
     reached: Estimate
     mean: Estimate
     median: Estimate
+    to_white: Estimate
     after_white: Estimate
     bits_each: Estimate
     error_mm: float
@@ -92,6 +95,7 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
     sure = [t for t in trials if t["reached"]]
     needed = np.array([t["readings"] if t["reached"] else max_readings for t in trials], dtype=np.float64)
     after = [t["readings"] - t["first_white"] for t in sure if t["first_white"] is not None]
+    met = np.array([max_readings if t["first_white"] is None else t["first_white"] for t in trials], dtype=np.float64)
     errors = np.array([t["error_mm"] for t in sure])
     expected = float(sum(t["chance_wrong"] for t in sure))
     return Summary(
@@ -99,6 +103,7 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
         reached=share_within(len(sure), len(trials)),
         mean=_mean(needed),
         median=_median(needed),
+        to_white=_mean(met),
         after_white=_mean(np.array(after, dtype=np.float64)),
         bits_each=_mean(np.array([t["bits"] / t["readings"] for t in trials])),
         error_mm=float(np.median(errors)) if len(errors) else math.nan,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, World, gaussian_spot
 
-__all__ = ["Trial", "experiment_of", "run_trial"]
+__all__ = ["Trial", "arm_of", "experiment_of", "run_trial"]
 
 _SEED = 2013
 # The study's sensor: one Gaussian, mm and LEGO units; the same numbers for the robot and, by pixels, for the world.
@@ -46,9 +47,15 @@ class Trial:
         """Name it in the campaign's file."""
         return f"{self.row.name} / {self.circle}"
 
+    @property
+    def truth(self) -> FloatArray:
+        """The circle: x_mm, y_mm, radius_mm, (3,)."""
+        return np.asarray(POPULATIONS[self.row.population].circles(self.circle + 1)[self.circle])
 
+
+@lru_cache(maxsize=16)
 def experiment_of(row: Row) -> Experiment:
-    """Pose what the robot of a row believes and wants."""
+    """Pose what the robot of a row believes and wants; once a process, with its tables."""
     scene = HypothesisScene(POPULATIONS[row.population].shape)
     common: dict[str, Any] = {
         "noise_sd": row.noise_sd,
@@ -84,9 +91,8 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     (`held`), seconds of arm time (`arm_s`), median processor time a decision (`cpu_s`), the widest posterior sd
     after each reading (`widest_mm`), and the fit (`p_value`).
     """
-    truth = POPULATIONS[trial.row.population].circles(trial.circle + 1)[trial.circle]
     experiment = experiment_of(trial.row)
-    arm = _arm_over(truth, trial)
+    arm = arm_of(trial)
     rng = np.random.default_rng([_SEED, trial.circle])
     widest, cpu, first_white, bits_at_white = [], [], None, None
     with arm:
@@ -107,7 +113,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         "first_white": first_white,
         "bits": round(last.bits, 3),
         "bits_at_white": bits_at_white,
-        **_judged(last, experiment, truth),
+        **_judged(last, experiment, trial.truth),
         "arm_s": round(last.reading.time_s, 2),
         "cpu_s": round(float(np.median(cpu)), 4),
         "widest_mm": widest,
@@ -131,11 +137,12 @@ def _judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, 
     }
 
 
-def _arm_over(truth: FloatArray, trial: Trial) -> SimulatedArm:
+def arm_of(trial: Trial) -> SimulatedArm:
     """Stand an arm that reaches the whole grid over the circle, with the noise that every row meets there."""
     spot = gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
     world = World(spot, black=_DARK, white=_BRIGHT, noise_sd=0.0)
-    disc = Disc((float(truth[0]), float(truth[1])), float(truth[2]))
+    x_mm, y_mm, radius_mm = trial.truth.tolist()
+    disc = Disc((x_mm, y_mm), radius_mm)
     noise, number = noise_of(trial.circle, trial.max_readings), itertools.count()
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:

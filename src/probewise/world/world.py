@@ -101,6 +101,7 @@ class World:
         time_s: float,
         rng: np.random.Generator | None,
         direction: tuple[float, float] = (0.0, 0.0),
+        height_mm: float | None = None,
     ) -> float:
         """Take one reading over a surface, as an arm does.
 
@@ -116,6 +117,8 @@ class World:
             Where the noise comes from; None: a reading without noise.
         direction
             Unit vector of the move that brought it there, for backlash.
+        height_mm
+            How high the sensor stands; None: where the spot and the levels belong.
         """
         rows = Rows(
             place_mm=np.array([[x_mm, y_mm]]),
@@ -128,7 +131,7 @@ class World:
             across=np.array([across_edge(surface)]),
             edge_mm=edge_distance(surface, np.array([x_mm]), np.array([y_mm])),
         )
-        look = self._look([(surface, np.zeros(1, dtype=np.int64))], rows)
+        look = self._look([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
         return float(self._noisy(look, rng)[0])
 
     def look(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> Look:
@@ -198,12 +201,12 @@ class World:
         """
         return Recording(plan, self._noisy(self.look(plan, surfaces) if look is None else look, rng))
 
-    def _look(self, surfaces: _Surfaces, sent: Rows) -> Look:
+    def _look(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> Look:
         place = self._changed("place", sent.place_mm, sent)
         there = replace(sent, place_mm=place, orientation_rad=self._changed("turn", sent.orientation_rad, sent))
         pattern = self._changed("pattern", np.zeros_like(place), there)
         center = place + self._changed("tilt", np.zeros_like(place), there)
-        scale = self._changed("height", np.full(len(place), self.height_mm), there) / self.height_mm
+        scale = self._changed("height", np.full(len(place), height_mm or self.height_mm), there) / self.height_mm
         if scale.min() <= 0:
             raise ParameterError("height_mm", float(scale.min() * self.height_mm), "greater than 0 at every reading")
         retouch = self._retouched if any(isinstance(effect, Retouches) for effect in self.concealed) else None

@@ -52,20 +52,23 @@ def widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float
     return towards_target(ax, target_mm)
 
 
-def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:
+def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None) -> AxesGrid:
     """Draw what each row of a study needs: mean and median in all, and after the first reading on white.
 
     Parameters
     ----------
     rows
         Summary by name, drawn from the top in this order.
+    axes
+        Axes to draw on, (1, 2), with one y axis; a new figure without.
 
     Returns
     -------
     Axes, (1, 2).
     """
     names = list(rows)
-    axes = grid_of_axes(1, 2, size_in=(9.0, 1.2 + 0.34 * len(names)), sharey=True)
+    if axes is None:
+        axes = grid_of_axes(1, 2, size_in=(9.0, 1.2 + 0.34 * len(names)), sharey=True)
     y = np.arange(len(names))
     for ax, parts, title in (
         (axes[0, 0], (("mean", BLUE, -0.14), ("median", VERMILLION, 0.14)), "in all"),

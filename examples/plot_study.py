@@ -1,0 +1,43 @@
+"""
+How many measurements the robot needs
+=====================================
+
+Shows what each row of the published study needs: in all, and after the first reading on white. The numbers are
+measured by ``probewise study`` over hundreds of circles and stored; nothing random is drawn here.
+"""
+
+# %%
+import csv
+from pathlib import Path
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+
+from probewise.report.plots import readings_needed
+from probewise.study import Estimate
+
+file = next(p for p in (Path("docs"), Path("../docs")) if p.is_dir()) / "results" / "study.csv"
+with file.open(encoding="utf-8", newline="") as lines:
+    rows = list(csv.DictReader(lines))
+
+
+def estimate(row, name):
+    """Take a number and its bounds from a row of the table."""
+    return Estimate(*(float(row[name + end]) for end in ("", "_low", "_high")))
+
+
+# %%
+# A run that does not reach the precision within 100 readings counts as 100.
+for row in rows:
+    print(f"{row['row']}: {row['runs']} runs, mean {estimate(row, 'mean')}, after white {estimate(row, 'after_white')}")
+
+# %%
+# Every row looks for the same circles and meets the same noise; each differs in one thing from the first.
+needed = {
+    f"{row['row']} ({row['runs']})": SimpleNamespace(
+        **{name: estimate(row, name) for name in ("mean", "median", "after_white")}
+    )
+    for row in rows
+}
+_, axes = plt.subplots(1, 2, figsize=(9, 1.2 + 0.34 * len(needed)), sharey=True, squeeze=False, layout="constrained")
+readings_needed(needed, axes=axes)

@@ -1,0 +1,64 @@
+"""Where a sensor can see a shape at all: elsewhere it reads what it reads beside it, and need not be asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.recordings.plan import Plan
+from probewise.scene import EllipseRegion, HypothesisScene, MixtureOfRegions, PolygonRegion, outlines
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor.commanded import is_commanded
+from probewise.sensor.stages import SensorModel
+
+__all__ = ["Sight"]
+
+_REACH = 6.0  # sds of a footprint beyond which it sees nothing: 1e-9 of the levels' difference
+_TILE_MM = 110.0
+_FAR_MM = 1e5
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Bounds about each hypothesis, `low_mm` and `high_mm`, (n_samples, 2); outside the reading is `beside`."""
+
+    low_mm: FloatArray
+    high_mm: FloatArray
+    beside: float
+
+    @classmethod
+    def of(cls, model: SensorModel, theta: FloatArray, plan: Plan) -> Self | None:
+        """Bound what hypotheses, (n_samples, n_params), can show; None for a model whose readings depend on more.
+
+        A known mixture, known levels and no effects leave nothing but the shape to make a difference.
+        """
+        if not isinstance(model, Chain) or model.effects or is_commanded(plan) or len(plan) == 0:
+            return None
+        if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
+            return None
+        if not isinstance(model.scene, HypothesisScene):
+            return None
+        region = model.scene.shape.region(theta)
+        if not isinstance(region, (EllipseRegion, PolygonRegion, MixtureOfRegions)):
+            return None
+        sds = np.sqrt(np.linalg.eigvalsh(model.ssf.covs_mm2)[:, -1])
+        reach = float((np.linalg.norm(model.ssf.means_mm, axis=1) + _REACH * sds).max())
+        edges = outlines(region)
+        low, high = (np.array([f(edge, axis=0) for edge in edges]) for f in (np.nanmin, np.nanmax))
+        one = plan.take(np.array([0]))
+        beside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
+        return cls(frozen(low - reach), frozen(high + reach), float(beside))
+
+    def parts(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
+        """Split a plan into tiles of the field: rows of the plan, and the hypotheses that show something there."""
+        column, row = (np.floor(place / _TILE_MM).astype(np.int64) for place in (plan.x_mm, plan.y_mm))
+        tiles = np.unique(np.stack([column, row]), axis=1, return_inverse=True)[1].ravel()
+        order = np.argsort(tiles, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(tiles[order])) + 1):
+            place = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
+            meets = (self.low_mm <= place.max(axis=0)).all(axis=1) & (self.high_mm >= place.min(axis=0)).all(axis=1)
+            yield rows, np.flatnonzero(meets)

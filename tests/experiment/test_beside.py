@@ -1,0 +1,37 @@
+"""What another sensor model makes of the readings that a run has taken."""
+
+import numpy as np
+import pytest
+
+from probewise.experiment import Field, beside, explore
+from probewise.inquiry import Grid
+
+COARSE = Grid(400.0, 300.0, 17, 13)
+
+
+def steps_of(small, **options):
+    return explore(small.arm(), small.experiment(grid=COARSE, **options), rng=np.random.default_rng(1), max_readings=6)
+
+
+def watched(small, other):
+    field = Field.under(small.arm(), COARSE)
+    return list(beside(steps_of(small), other, field, rng=np.random.default_rng(2)))
+
+
+def test_the_same_model_comes_to_believe_the_same(small):
+    """Two routes to one posterior: along the run's own choices, and by looking on; 600 samples each."""
+    own, other = watched(small, small.experiment(grid=COARSE))[-1]
+    assert other.mean == pytest.approx(own.mean, abs=6 * float(own.sd.max()) / np.sqrt(300))
+    assert other.log_z == pytest.approx(
+        own.log_z, abs=6 * np.hypot(own.posterior.log_z_error, other.posterior.log_z_error)
+    )
+
+
+def test_the_run_goes_its_way_whoever_looks_on(small):
+    alone = list(steps_of(small))
+    pairs = watched(small, small.experiment(grid=COARSE, blur_mm=0.0, doubt_p=0.0))
+    assert [own.reading for own, _ in pairs] == [step.reading for step in alone]
+    assert [own.mean.tolist() for own, _ in pairs] == [step.mean.tolist() for step in alone]
+    assert [other.reading for _, other in pairs] == [own.reading for own, _ in pairs]
+    assert [other.number for _, other in pairs] == list(range(1, len(alone) + 1))
+    assert pairs[-1][1].mean.tolist() != pairs[-1][0].mean.tolist()

@@ -38,4 +38,6 @@ def hypothesis_probabilities(
         ax.annotate(f"{p:.3f}", (p, float(y)), xytext=(4, 0), textcoords="offset points", va="center", fontsize="small")
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in shown])
     ax.set_xlim(0, 1.12)
+    # Room for four bars at least, so that one alone is no wall.
+    ax.set_ylim(min(-0.5, len(shown) - 4.5), len(shown) - 0.5)
     return tidy(ax, x="probability", y="")

@@ -212,3 +212,18 @@ def test_an_earlier_sensor_is_taken_as_the_prior():
     # Twice the readings: every level and place is known better by about the square root of two.
     ratio = again.repaired.theta.std(axis=0)[1:3] / first.repaired.theta.std(axis=0)[1:3]
     np.testing.assert_allclose(ratio, math.sqrt(0.5), rtol=0.25)
+
+
+@pytest.mark.slow
+def test_what_has_a_name_of_our_own_is_unknown_and_its_repair_predicts():
+    """The paper slips; the model that finds it moves the arm instead, and no name of the vocabulary is given."""
+    half_way_s = float(np.median(two_way_plan().time_s))
+    pushed = recording("two_way", hidden.SlippedPaper(1.5, half_way_s))
+    found = diagnose(pushed, rng=np.random.default_rng(0))
+    document = strict(found)
+    assert found.verdict == "unknown"
+    assert found.combination == ("unknown",)
+    assert document["unknown_candidates"][0]["name"] == "arm_knock"
+    assert found.repaired.effects == ("arm_knock",)
+    assert found.improvement.rms_after < 1.1 * NOISE_SD
+    assert found.improvement.p_value_after > 0.001

@@ -240,7 +240,7 @@ def test_a_bump_is_found_where_it_is():
     assert found[0].start == pytest.approx(60, abs=8)
     assert found[0].end == pytest.approx(75, abs=8)
     assert found[0].p_value < 0.01
-    assert found[0].witness == "witness_time.png"
+    assert found[0].witness == "witness_time.svg"
     assert found[0].curve_mean.max() > 1.0
 
 

@@ -9,24 +9,29 @@ import numpy as np
 import pytest
 
 from probewise.effects import (
+    UNNAMED,
     VOCABULARY,
     AlbedoGradient,
     AmbientGradient,
     AmbientStep,
+    ArmKnock,
     Backlash,
     CorrelatedNoise,
     EdgeMisplacement,
     Extent,
     Flicker,
     GainDrift,
+    GainStep,
     Glint,
     Halo,
     HeavyTailed,
     HeightOffset,
     Lag,
     LogHeavyTailed,
+    MissingTooth,
     Nonlinearity,
     PeriodicPositionError,
+    Reflection,
     Saturation,
     ScanAngleError,
     ScanMisplacement,
@@ -63,9 +68,12 @@ def base() -> Chain:
     )
 
 
-@pytest.mark.parametrize("name", VOCABULARY)
+EFFECTS = {**VOCABULARY, **UNNAMED}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_keeps_the_contract(name):
-    effect = VOCABULARY[name].for_extent(EXTENT)
+    effect = EFFECTS[name].for_extent(EXTENT)
     names = effect.prior.names
     assert effect.name == name
     assert isinstance(effect.stage, Stage)
@@ -82,13 +90,13 @@ def test_every_effect_keeps_the_contract(name):
         assert any(c.isdigit() for c in said)
         assert all(scan in said for scan in variant.scans)
         assert len(variant.variants()) == len(effect.variants())
-    VOCABULARY[name]()  # a sensor file needs its function only, whatever the prior's scale
+    EFFECTS[name]()  # a sensor file needs its function only, whatever the prior's scale
 
 
-@pytest.mark.parametrize("name", [name for name, kind in VOCABULARY.items() if kind.stage is not Stage.NOISE])
+@pytest.mark.parametrize("name", [name for name, kind in EFFECTS.items() if kind.stage is not Stage.NOISE])
 def test_every_setting_of_every_bank_changes_finite_readings(name):
     """And what is an amplitude does nothing at zero."""
-    effect = VOCABULARY[name].for_extent(EXTENT)
+    effect = EFFECTS[name].for_extent(EXTENT)
     plain = base().predict(np.zeros((1, 0)), PLAN)
     changed = 0.0
     for variant in effect.variants()[:: max(len(effect.variants()) // 6, 1)]:
@@ -105,10 +113,10 @@ def test_every_setting_of_every_bank_changes_finite_readings(name):
     assert changed > 1e-3
 
 
-@pytest.mark.parametrize("name", VOCABULARY)
+@pytest.mark.parametrize("name", EFFECTS)
 def test_a_prior_maps_the_unit_cube_to_its_own_density(name):
     """Route one: the density; route two: the determinant of the way back to the cube, by central differences."""
-    prior = VOCABULARY[name].for_extent(EXTENT).prior
+    prior = EFFECTS[name].for_extent(EXTENT).prior
     n_params = len(prior.names)
     u = np.random.default_rng(1).uniform(0.1, 0.9, (50, n_params))
     theta = prior.from_unit_cube(u)
@@ -238,6 +246,39 @@ def test_the_moments_of_a_step_lie_between_the_readings():
         readings = variant.apply(np.zeros((1, 408)), np.array([[2.0, low + 0.1], [2.0, high - 0.1]]), paper_plan())
         np.testing.assert_array_equal(readings[0], readings[1])
         np.testing.assert_array_equal(readings[0], 2.0 * (paper_plan().time_s >= high))
+
+
+@pytest.mark.parametrize("kind", [AmbientStep, ArmKnock, GainStep])
+def test_gates_open_what_each_variant_acts_on(kind):
+    """Route one: everywhere, and the gate; route two: each variant by itself."""
+    effect = kind.for_extent(EXTENT).coarse()
+    gates = effect.gates(PLAN)
+    plain = base().predict(np.zeros((1, 0)), PLAN)
+    everywhere = base().with_effects(effect).predict(gates.always, PLAN) - plain
+    for k in (0, 7, len(gates.opened) - 1):
+        variant = effect.variants()[k]
+        own = base().with_effects(variant).predict(variant.bank()[0], PLAN) - plain
+        np.testing.assert_allclose(everywhere * gates.opened[k], own, atol=1e-12)
+
+
+def test_a_reflection_is_the_same_scene_seen_from_beside():
+    reflection = Reflection.for_extent(EXTENT)
+    share, dx_mm, dy_mm = 0.3, 4.0, -2.5
+    seen = base().with_effects(reflection).predict(np.array([[share, dx_mm, dy_mm]]), PLAN)
+    beside = replace(PLAN, x_mm=PLAN.x_mm + dx_mm, y_mm=PLAN.y_mm + dy_mm)
+    nothing = np.zeros((1, 0))
+    expected = (1 - share) * base().predict(nothing, PLAN) + share * base().predict(nothing, beside)
+    np.testing.assert_allclose(seen, expected, atol=1e-9)
+
+
+def test_a_missing_tooth_moves_what_lies_beyond_it_along_its_axis_alone():
+    tooth = MissingTooth.for_extent(EXTENT)
+    for axis, name in enumerate(("x_mm", "y_mm")):
+        at_mm = float(np.median(getattr(PLAN, name)))
+        own = getattr(PLAN, name)
+        moved = replace(PLAN, **{name: own + 0.7 * (own > at_mm)})
+        seen = base().with_effects(tooth).predict(np.array([[0.7, at_mm, float(axis)]]), PLAN)
+        np.testing.assert_allclose(seen, base().predict(np.zeros((1, 0)), moved), atol=1e-9)
 
 
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():

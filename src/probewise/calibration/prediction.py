@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray
-from probewise.calibration.density import log_cell_density, log_gaussian_density
+from probewise._arrays import BoolArray, FloatArray
 from probewise.calibration.distinct import DistinctRows
 from probewise.calibration.sensor_file import FittedSensor
+from probewise.effects import log_density, variance
 from probewise.errors import DoubtfulResultWarning, ShapeError
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.scene import KnownScene
+from probewise.sensor import NoiseLevel
 
 __all__ = ["predict"]
 
@@ -25,11 +27,13 @@ _BLOCK = 4_000_000
 def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[float] | None = None) -> Prediction:
     """Predict every row of a plan, and score its readings where there are any.
 
-    Mean and sd are those of one new reading, parameter uncertainty and noise together. The density
-    is the mixture, over the posterior samples, of a Gaussian with that sample's prediction and
-    pooled noise sd; where the plan declares a quantisation step, the mass of the reading's cell
-    divided by the step. Each row is scored alone. New patterns, scans and angles are predicted like
-    any other; an effect that belongs to one scan plays no part (see `FittedSensor.chain`).
+    Mean and sd are those of one new reading that is not lost, parameter uncertainty and noise together.
+    The density is the mixture, over the posterior samples, of the law of that sample's noise about its
+    prediction: normal with the pooled sd, and as the sensor's effects on the noise have it (a tail,
+    losses, a spread that follows the signal). Where the plan declares a quantisation step, or the sensor
+    has one, it is the mass of the reading's cell divided by the step. Each row is scored alone. New
+    patterns, scans and angles are predicted like any other; an effect that belongs to one scan plays no
+    part (see `FittedSensor.chain`).
 
     Parameters
     ----------
@@ -73,29 +77,33 @@ def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[fl
     n_samples, n_points = len(theta), len(plan)
     per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))
 
-    total, squares, variance = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
+    total, squares, of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
     log_sum = np.full(int(scored.sum()), -np.inf)
     center: FloatArray | None = None
     for first in range(0, n_samples, per_block):
         block = slice(first, first + per_block)
         mean = model.predict(theta[block], plan)
-        sd = np.broadcast_to(chain.noise_level(theta[block], plan, sensor.noise_sd[block, None]).sd, mean.shape)
+        level = chain.noise_level(theta[block], plan, sensor.noise_sd[block, None])
         if center is None:
             center = mean.mean(axis=0)  # Sums about a nearby value keep their digits.
         total += (mean - center).sum(axis=0)
         squares += ((mean - center) ** 2).sum(axis=0)
-        variance += (sd**2).sum(axis=0)
+        of_noise += np.broadcast_to(variance(level), mean.shape).sum(axis=0)
+        if step is not None:  # the pooled sd holds what a declared rounding adds
+            level = replace(level, step=np.full((1, 1), step))
         if log_sum.size:
-            at = recorded[scored]
-            log_p = (
-                log_gaussian_density(at, mean[:, scored], sd[:, scored])
-                if step is None
-                else log_cell_density(at, mean[:, scored], sd[:, scored], step)
-            )
+            log_p = log_density(_of_rows(level, scored), recorded[scored], mean[:, scored])
             log_sum = np.logaddexp(log_sum, np.logaddexp.reduce(log_p, axis=0))
     shift = total / n_samples
     spread = np.maximum(squares / n_samples - shift**2, 0.0)
-    log_density = np.full(n_points, np.nan)
-    log_density[scored] = log_sum - math.log(n_samples)
+    scores = np.full(n_points, np.nan)
+    scores[scored] = log_sum - math.log(n_samples)
     base = np.zeros(n_points) if center is None else center
-    return Prediction(plan, base + shift, np.sqrt(spread + variance / n_samples), log_density)
+    return Prediction(plan, base + shift, np.sqrt(spread + of_noise / n_samples), scores)
+
+
+def _of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
+    """Keep the noise of some rows."""
+    if level.sd.shape[-1] == 1:
+        return level
+    return replace(level, sd=level.sd[:, rows])

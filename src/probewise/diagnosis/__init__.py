@@ -8,7 +8,7 @@ the gain is shown on readings kept back.
 from probewise.diagnosis.audit import Alias, NextMeasurement
 from probewise.diagnosis.audit_document import CURE_PLAN, audit_json
 from probewise.diagnosis.document import diagnosis_json, diagnosis_schema
-from probewise.diagnosis.engine import SensorPrior, diagnose
+from probewise.diagnosis.engine import SensorPrior, Thorough, diagnose
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.null import Null
@@ -16,6 +16,7 @@ from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.own_model import OwnModel, Parameters
 from probewise.diagnosis.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
 from probewise.diagnosis.repaired import ModelSamples
+from probewise.diagnosis.thorough import weigh_thoroughly
 from probewise.diagnosis.unknown_shape import SensorAndShape
 from probewise.diagnosis.verdict import (
     Diagnosis,
@@ -26,6 +27,7 @@ from probewise.diagnosis.verdict import (
     ParameterFound,
     Verdict,
 )
+from probewise.diagnosis.weighing import Weighing
 
 __all__ = [
     "CURE_PLAN",
@@ -49,7 +51,9 @@ __all__ = [
     "SensorAndShape",
     "SensorPrior",
     "Smallest",
+    "Thorough",
     "Verdict",
+    "Weighing",
     "audit_json",
     "audit_plan",
     "audit_recorded",
@@ -57,4 +61,5 @@ __all__ = [
     "diagnosis_json",
     "diagnosis_schema",
     "join",
+    "weigh_thoroughly",
 ]

@@ -7,6 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 from probewise.diagnosis.verdict import Diagnosis, ParameterFound
+from probewise.diagnosis.weighing import Weighing
 
 __all__ = ["diagnosis_json", "diagnosis_schema"]
 
@@ -27,7 +28,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     command line.
     """
     gain, plan = diagnosis.improvement, diagnosis.next_measurement
-    return {
+    document = {
         "format": "diagnosis/1",
         "verdict": diagnosis.verdict,
         "reason": diagnosis.reason,
@@ -86,6 +87,18 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "minutes": plan.minutes,
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,
         },
+    }
+    return document | ({"thorough": [_weighing(w) for w in diagnosis.weighings]} if diagnosis.weighings else {})
+
+
+def _weighing(twice: Weighing) -> dict[str, Any]:
+    return {
+        "effects": list(twice.effects),
+        "n_gaussians": twice.n_gaussians,
+        "log_evidence_laplace": twice.laplace,
+        "log_evidence_nested": twice.nested,
+        "error": twice.error,
+        "agree": twice.agree,
     }
 
 

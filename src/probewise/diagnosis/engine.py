@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -45,13 +45,19 @@ from probewise.diagnosis.verdict import (
     decide,
 )
 from probewise.diagnosis.weighed import Candidate, Search
-from probewise.effects import NUISANCES, VOCABULARY, Extent, NamedEffect
+from probewise.diagnosis.weighing import Weighing, with_agreement
+from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
 
-__all__ = ["SensorPrior", "diagnose"]
+__all__ = ["SensorPrior", "Thorough", "diagnose"]
+
+Names = tuple[str, ...]
+
+Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
+"""Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
 
 N_DRAWS = 999
 _LEAST_PROBABILITY = 1e-3
@@ -79,6 +85,7 @@ def diagnose(
     sensor: SensorPrior | None = None,
     null: Null | None = None,
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    thorough: Thorough | None = None,
     rng: np.random.Generator,
 ) -> Diagnosis:
     """Tell what physics the sensor model leaves out of these recordings.
@@ -94,7 +101,10 @@ def diagnose(
         What is to be diagnosed instead of a calibrated sensor: `SensorAndShape`, where what lies under it
         is not known, or `OwnModel`, any simulator.
     effects
-        The vocabulary to choose from, by name.
+        The vocabulary to choose from, by name. What is outside it counts as unknown, also where it has a
+        name of our own (`UNNAMED`).
+    thorough
+        Weighs what leads a second time: `weigh_thoroughly`, by nested sampling.
     rng
         Source of randomness, for the null laws of the tests and the posterior samples.
 
@@ -116,7 +126,7 @@ def diagnose(
     rows = rows_to_diagnose(everything)
     recording = everything if len(rows) == len(everything) else everything.take(rows)
     extent = Extent.of(recording)
-    fitted = {name: kind.for_extent(extent) for name, kind in {**effects, **NUISANCES}.items()}
+    fitted = {name: kind.for_extent(extent) for name, kind in {**effects, **UNNAMED, **NUISANCES}.items()}
     floor = sd_floor(recording)
     known = null
     if sensor is not None:
@@ -124,7 +134,7 @@ def diagnose(
         known = sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
     able = {name: effect for name, effect in fitted.items() if effect is not None}
     built = {name: effect for name, effect in able.items() if known is None or known.admits(effect)}
-    found = _Diagnoser(recording, built, known, floor, rng).run()
+    found = _Diagnoser(recording, built, known, floor, thorough, rng).run()
     return found if recording is everything else _of_everything(found, everything)
 
 
@@ -134,6 +144,7 @@ class _Diagnoser:
     built: Mapping[str, NamedEffect[Any]]
     sensor: Null | None
     floor: float
+    thorough: Thorough | None
     rng: np.random.Generator
 
     @property
@@ -149,6 +160,9 @@ class _Diagnoser:
         self.search: Search = search(
             self.recording, self.built, sensor=self.sensor, sd_floor=self.floor, max_order=1 if n < 40 else 3
         )
+        weighings: tuple[Weighing, ...] = ()
+        if self.thorough is not None and not few:
+            self.search, weighings = self.thorough(self.search)
         self.noise_names = frozenset(k for k, e in self.built.items() if e.stage is Stage.NOISE)
         probabilities = self.search.probabilities
         hypotheses = _hypotheses(probabilities)
@@ -170,8 +184,9 @@ class _Diagnoser:
             p_value = 1.0  # readings that never change carry no noise to measure a residual by
 
         mean_names = tuple(name for name in combination if name in self.built and name not in self.noise_names)
+        foreseen = self._foreseen(probabilities)
         if verdict == "unknown":
-            mean_names = self.search.beside(noise)
+            mean_names = foreseen or self.search.beside(noise)
         noise_of = noise
         if verdict in ("named", "noise", "clean"):
             stated = tuple(name for name in combination if name in self.noise_names)
@@ -186,16 +201,19 @@ class _Diagnoser:
         where = self._where(null, problem, draws, best, effects, p_value)
         improvement = self._improvement(null, best, noise_of, after, p_value)
         residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
-        if verdict == "unknown":
+        if verdict == "unknown" and not foreseen:
             improvement, correction = self._corrected(null, best, after, noise, improvement)
             residuals_after = residuals_after - correction
             change[self.usable] = correction
-        reason = self._reason(verdict, combination, hypotheses, effects, p_value, few, pairs, where, noise)
+        candidates = [
+            e.sentence(*_moments(samples.columns(e.name))) for e in best.found.model.effects if e.name in UNNAMED
+        ]
+        reason = self._reason(verdict, combination, hypotheses, effects, p_value, few, pairs, where, noise, candidates)
         predicted_before, predicted_after = (c.found.model.predict(c.found.z[None, :])[0] for c in (null, best))
         return Diagnosis(
             recording=self.recording,
             verdict=verdict,
-            reason=reason,
+            reason=with_agreement(reason, weighings),
             p_value=p_value,
             combination=combination,
             hypotheses=hypotheses,
@@ -215,7 +233,8 @@ class _Diagnoser:
             predicted_before=predicted_before,
             predicted_after=predicted_after + change,
             order_probabilities=dict(self.search.order_probabilities),
-            unknown_shares=dict(self.search.unknown_shares),
+            unknown_shares=self._unknown_shares(probabilities),
+            weighings=weighings,
         )
 
     def _most_probable_noise(
@@ -225,6 +244,24 @@ class _Diagnoser:
         for (_, noise), p in probabilities.items():
             marginal[noise] = marginal.get(noise, 0.0) + p
         return max(marginal, key=lambda k: marginal[k])
+
+    def _foreseen(self, probabilities: Mapping[tuple[Names, Names], float]) -> Names:
+        """Name the leading refitted combination with something outside the vocabulary, if it leads what is unknown."""
+        by_mean = _by_mean(probabilities)
+        own = {names: p for names, p in by_mean.items() if UNNAMED.keys() & set(names)}
+        refitted = {names for _, names in self.search.candidates}
+        leader = max(own, key=lambda names: own[names], default=())
+        return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
+
+    def _unknown_shares(self, probabilities: Mapping[tuple[Names, Names], float]) -> dict[str, float]:
+        """Share what is unknown out over the names of our own, and over covariates for what has none."""
+        by_mean = _by_mean(probabilities)
+        shares = {family: by_mean.get(("unknown",), 0.0) * p for family, p in self.search.unknown_shares.items()}
+        for names, p in by_mean.items():
+            for name in UNNAMED.keys() & set(names):
+                shares[name] = shares.get(name, 0.0) + p
+        total = sum(shares.values()) or 1.0
+        return {name: p / total for name, p in shares.items()}
 
     def _sample(self, candidate: Candidate, noise: tuple[str, ...]) -> ModelSamples:
         evidence = candidate.evidence[noise]
@@ -245,7 +282,7 @@ class _Diagnoser:
         telling: dict[str, FloatArray] = {}
         chosen: dict[str, NamedEffect[Any]] = {}
         for name, effect in self.built.items():
-            if name in self.noise_names:
+            if name in self.noise_names or name in UNNAMED:
                 continue
             templates = self.search.templates.of(found, effect)
             blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
@@ -302,7 +339,7 @@ class _Diagnoser:
         out, unit = [], self.recording.plan.instrumentation.unit
         for name, effect in self.built.items():
             p = sum(h.probability for h in hypotheses if name in h.effects)
-            if p <= _LEAST_PROBABILITY or name in NUISANCES:
+            if p <= _LEAST_PROBABILITY or name in NUISANCES or name in UNNAMED:
                 continue
             holder, noise = (best, noise_of) if name in samples.effects else self._holder(name)
             if holder is None:
@@ -320,6 +357,7 @@ class _Diagnoser:
                     size,
                     effect.sentence(values.mean(axis=0), values.std(axis=0)),
                     (*_parameters(effect, values, unit), *_scans(effect, self.recording.plan)),
+                    effect.scans,
                 )
             )
         return tuple(sorted(out, key=lambda e: -e.probability))
@@ -495,6 +533,7 @@ class _Diagnoser:
         pairs: Sequence[Alias],
         where: Sequence[Any],
         noise: tuple[str, ...],
+        candidates: Sequence[str],
     ) -> str:
         n = len(self.usable)
         if few and n >= self.least_readings:
@@ -507,6 +546,9 @@ class _Diagnoser:
             ssf = "" if order == 0 else ", an SSF of one Gaussian," if order == 1 else f", an SSF of {order} Gaussians,"
             return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
         if verdict == "unknown":
+            if candidates:
+                like = "; ".join(candidates)
+                return f"Something is missing (p = {p_value:.2g}) that has no name; it is most like this: {like}."
             place = f" It shows most in {where[0].covariate}." if where else ""
             known = " and ".join(name.replace("_", " ") for name in self.search.beside(noise))
             beside = f", beside {known}" if known else ""
@@ -543,11 +585,23 @@ def _hypotheses(
     """Join mean and noise into combinations; unknown is one hypothesis under any noise."""
     joined: dict[tuple[str, ...], float] = {}
     for (mean, noise), p in probabilities.items():
-        key = mean if mean == ("unknown",) else tuple(sorted((*mean, *_in_vocabulary(noise))))
+        outside = mean == ("unknown",) or bool(UNNAMED.keys() & set(mean))
+        key = ("unknown",) if outside else tuple(sorted((*mean, *_in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)
+
+
+def _by_mean(probabilities: Mapping[tuple[Names, Names], float]) -> dict[Names, float]:
+    out: dict[Names, float] = {}
+    for (mean, _), p in probabilities.items():
+        out[mean] = out.get(mean, 0.0) + p
+    return out
+
+
+def _moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return np.asarray(values.mean(axis=0)), np.asarray(values.std(axis=0))
 
 
 def _in_vocabulary(noise: tuple[str, ...]) -> tuple[str, ...]:

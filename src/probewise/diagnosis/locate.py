@@ -53,7 +53,7 @@ class Place:
     def witness(self) -> str:
         """Name of the figure file that shows it."""
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
-        return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".png"
+        return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
 
 
 def global_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from probewise.effects import UNNAMED, NamedEffect
+from probewise.sensor import Stage
 
 __all__ = ["PriorOdds"]
 
@@ -15,32 +20,52 @@ class PriorOdds:
     """Prior odds of what may be missing from the mean, and of what may be wrong with the noise.
 
     Of the mean: `clean_mean`, `unknown`, and the rest shared out over combinations, by size, then evenly;
-    `unknown_beside` is the share of those in which something unknown is at work besides. Of the noise:
-    `white`, the rest over noise models, by size, then evenly. `coincidence` (nats) is what speaks against
-    an effect that makes a Gaussian of the SSF superfluous, for each one: that physics looks like an SSF's
-    shape takes more than an even chance to believe.
+    `unknown_beside` is the share of those in which something unknown is at work besides. Half of what is
+    unknown (`foreseen`) is shared out over the effects of `UNNAMED`, the rest is like nothing foreseen.
+    Of the noise: `white`, the rest over noise models, by size, then evenly. `coincidence` (nats) is what
+    speaks against an effect that makes a Gaussian of the SSF superfluous, for each one: that physics looks
+    like an SSF's shape takes more than an even chance to believe.
     """
 
+    n_named: int = 24
+    n_unnamed: int = len(UNNAMED)
+    n_noises: int = 6
     clean_mean: float = 0.60
     unknown: float = 0.06
-    by_size: tuple[float, ...] = (0.33, 0.0095, 0.0005)
+    foreseen: float = 0.5
+    by_size: tuple[float, ...] = field(default=(0.33, 0.0095, 0.0005))
     unknown_beside: float = 0.01
     white: float = 0.94
-    noise_by_size: tuple[float, ...] = (0.057, 0.003)
+    noise_by_size: tuple[float, ...] = field(default=(0.057, 0.003))
     coincidence: float = 8.0
 
-    def log_mean(self, names: Names, n_effects: int) -> float:
+    @classmethod
+    def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
+        """Share the odds out over these effects."""
+        on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
+        unnamed = len(UNNAMED.keys() & effects)
+        return cls(len(effects) - len(on_noise) - unnamed, unnamed, len(on_noise))
+
+    def log_mean(self, names: Names) -> float:
         """Log prior of a combination of effects on the mean."""
-        if not names:
-            return math.log(self.clean_mean)
-        return math.log(self.by_size[len(names) - 1] / math.comb(n_effects, len(names)))
+        named = [name for name in names if name not in UNNAMED]
+        log_p = self._log_of_named(len(named))
+        for k in range(len(names) - len(named)):
+            share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
+            log_p += math.log(share * self.foreseen / (self.n_unnamed - k))
+        return log_p
 
-    def log_unknown(self, names: Names, n_effects: int) -> float:
-        """Log prior of something unknown, beside a combination of effects on the mean."""
-        return self.log_mean(names, n_effects) + math.log(self.unknown_beside) if names else math.log(self.unknown)
+    def _log_of_named(self, n: int) -> float:
+        return math.log(self.by_size[n - 1] / math.comb(self.n_named, n) if n else self.clean_mean)
 
-    def log_noise(self, names: Names, n_effects: int) -> float:
-        """Log prior of a noise model, made of some of `n_effects` effects; `names` are those that may be absent."""
+    def log_unknown(self, names: Names) -> float:
+        """Log prior of something that nobody foresaw, beside a combination of effects on the mean."""
+        if names:
+            return self.log_mean(names) + math.log(self.unknown_beside)
+        return math.log(self.unknown * (1 - self.foreseen if self.n_unnamed else 1.0))
+
+    def log_noise(self, names: Names) -> float:
+        """Log prior of a noise model; `names` are those of its effects that may be absent."""
         if not names:
             return math.log(self.white)
-        return math.log(self.noise_by_size[len(names) - 1] / math.comb(n_effects, len(names)))
+        return math.log(self.noise_by_size[len(names) - 1] / math.comb(self.n_noises, len(names)))

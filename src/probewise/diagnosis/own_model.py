@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.special import ndtr, ndtri
-from scipy.stats import qmc
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.coordinates import LEAST_READINGS
@@ -73,6 +72,8 @@ class OwnModel:
     @cached_property
     def starts(self) -> FloatArray:
         """Start from the middle of the prior and from points spread evenly over it, (8, n_params)."""
+        from scipy.stats import qmc  # here, since it takes a second to import that a sensor's diagnosis does without
+
         spread = qmc.Halton(self.n_params, scramble=False).random(_N_STARTS)[1:]
         return np.concatenate([np.zeros((1, self.n_params)), np.asarray(ndtri(spread), dtype=np.float64)])
 

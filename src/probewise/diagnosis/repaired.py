@@ -17,7 +17,7 @@ from probewise.diagnosis.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit, degrees_of_freedom
 from probewise.diagnosis.null import Predictor
-from probewise.effects import NUISANCES, Extent, NoiseEffect
+from probewise.effects import NUISANCES, Extent, NoiseEffect, Quantisation
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
@@ -134,7 +134,14 @@ def sample_model(
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
     theta = np.concatenate([theta, *(_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
     names = tuple(effect.name for effect in chain.effects)
+    rounding = theta[:, [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]].sum(axis=1)
+    noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
     return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance)
+
+
+def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:
+    """Take out of a residual's sd what rounding to a step adds; what is left is known no better than the whole is."""
+    return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
 def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:

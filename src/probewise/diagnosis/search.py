@@ -31,7 +31,7 @@ from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
 from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
 from probewise.diagnosis.weighed import STEERING, Candidate, Search, weighed
-from probewise.effects import VOCABULARY, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
+from probewise.effects import UNNAMED, VOCABULARY, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
@@ -78,7 +78,9 @@ def search(
     beam, depth
         How many combinations of each size are refitted, and the largest size.
     """
-    return _Searcher(recording, effects, sensor, sd_floor, prior or PriorOdds(), max_order, beam, depth).run()
+    return _Searcher(
+        recording, effects, sensor, sd_floor, prior or PriorOdds.over(effects), max_order, beam, depth
+    ).run()
 
 
 @dataclass(eq=False)
@@ -185,7 +187,7 @@ class _Searcher:
 
     def _log_noise(self, names: Names) -> float:
         uncertain = tuple(n for n in names if n not in self.certain)
-        return self.prior.log_noise(uncertain, len(self.noise_effects))
+        return self.prior.log_noise(uncertain)
 
     def _nulls(self) -> list[Candidate]:
         return [c for (_, names), c in self.candidates.items() if not names]
@@ -277,7 +279,7 @@ class _Searcher:
             self._keep(replace(candidate, evidence=self._weigh_all(candidate.found, candidate.log_share)))
 
     def _log_prior(self, names: Names) -> float:
-        return self.prior.log_mean(names, len(self.mean_effects))
+        return self.prior.log_mean(names)
 
     def _coincidence(self, n_gaussians: int) -> float:
         """Give the nats against effects beside so few Gaussians, where the null alone has more."""
@@ -315,7 +317,7 @@ class _Searcher:
             best_so_far = max(c.log_z + self._log_prior(c.names) for c in grown)
             grown = []
             # A user's own effect was named to be tried, however far it leads from where screening is linear.
-            own = [names for names in ranked if size == 1 and names[0] not in VOCABULARY]
+            own = [names for names in ranked if size == 1 and names[0] not in {**VOCABULARY, **UNNAMED}]
             for rank, names in enumerate(dict.fromkeys([*ranked[: self.beam], *own])):
                 # A combination that screening puts this far behind cannot come to matter.
                 if odds[names] < best_so_far - STEERING and (size > 1 or rank > 0) and names not in own:

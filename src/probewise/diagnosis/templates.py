@@ -56,20 +56,20 @@ class TemplateMemory:
     """The templates of effects about fits, each laid out once."""
 
     usable: IntArray
-    known: dict[tuple[Fit, str], EffectTemplates] = field(default_factory=dict)
+    known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
     banks: dict[tuple[Fit, tuple[str, ...]], Bank] = field(default_factory=dict)
 
     def bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> Bank:
-        """Give the templates of several effects about one fit, side by side, labelled by their names."""
+        """Give the coarse templates of several effects about one fit, side by side, labelled by their names."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
-            own = [(effect.name, t) for effect in effects for t in self.of(found, effect).columns]
+            own = [(effect.name, t) for effect in effects for t in self.of(found, effect.coarse()).columns]
             self.banks[key] = Bank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
         return self.banks[key]
 
     def of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
         """Give the templates of one effect about one fit."""
-        key = found, effect.name
+        key = found, effect
         if key not in self.known:
             self.known[key] = effect_templates(found, effect, self.usable)
         return self.known[key]
@@ -79,15 +79,20 @@ def effect_templates(found: Fit, effect: NamedEffect[Any], usable: IntArray) -> 
     """Difference the chain with and without each variant of the effect."""
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
+    gates = effect.gates(found.model.plan)
+    if gates is not None:
+        (everywhere,) = _columns(found, effect, gates.always[None, :, :], usable)
+        columns = tuple(everywhere * opened[usable, None] for opened in gates.opened)
+        return EffectTemplates(columns, tuple(itertools.chain(*banks)), variants, np.arange(len(variants)))
     # Variants bound to the same scans, or to none, differ in their priors alone: one prediction does for them.
-    columns: list[FloatArray] = []
+    by_entry: list[FloatArray] = []
     first = 0
     for _, group in itertools.groupby(variants, key=lambda variant: variant.scans):
         last = first + len(list(group))
-        columns += _columns(found, variants[first], np.concatenate(banks[first:last]), usable)
+        by_entry += _columns(found, variants[first], np.concatenate(banks[first:last]), usable)
         first = last
     choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
-    return EffectTemplates(tuple(columns), tuple(itertools.chain(*banks)), variants, choice)
+    return EffectTemplates(tuple(by_entry), tuple(itertools.chain(*banks)), variants, choice)
 
 
 def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:

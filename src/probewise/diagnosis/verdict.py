@@ -11,6 +11,7 @@ from probewise._display import ShowsItself
 from probewise.diagnosis.audit import Alias, NextMeasurement
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.repaired import ModelSamples
+from probewise.diagnosis.weighing import Weighing
 from probewise.recordings.plan import Recording
 
 __all__ = [
@@ -54,13 +55,14 @@ class ParameterFound:
 
 @dataclass(frozen=True)
 class EffectFound:
-    """One effect: how probable, how large (lambda), what it does in words, its parameters."""
+    """One effect: how probable, how large (lambda), what it does in words, its parameters, the scans it is bound to."""
 
     name: str
     probability: float
     size_lambda: float
     sentence: str
     parameters: tuple[ParameterFound, ...]
+    scans: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,8 @@ class Diagnosis(ShowsItself):
         Probability of each number of Gaussians of a clean sensor's SSF.
     unknown_shares
         If something has no name, the probability that it depends on each covariate.
+    weighings
+        Hypotheses weighed twice, by Laplace and by nested sampling, where that was asked for.
     """
 
     recording: Recording
@@ -138,6 +142,7 @@ class Diagnosis(ShowsItself):
     predicted_after: FloatArray
     order_probabilities: Mapping[int, float]
     unknown_shares: Mapping[str, float]
+    weighings: tuple[Weighing, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("residuals_before", "residuals_after", "predicted_before", "predicted_after"):

@@ -22,7 +22,6 @@ from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.templates import TemplateMemory
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Recording
-from probewise.sensor import Stage
 
 __all__ = ["STEERING", "Candidate", "Search", "weighed"]
 
@@ -97,9 +96,8 @@ class Search:
 
     def beside(self, noise: Names) -> Names:
         """Name the effects on the mean beside which something unknown most probably is; () for none."""
-        n_effects = sum(e.stage is not Stage.NOISE for e in self.effects.values())
         scores = {
-            names: value + self.prior.log_unknown(names, n_effects)
+            names: value + self.prior.log_unknown(names)
             for (_, names, own), value in self.unknown.items()
             if own == noise
         }
@@ -109,10 +107,9 @@ class Search:
     def order(self) -> int:
         """SSF order of the most probable explanation, named or not: that at which the null is tested."""
         by_order: dict[int, float] = {}
-        n_effects = sum(e.stage is not Stage.NOISE for e in self.effects.values())
-        terms = [(n, c.log_z + self.prior.log_mean(names, n_effects)) for (n, names), c in self.candidates.items()]
+        terms = [(n, c.log_z + self.prior.log_mean(names)) for (n, names), c in self.candidates.items()]
         for (n, names, _), value in self.unknown.items():
-            terms.append((n, value + self.prior.log_unknown(names, n_effects)))
+            terms.append((n, value + self.prior.log_unknown(names)))
         for n, value in terms:
             by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
         return max(by_order, key=lambda n: by_order[n])
@@ -120,22 +117,21 @@ class Search:
 
 def weighed(search: Search) -> Search:
     """Turn evidences into probabilities of (mean, noise) hypotheses, summed over SSF orders."""
-    prior, n_effects = search.prior, sum(e.stage is not Stage.NOISE for e in search.effects.values())
-    n_noises = sum(e.stage is Stage.NOISE for e in search.effects.values())
+    prior = search.prior
     log_order = -math.log(len(search.sensors))
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), candidate in search.candidates.items():
         for noise, evidence in candidate.evidence.items():
             log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
-    log_p = {key: value + prior.log_mean(key[0], n_effects) for key, value in log_z.items()}
+    log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
     for (_, names, noise), value in search.unknown.items():
         key = ("unknown",), noise
-        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names, n_effects)))
+        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
     for (names, noise), value in search.screened.items():
-        log_p[names, noise] = value + prior.log_mean(names, n_effects)
+        log_p[names, noise] = value + prior.log_mean(names)
     for names, noise in log_p:
         uncertain = tuple(n for n in noise if n not in search.certain)
-        log_p[names, noise] += log_order + prior.log_noise(uncertain, n_noises)
+        log_p[names, noise] += log_order + prior.log_noise(uncertain)
     total = float(logsumexp(list(log_p.values())))
     nulls = {n: c for (n, names), c in search.candidates.items() if not names}
     clean_by_order = {n: float(logsumexp([e.log_z for e in c.evidence.values()])) for n, c in nulls.items()}

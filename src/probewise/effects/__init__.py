@@ -18,20 +18,24 @@ from probewise.effects.gain import BatterySag, GainDrift
 from probewise.effects.glint import Glint
 from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
 from probewise.effects.height import HeightGradient, HeightOffset
+from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Known
 from probewise.effects.lattice import Quantisation, lattice_step
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.moves import in_scans
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, SignalDependentNoise
-from probewise.effects.noise_law import NoiseRows, draw_readings, log_density
+from probewise.effects.noise_law import NoiseRows, draw_readings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
+from probewise.effects.rails import BentRails, MissingTooth
 from probewise.effects.readings import Hysteresis, Lag
+from probewise.effects.reflection import Reflection
 from probewise.effects.response import Nonlinearity
 from probewise.effects.saturation import Saturation
 from probewise.effects.tilt import SensorTilt
 from probewise.effects.vocabulary import NamedEffect, NoiseEffect
 from probewise.effects.waves import Flicker, PeriodicPositionError
+from probewise.effects.wear import SlowSinking, SlowTurn
 
 VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
     {
@@ -73,18 +77,26 @@ VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 )
 """Every effect that the diagnosis weighs, by name."""
 
+UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
+    {effect.name: effect for effect in (ArmKnock, GainStep, BentRails, MissingTooth, Reflection, SlowTurn, SlowSinking)}
+)
+"""Physics outside the vocabulary, by names of our own: what a diagnosis says is unknown, and what it may be."""
+
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
 """What may be wrong with the noise and has no name in the vocabulary, by a name of our own."""
 
 __all__ = [
     "NUISANCES",
+    "UNNAMED",
     "VOCABULARY",
     "AlbedoGradient",
     "AlbedoPatch",
     "AmbientGradient",
     "AmbientStep",
+    "ArmKnock",
     "Backlash",
     "BatterySag",
+    "BentRails",
     "CorrelatedNoise",
     "DriftingNoise",
     "Dropouts",
@@ -94,6 +106,7 @@ __all__ = [
     "Extent",
     "Flicker",
     "GainDrift",
+    "GainStep",
     "Glint",
     "Halo",
     "HeavyTailed",
@@ -103,6 +116,7 @@ __all__ = [
     "Known",
     "Lag",
     "LogHeavyTailed",
+    "MissingTooth",
     "NamedEffect",
     "NoiseEffect",
     "NoiseRows",
@@ -113,14 +127,18 @@ __all__ = [
     "PeriodicPositionError",
     "PositionScale",
     "Quantisation",
+    "Reflection",
     "Saturation",
     "ScanAngleError",
     "ScanMisplacement",
     "SensorTilt",
     "SignalDependentNoise",
+    "SlowSinking",
+    "SlowTurn",
     "draw_readings",
     "edge_distance",
     "in_scans",
     "lattice_step",
     "log_density",
+    "variance",
 ]

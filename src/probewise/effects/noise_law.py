@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.effects.density import log_cell_density, log_gaussian_density
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["NoiseRows", "draw_readings", "log_density"]
+__all__ = ["NoiseRows", "draw_readings", "log_density", "variance"]
 
 _NARROW = 1e-3  # of the noise sd: how exactly a lost reading holds its value where nothing is rounded
 
@@ -41,21 +41,30 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
     predicted
         Noise-free readings, (n_samples, n_points).
     """
+    of_kept = _log_rounded(readings, predicted, level.sd, level.step)
+    with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
+        if np.any(level.wide_share):
+            wide = _log_rounded(readings, predicted, level.sd * level.wide_times, level.step)
+            of_kept = np.logaddexp(np.log1p(-level.wide_share) + of_kept, np.log(level.wide_share) + wide)
+        if np.any(level.lost_share):
+            lost = _log_rounded(readings, level.lost_value, level.sd * _NARROW, level.step)
+            of_kept = np.logaddexp(np.log1p(-level.lost_share) + of_kept, np.log(level.lost_share) + lost)
+    return of_kept
 
-    def normal(mean: FloatArray, sd: FloatArray) -> FloatArray:
-        z = (readings - mean) / sd
-        smooth = np.exp(-0.5 * z * z) / (sd * np.sqrt(2 * np.pi))
-        # Rounded readings hold the mass of a cell.
-        step = np.where(level.step > 0, level.step, 1.0)
-        half = step / 2 / sd
-        in_cell = np.where(z > 0, ndtr(half - z) - ndtr(-half - z), ndtr(z + half) - ndtr(z - half)) / step
-        return np.where(level.step > 0, in_cell, smooth)
 
-    kept = (1 - level.wide_share) * normal(predicted, level.sd)
-    kept = kept + level.wide_share * normal(predicted, level.sd * level.wide_times)
-    lost = normal(level.lost_value, level.sd * _NARROW)
-    with np.errstate(divide="ignore"):
-        return np.log((1 - level.lost_share) * kept + level.lost_share * lost)
+def variance(level: NoiseLevel) -> FloatArray:
+    """Compute the variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
+    wide = 1 + level.wide_share * (level.wide_times**2 - 1)
+    return np.asarray(level.sd**2 * wide + level.step**2 / 12)
+
+
+def _log_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
+    """Give the normal log density; where there is a step, the log of its mean over the reading's cell."""
+    if not np.any(step):
+        return log_gaussian_density(readings, mean, sd)
+    width = np.where(step > 0, step, 1.0)
+    in_cell = log_cell_density(readings, mean, sd, width)
+    return in_cell if np.all(step) else np.where(step > 0, in_cell, log_gaussian_density(readings, mean, sd))
 
 
 def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator) -> FloatArray:

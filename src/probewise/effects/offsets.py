@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import ClassVar, Self
 
 import numpy as np
@@ -12,14 +11,13 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.moments import SinceAMoment, moments_of
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
 __all__ = ["AmbientGradient", "AmbientStep", "OffsetDrift"]
-
-_MOST_MOMENTS = 512
 
 
 @dataclass(frozen=True)
@@ -103,16 +101,10 @@ class OffsetDrift(NamedEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class AmbientStep(NamedEffect[FloatArray]):
-    """Light switched on or off in the room: reading + amp 1(t > at_s).
-
-    `moments_s` are the times between which a change is told from the next one: those of the
-    readings. Which two it happened between is a discrete choice; within them no reading tells.
-    """
+class AmbientStep(SinceAMoment[FloatArray]):
+    """Light switched on or off in the room: reading + amp 1(t > at_s)."""
 
     typical: float = 0.5
-    moments_s: tuple[float, ...] = (0.0, 1e5)
-    between_s: tuple[float, float] | None = None
 
     name: ClassVar[str] = "ambient_step"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -123,38 +115,25 @@ class AmbientStep(NamedEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Take a hundredth of the readings' range as typical; look between any two readings of the recording."""
-        moments = np.unique(extent.plan.time_s)
-        if len(moments) < 2:
-            return None
-        stride = -(-(len(moments) - 1) // _MOST_MOMENTS)
-        kept = np.append(moments[:-1:stride], moments[-1])
-        return cls(typical=0.01 * extent.span, moments_s=tuple(kept.tolist()))
+        moments = moments_of(extent)
+        return None if moments is None else cls(moments, typical=0.01 * extent.span)
 
     @cached_property
     def prior(self) -> Product:
         """Size, of either sign, and time: even over the recording, or between two readings where that is chosen."""
-        first, last = self.between_s or (self.moments_s[0], self.moments_s[-1])
-        return Product({"amp": HeavyTailed(self.typical), "at_s": Uniform(first, last)})
+        return Product({"amp": HeavyTailed(self.typical), "at_s": Uniform(*self.open_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the step to the readings taken after it, (n_samples, n_points)."""
-        return np.asarray(value + theta[:, :1] * (plan.time_s > theta[:, 1:2]))
-
-    def variants(self) -> tuple[Self, ...]:
-        """Choose the two readings between which it happened."""
-        return tuple(replace(self, between_s=pair) for pair in pairwise(self.moments_s))
+        return np.asarray(value + theta[:, :1] * self.since(theta, plan))
 
     def bank(self) -> FloatArray:
         """One setting, in the middle of the time left open."""
-        at = self.between_s or (self.moments_s[0], self.moments_s[-1])
-        return np.array([[[self.typical, sum(at) / 2]]])
+        return np.array([[[self.typical, sum(self.open_s) / 2]]])
 
-    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw the time from all intervals by their weight."""
-        moments = np.array(self.moments_s)
-        chosen = rng.choice(len(weights), len(theta), p=weights)
-        at_s = moments[chosen] + np.diff(moments)[chosen] * rng.random(len(theta))
-        return np.stack([theta[:, 0], at_s], axis=-1)
+    def coarse(self) -> Self:
+        """Look between any two readings: it is the step that is told from all others by its moment."""
+        return self
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say when the reading jumped, and how far."""

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_law import NoiseRows
+from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseLevel
 
-__all__ = ["NamedEffect", "NoiseEffect", "give_or_take"]
+__all__ = ["Gates", "NamedEffect", "NoiseEffect", "V", "give_or_take"]
 
 V = TypeVar("V")
+
+
+@dataclass(frozen=True, eq=False)
+class Gates:
+    """Where variants act that differ in nothing else, one bank entry each.
+
+    `always` are the columns of an entry that acts on all readings, (n_columns, n_params); `opened`
+    (n_variants, n_points) are the readings that each variant acts on.
+    """
+
+    always: FloatArray
+    opened: BoolArray
 
 
 class NamedEffect(Effect[V], Protocol[V]):
@@ -69,6 +83,14 @@ class NamedEffect(Effect[V], Protocol[V]):
         Variants differ in their `scans`, or in their priors alone.
         """
         return (self,)
+
+    def gates(self, plan: Plan) -> Gates | None:
+        """Where its variants differ only in the readings that they act on: one prediction does for all of them."""
+        return None
+
+    def coarse(self) -> Self:
+        """Leave fewer choices open, enough to see whether the effect is there at all; by default all of them."""
+        return self
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Spread samples of one variant's parameters, (n_samples, n_params), over all variants by their weight.

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from probewise.calibration.density import log_cell_density, log_gaussian_density
+from probewise.effects.density import log_cell_density, log_gaussian_density
 
 
 def test_the_gaussian_density_is_that_of_scipy() -> None:

@@ -1,4 +1,4 @@
-"""The predictive density of single readings: a mixture over posterior samples."""
+"""The normal density of a reading, and its mean over the cell that a reading was rounded to."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def log_gaussian_density(readings: FloatArray, mean: FloatArray, sd: FloatArray)
     return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
 
 
-def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float) -> FloatArray:
+def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray) -> FloatArray:
     """Log of the Gaussian mass within half a step of the readings, divided by the step.
 
     The tail further out is subtracted from the nearer one in logs, so the result stays finite
@@ -30,4 +30,4 @@ def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, ste
     above = low + high > 0
     near, far = np.where(above, -low, high), np.where(above, -high, low)
     log_near, log_far = log_ndtr(near), log_ndtr(far)
-    return np.asarray(log_near + np.log(-np.expm1(np.minimum(log_far - log_near, -1e-300))) - math.log(step))
+    return np.asarray(log_near + np.log(-np.expm1(np.minimum(log_far - log_near, -1e-300))) - np.log(step))

@@ -1,0 +1,83 @@
+"""A second image beside the first: light that comes back from a plate or a lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import Product, Uniform
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Footprint, Stage
+
+__all__ = ["Reflection"]
+
+_ANGLES = 8
+
+
+@dataclass(frozen=True)
+class Reflection(NamedEffect[Footprint]):
+    """A share of the footprint looks (dx_mm, dy_mm) beside it, in the lab frame."""
+
+    typical: float = 0.02
+    farthest_mm: float = 20.0
+
+    name: ClassVar[str] = "reflection"
+    stage: ClassVar[Stage] = Stage.FOOTPRINT
+    units: ClassVar[tuple[str, ...]] = ("1", "mm", "mm")
+    covariates: ClassVar[tuple[str, ...]] = ("place", "edge_distance")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look as far as half the longest scan."""
+        return cls(farthest_mm=0.5 * extent.length_mm)
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share, and displacement along X and Y."""
+        reach = Uniform(-self.farthest_mm, self.farthest_mm)
+        return Product({"share": HeavyTailed(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        """Set a fainter copy of each Gaussian beside it."""
+        share = np.clip(theta[:, :1, None], 0.0, 1.0)
+        turn = plan.orientation_rad[None, :, None]
+        dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
+        u_mm = value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy
+        v_mm = value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy
+        return Footprint(
+            weight=_joined(value.weight * (1 - share), value.weight * share),
+            u_mm=_joined(value.u_mm, u_mm),
+            v_mm=_joined(value.v_mm, v_mm),
+            var_u=_joined(value.var_u, value.var_u),
+            var_v=_joined(value.var_v, value.var_v),
+            cov_uv=_joined(value.cov_uv, value.cov_uv),
+            brightness=value.brightness,
+        )
+
+    def bank(self) -> FloatArray:
+        """Three distances in eight directions."""
+        angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
+        far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
+        dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()
+        return np.stack([np.full(dx.size, self.typical), dx, dy], axis=-1)[:, None, :]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how strong the second image is, and where."""
+        return (
+            f"a reflection: {give_or_take(mean[0], sd[0], factor=100)} % of the light comes from "
+            f"{give_or_take(mean[1], sd[1])} mm along X and {give_or_take(mean[2], sd[2])} mm along Y beside the spot"
+        )
+
+
+def _joined(first: FloatArray, second: FloatArray) -> FloatArray:
+    shape = np.broadcast_shapes(first.shape, second.shape)
+    return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)

@@ -1,0 +1,95 @@
+"""A sensor that does not stay as it was: it turns in its holder, or sinks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.priors import Product
+from probewise.recordings.plan import Plan
+from probewise.sensor.commanded import raised
+from probewise.sensor.stages import Footprint, Poses, Stage
+
+__all__ = ["SlowSinking", "SlowTurn"]
+
+
+@dataclass(frozen=True)
+class SlowTurn(NamedEffect[Poses]):
+    """The sensor turns in its holder: orientation + deg_per_hour t."""
+
+    typical_deg_per_hour: float = 2.0
+
+    name: ClassVar[str] = "slow_turn"
+    stage: ClassVar[Stage] = Stage.POSE
+    units: ClassVar[tuple[str, ...]] = ("deg/h",)
+    covariates: ClassVar[tuple[str, ...]] = ("time", "orientation")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take two degrees over the recording as typical."""
+        return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Degrees an hour, of either sign."""
+        return Product({"deg_per_hour": HeavyTailed(self.typical_deg_per_hour)})
+
+    def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        """Turn the sensor with time."""
+        turn = np.deg2rad(theta[:, :1]) * (plan.time_s / 3600)
+        return replace(value, orientation_rad=value.orientation_rad + turn)
+
+    def bank(self) -> FloatArray:
+        """One setting: linear while the turn is small."""
+        return np.full((1, 1, 1), self.typical_deg_per_hour)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how fast it turns."""
+        return f"the sensor turns by {give_or_take(mean[0], sd[0])} degrees an hour: it is loose in its holder"
+
+
+@dataclass(frozen=True)
+class SlowSinking(NamedEffect[Footprint]):
+    """The height changes: h/h0 = 1 + per_hour t; footprint x h/h0, signal x (h0/h)^2."""
+
+    typical_per_hour: float = 0.1
+
+    name: ClassVar[str] = "slow_sinking"
+    stage: ClassVar[Stage] = Stage.FOOTPRINT
+    units: ClassVar[tuple[str, ...]] = ("1/h",)
+    covariates: ClassVar[tuple[str, ...]] = ("time", "level")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take a hundredth of the height over the recording as typical."""
+        return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Share of the height an hour, of either sign."""
+        return Product({"per_hour": HeavyTailed(self.typical_per_hour)})
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        """Widen and dim the footprint with time."""
+        return raised(value, 1 + theta[:, :1] * (plan.time_s / 3600))
+
+    def bank(self) -> FloatArray:
+        """One setting: linear while the change is small."""
+        return np.full((1, 1, 1), self.typical_per_hour)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how fast it sinks or rises."""
+        way = "rises" if mean[0] > 0 else "sinks"
+        return (
+            f"the sensor {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} % of its height an hour: "
+            "it is loose in its holder"
+        )

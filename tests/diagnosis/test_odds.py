@@ -1,0 +1,33 @@
+"""Prior odds of hypotheses."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import pytest
+
+from probewise.diagnosis import PriorOdds
+from probewise.effects import UNNAMED, VOCABULARY, Extent
+from probewise.recordings import two_way_plan
+from probewise.sensor import Stage
+
+EXTENT = Extent(10.0, 60.0, two_way_plan())
+EFFECTS = {**VOCABULARY, **UNNAMED}
+
+
+def test_everything_about_the_mean_sums_to_one_but_for_what_is_unknown_beside():
+    effects = {name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()}
+    odds = PriorOdds.over({name: effect for name, effect in effects.items() if effect is not None})
+    named = [n for n, kind in VOCABULARY.items() if kind.stage is not Stage.NOISE and effects[n] is not None]
+    total = math.exp(odds.log_unknown(()))
+    total += sum(math.exp(odds.log_mean(names)) for k in range(4) for names in combinations(named, k))
+    total += sum(math.exp(odds.log_mean((name,))) for name in UNNAMED)
+    assert total == pytest.approx(1.0, abs=1e-9)
+
+
+def test_half_of_the_unknown_has_a_name_of_our_own():
+    odds = PriorOdds.over({name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()})
+    assert sum(math.exp(odds.log_mean((name,))) for name in UNNAMED) == pytest.approx(math.exp(odds.log_unknown(())))
+    beside = odds.log_mean(("arm_knock", "backlash")) - odds.log_mean(("backlash",))
+    assert math.exp(beside) * len(UNNAMED) == pytest.approx(odds.unknown_beside * odds.foreseen)

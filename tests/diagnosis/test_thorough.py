@@ -1,0 +1,143 @@
+"""Nested sampling beside Laplace: the truth where it is known, agreement where it should be, and who wins."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, thorough, weigh_thoroughly
+from probewise.diagnosis.search import search
+from probewise.diagnosis.weighing import Weighing, with_agreement
+from probewise.effects import VOCABULARY, Extent
+from probewise.priors import Normal, Product
+from probewise.recordings import Plan, Recording, paper_plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+
+LINE = OwnModel(lambda p, plan: p["a"] + p["b"] * plan.time_s, Product({"a": Normal(0, 2), "b": Normal(0, 0.2)}))
+FLOOR = 1e-6
+
+
+def line_recording(step: float) -> Recording:
+    """Forty readings of a line with noise of sd 0.3, and a step half way."""
+    n = 40
+    time = np.arange(n, dtype=np.float64)
+    plan = Plan(
+        x_mm=np.zeros(n),
+        y_mm=np.zeros(n),
+        orientation_rad=np.zeros(n),
+        time_s=time,
+        scan=np.zeros(n, dtype=int),
+        scan_names=("only",),
+        pattern=np.zeros(n, dtype=int),
+        pattern_names=("nothing",),
+    )
+    noise = 0.3 * np.random.default_rng(7).standard_normal(n)
+    return Recording(plan, 1.0 + 0.05 * time + step * (time > 19.5) + noise)
+
+
+def searched(recording):
+    names = ("ambient_step", "hysteresis")
+    effects = {name: VOCABULARY[name].for_extent(Extent.of(recording)) for name in names}
+    return search(
+        recording, {k: e for k, e in effects.items() if e is not None}, sensor=LINE, sd_floor=FLOOR, max_order=1
+    )
+
+
+@pytest.fixture(scope="module")
+def stepped():
+    return searched(line_recording(0.3))
+
+
+def test_a_line_weighs_what_quadrature_says():
+    """The noise's sd integrated out in closed form, 1/2 Gamma(n/2) (pi rss)^(-n/2), then a fine grid over a and b."""
+    recording = line_recording(0.0)
+    _, (null, *_) = weigh_thoroughly(searched(recording), rng=np.random.default_rng(1), n_live=100)
+    a, b = np.linspace(0.0, 2.0, 401), np.linspace(0.0, 0.1, 401)
+    time, n = recording.plan.time_s, len(recording.readings)
+    rss = ((recording.readings - a[:, None, None] - b[:, None] * time) ** 2).sum(axis=-1)
+    log_prior = -0.5 * (a[:, None] / 2) ** 2 - 0.5 * (b / 0.2) ** 2 - math.log(2 * math.pi * 2 * 0.2)
+    log_post = math.lgamma(n / 2) - math.log(2) - n / 2 * np.log(math.pi * rss) + log_prior
+    truth = np.log(np.exp(log_post - log_post.max()).sum() * (a[1] - a[0]) * (b[1] - b[0])) + log_post.max()
+    assert null.effects == ()
+    assert null.nested == pytest.approx(truth, abs=0.02 + 4 * null.error)
+    assert null.error < 0.1
+    assert null.agree
+
+
+def test_the_null_is_always_weighed_too(stepped):
+    found, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=60)
+    assert {"ambient_step", "clean"} <= {w.label for w in weighings}
+    assert all(w.agree for w in weighings)
+    assert found.probabilities == stepped.probabilities
+
+
+def moved(stepped, monkeypatch, gap, doubts=()):
+    def weigh(candidate, noise, *_, **__):
+        own = gap if candidate.names else 0.5
+        return Weighing(candidate.names, candidate.n_gaussians, 0.0, own, 0.01, doubts)
+
+    monkeypatch.setattr(thorough, "_weigh", weigh)
+    return weigh_thoroughly(stepped, rng=np.random.default_rng(0))
+
+
+def odds(found):
+    """Odds of a step against a clean mean, under white noise."""
+    return found.probabilities[("ambient_step",), ()] / found.probabilities[(), ()]
+
+
+def test_nested_sampling_wins_where_it_disagrees(stepped, monkeypatch):
+    """What it finds beyond Laplace, less what it finds of the null, moves the odds by as many nats."""
+    found, _ = moved(stepped, monkeypatch, 2.5)
+    assert odds(found) / odds(stepped) == pytest.approx(math.exp(2.0))
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+
+
+def test_what_is_unknown_beside_a_hypothesis_moves_with_it(stepped, monkeypatch):
+    found, _ = moved(stepped, monkeypatch, 2.5)
+    for key, value in found.unknown.items():
+        assert value - stepped.unknown[key] == pytest.approx(2.0 if key[1] else 0.0)
+
+
+def test_within_a_nat_laplace_stands(stepped, monkeypatch):
+    found, _ = moved(stepped, monkeypatch, -0.9)
+    assert found is stepped
+
+
+def test_a_run_with_doubts_does_not_win(stepped, monkeypatch):
+    found, weighings = moved(stepped, monkeypatch, 5.0, doubts=("few effective samples",))
+    assert found is stepped
+    assert "doubts itself" in with_agreement("A reason.", weighings)
+
+
+def test_the_reason_says_whether_they_agree():
+    near, far = Weighing(("lag",), 1, -10.0, -10.4, 0.1), Weighing((), 1, -12.0, -14.0, 0.1)
+    assert with_agreement("A reason.", ()) == "A reason."
+    assert with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees within a nat."
+    assert "clean by −2.0 nats" in with_agreement("A reason.", (near, far))
+
+
+@pytest.mark.slow
+def test_a_recording_is_weighed_alike_both_ways():
+    """A third of the paper's plan, by electronics that give no more than 50 of 60."""
+    plan = paper_plan()
+    plan = plan.take(np.arange(0, len(plan), 3))
+    spot = np.array([1.0, 0.0, 1.5, 1 / 72, 1 / 128, 0.0])
+    exact = Chain(FixedMixture.from_parameters(spot), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
+    noise = 0.5 * np.random.default_rng(3).standard_normal(len(plan))
+    recording = Recording(plan, np.minimum(exact.predict(np.empty((1, 0)), plan)[0], 50.0) + noise)
+    seen = []
+
+    def again(found):
+        return weigh_thoroughly(
+            found, rng=np.random.default_rng(4), n_live=100, progress=lambda label, _: seen.append(label)
+        )
+
+    found = diagnose(recording, thorough=again, rng=np.random.default_rng(1))
+    assert found.combination == ("saturation",)
+    assert {w.label for w in found.weighings} == set(seen)
+    assert all(w.agree for w in found.weighings)
+    assert found.reason.endswith("nested sampling agrees within a nat.")
+    assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.weighings)
+    assert "thorough" not in diagnosis_json(replace(found, weighings=()))

@@ -66,7 +66,7 @@ def test_a_recording_without_effects_is_clean():
     assert found.verdict == "clean"
     assert found.combination == ()
     assert found.p_value > 0.01
-    assert found.repaired.theta.shape == (1000, 8)
+    assert found.repaired.theta.shape == (500, 8)
     assert document["next_measurement"]["readings"] >= 1
     assert found.noise.parameters[0].interval95[0] < NOISE_SD < found.noise.parameters[0].interval95[1]
 

@@ -29,7 +29,7 @@ from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.noise import noise_statistics, steps_within_scans
 from probewise.diagnosis.null import Null
-from probewise.diagnosis.repaired import ModelSamples, sample_model
+from probewise.diagnosis.repaired import ModelSamples, over_orders, sample_model
 from probewise.diagnosis.search import search
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.unknown import correct
@@ -62,6 +62,7 @@ Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
 N_DRAWS = 999
 _LEAST_PROBABILITY = 1e-3
 _ALARM = 0.01
+_LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
 
 
@@ -263,9 +264,17 @@ class _Diagnoser:
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}
 
-    def _sample(self, candidate: Candidate, noise: tuple[str, ...]) -> ModelSamples:
-        evidence = candidate.evidence[noise]
-        return sample_model(candidate.found, evidence, self.recording, weights=candidate.weights, rng=self.rng)
+    def _sample(self, candidate: Candidate, noise: Names) -> ModelSamples:
+        """Draw from the posterior of a candidate's hypothesis, over all SSF orders that matter."""
+        alike = [c for (_, names), c in self.search.candidates.items() if names == candidate.names]
+        log_z = np.array([c.evidence[noise].log_z for c in alike])
+        weights = np.exp(log_z - log_z.max())
+        kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
+        parts = [
+            sample_model(c.found, c.evidence[noise], self.recording, weights=c.weights, rng=self.rng)
+            for c in itertools.compress(alike, kept)
+        ]
+        return over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
 
     def _spread(self, values: FloatArray) -> FloatArray:
         out = np.full(len(self.recording), np.nan)
@@ -348,7 +357,8 @@ class _Diagnoser:
                 effect = next((e for e in holder.found.model.effects if e.name == name), effect)
                 own = samples
                 if name not in samples.effects:
-                    own = self._sample(holder, noise)
+                    evidence, weights = holder.evidence[noise], holder.weights
+                    own = sample_model(holder.found, evidence, self.recording, weights=weights, rng=self.rng, n_steps=0)
                 values, size = own.columns(name), self._size(holder, name, noise)
             out.append(
                 EffectFound(

@@ -60,6 +60,13 @@ class NoiseEvidence:
         """The most probable node's."""
         return self.laid_out.laws[int(np.argmax(self.log_z_nodes))]
 
+    @property
+    def at_best(self) -> NoiseEvidence:
+        """The most probable node alone."""
+        at = [int(np.argmax(self.log_z_nodes))]
+        laid_out = LaidOut(self.laid_out.settings[at], (self.law,), self.laid_out.log_weights[at])
+        return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], laid_out)
+
 
 def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     """Integrate a fit's likelihood over its parameters and the noise sd (Laplace), and the noise model's nodes.

@@ -1,0 +1,45 @@
+"""Posterior samples of a diagnosed model."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.coordinates import default_sensor
+from probewise.diagnosis.repaired import ModelSamples, over_orders
+from probewise.effects import Extent
+from probewise.recordings import two_way_plan
+
+PLAN = two_way_plan()
+
+
+def samples_of(n_gaussians: int, n: int = 500) -> ModelSamples:
+    sensor = default_sensor(Extent(10.0, 60.0, PLAN), n_gaussians)
+    z = 0.3 * np.random.default_rng(n_gaussians).standard_normal((n, sensor.n_params))
+    chain = sensor.chain(PLAN, (), n_nodes=16)
+    return ModelSamples(chain, sensor.theta(z), np.full(n, float(n_gaussians)), (), n_gaussians)
+
+
+def test_a_gaussian_in_halves_predicts_the_same():
+    one, three = samples_of(1), samples_of(3)
+    mixed = over_orders([one, three], np.array([1.0, 0.0]), rng=np.random.default_rng(0))
+    assert mixed.n_gaussians == 3
+    assert mixed.theta.shape == three.theta.shape
+    expected = np.sort(one.chain.predict(one.theta, PLAN)[:, 150])
+    np.testing.assert_allclose(np.sort(mixed.chain.predict(mixed.theta, PLAN)[:, 150]), expected, rtol=1e-10)
+
+
+def test_orders_are_mixed_by_their_probability():
+    mixed = over_orders([samples_of(1), samples_of(2)], np.array([0.3, 0.7]), rng=np.random.default_rng(3))
+    of_one = int(np.sum(mixed.noise_sd == 1.0))
+    # Four sd of a binomial of 500: fails by chance once in 16,000 seeds.
+    assert of_one == pytest.approx(150, abs=4 * np.sqrt(500 * 0.3 * 0.7))
+    assert dataclasses.replace(mixed).theta.shape == (500, 14)
+
+
+def test_one_order_alone_stays_as_it_is():
+    one = samples_of(2)
+    alone = over_orders([one], np.ones(1), rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(np.sort(alone.theta, axis=0), np.sort(one.theta, axis=0))

@@ -17,7 +17,7 @@ def hidden(name, size=8.0, *, cosines=None, on_noise=False, in_vocabulary=True, 
 def case(kind="clean", size=0.0, *, truth=(), hides=(), said=None, p=0.97, **others):
     said = list(truth) if said is None else list(said)
     verdict = {(): "clean", ("unknown",): "unknown"}.get(tuple(said), "named")
-    scan = {"null": -120.0, "repaired": -100.0, "true": -100.0}
+    scan = {"null": -120.0, "repaired": -100.0, "right": -100.0, "true": -100.0}
     return {
         "kind": kind,
         "size": size,

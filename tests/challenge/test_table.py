@@ -130,16 +130,17 @@ def test_intervals_count_where_the_name_is_right(make):
 
 def test_the_held_out_gain_is_a_ratio_of_sums(make):
     def scans(repaired):
-        return {
-            name: {"null": -100.0, "repaired": repaired, "true": -80.0} for name in ("angle", "pattern", "direction")
-        }
+        own = {"null": -100.0, "repaired": repaired, "right": -90.0, "true": -80.0}
+        return dict.fromkeys(("angle", "pattern", "direction"), own)
 
     results = [
         make.single(held_out=scans(-80.0)),
         make.single(held_out=scans(-90.0)),
         make.single(held_out=scans(-101)),
     ]
-    assert row(results, "held-out gain, share of the true model's").found.value == pytest.approx((20 + 10 - 1) / 60)
+    assert row(results, "held-out gain, share of the right model's").found.value == pytest.approx((20 + 10 - 1) / 30)
+    of_truth = row(results, "  share of what the truth itself would gain").found.value
+    assert of_truth == pytest.approx((20 + 10 - 1) / 60)
     assert row(results, "held-out worse than the null by over 1 nat").found.value == pytest.approx(1 / 3)
 
 

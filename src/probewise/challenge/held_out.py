@@ -6,9 +6,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration import FittedSensor, predict
-from probewise.diagnosis import Diagnosis
+from probewise.diagnosis import Diagnosis, model_with
 from probewise.recordings.plan import Recording
-from probewise.world.challenge import Case, kept_back
+from probewise.world.challenge import NO_PHYSICS, Case, kept_back
 
 __all__ = ["log_densities"]
 
@@ -16,18 +16,23 @@ __all__ = ["log_densities"]
 def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator) -> dict[str, dict[str, float]]:
     """Sum the log predictive densities of each scan kept back, in nats.
 
-    Both sensors are those that `probewise diagnose` writes. The true model knows the noise-free reading and the sd
-    of the noise's normal part; it is the truth where the noise is white.
+    "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", where all that is concealed
+    is in the vocabulary, is the model with just these effects, fitted to the same readings: nobody could have
+    named better. "true" is beyond reach, since it knows the noise-free reading and the sd of the noise's
+    normal part; it is the truth where the noise is white.
 
     Returns
     -------
-    By name of the scan: "null", "repaired" and "true".
+    By name of the scan, then of the model.
     """
+    fitting, *drawing = rng.spawn(4)
+    models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
+    hidden = case.truth.hidden
+    if hidden and all(h.in_vocabulary and h.name not in NO_PHYSICS for h in hidden):
+        models["right"] = model_with(case.recording, [h.name for h in hidden], rng=fitting)
     sensors = {
         name: samples.fitted_sensor(diagnosis.recording, rng=child)
-        for (name, samples), child in zip(
-            (("null", diagnosis.null), ("repaired", diagnosis.repaired)), rng.spawn(2), strict=True
-        )
+        for (name, samples), child in zip(models.items(), drawing, strict=False)
     }
     return {
         scan: {

@@ -7,6 +7,7 @@ the gain is shown on readings kept back.
 
 from probewise.diagnosis.audit import Alias, NextMeasurement
 from probewise.diagnosis.audit_document import CURE_PLAN, audit_json
+from probewise.diagnosis.chosen import model_with
 from probewise.diagnosis.document import diagnosis_json, diagnosis_schema
 from probewise.diagnosis.engine import SensorPrior, Thorough, diagnose
 from probewise.diagnosis.joining import join
@@ -61,5 +62,6 @@ __all__ = [
     "diagnosis_json",
     "diagnosis_schema",
     "join",
+    "model_with",
     "weigh_thoroughly",
 ]

@@ -184,7 +184,7 @@ def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
 def _posterior_draws(
     found: Fit, noise: NoiseEvidence, recording: Recording, n_steps: int, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw coordinates, (N_SAMPLES, n_params): from Laplace's approximation, resampled by weight, then Metropolis steps."""
+    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, resampled by weight, then Metropolis steps."""
     law = noise.law
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
     sigma = law.scale(whitened)

@@ -2,7 +2,8 @@
 
     python benchmarks/inquiry_speed.py --circles 5 --out docs/results/inquiry_speed.json
 
-Medians over the readings of whole runs, the study's first row, on circles that the study does not look for.
+Medians over the readings of whole runs, the study's first row, on circles that the study does not look for; and
+of as many runs for each other shape, drawn from its prior, under the same sensor (seed: the number of the run).
 The plain ways, in the same process and about the same posterior:
 
 - the map's predictions by the sensor's closed form for every hypothesis at every one of the 131 x 65 places,
@@ -20,16 +21,21 @@ import json
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from probewise.experiment import Experiment, Field, Step, explore
+from probewise.arm import Pose, Reach, SimulatedArm
+from probewise.experiment import SHAPES, Experiment, Field, Step, explore
 from probewise.experiment.asking import inquire
 from probewise.experiment.loop import from_scratch
 from probewise.experiment.particles import update
+from probewise.inquiry import Grid
+from probewise.scene import Field as PlayingField
+from probewise.scene import HypothesisScene
 from probewise.study import REFERENCE, Trial, arm_of, experiment_of
 
 FIRST_CIRCLE = 2000  # the study looks for the first thousand at most
@@ -52,16 +58,15 @@ def plain_map_s(experiment: Experiment, step: Step) -> float:
     return took * len(theta) / SOME_HYPOTHESES
 
 
-def follow(circle: int) -> list[dict[str, float]]:
+def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str, float]]:
     """Run once, and time every step again by itself."""
-    experiment = experiment_of(REFERENCE)
     rows = []
-    with arm_of(Trial(REFERENCE, circle)) as arm:
+    with arm:
         field = Field.under(arm, experiment.grid)
-        steps = list(explore(arm, experiment, rng=np.random.default_rng(circle)))
+        steps = list(explore(arm, experiment, rng=np.random.default_rng(run)))
     for number, (before, after) in enumerate(pairwise(steps)):
         problem = experiment.problem([step.reading for step in steps[: number + 2]])
-        rng = np.random.default_rng([circle, number])
+        rng = np.random.default_rng([run, number])
         scratch = partial(from_scratch, problem, experiment, rng)
         ask = partial(inquire, experiment, after.posterior, field, at=after.reading, rng=rng)
         infer = partial(update, before.posterior, problem, rng=rng, fall_back=scratch, blocks=experiment.blocks)
@@ -72,30 +77,60 @@ def follow(circle: int) -> list[dict[str, float]]:
     return rows
 
 
+def circle(run: int) -> list[dict[str, float]]:
+    """Look for a circle of the study."""
+    trial = Trial(REFERENCE, FIRST_CIRCLE + run)
+    return follow(arm_of(trial), experiment_of(REFERENCE), FIRST_CIRCLE + run)
+
+
+def other_shape(name: str, run: int) -> list[dict[str, float]]:
+    """Look for another shape, read in closed form: what the robot does with a reading is the same."""
+    shape = SHAPES[name](PlayingField())
+    known = experiment_of(REFERENCE)
+    chain = replace(known.model, scene=HypothesisScene(shape))
+    experiment = replace(known, shape=shape, model=chain)
+    rng = np.random.default_rng(run)
+    truth = shape.prior.from_unit_cube(rng.random((1, len(shape.prior.names))))
+
+    def light(pose: Pose, time_s: float, height_mm: float) -> float:
+        place = Grid(2.0, 2.0, 2, 2).plan("field").take(np.array([0]))
+        place = replace(place, x_mm=np.array([pose.x_mm]), y_mm=np.array([pose.y_mm]))
+        return float(chain.predict(truth, place)[0, 0] + rng.standard_normal())
+
+    return follow(SimulatedArm(light, reach=Reach.everywhere(), scale=None), experiment, run)
+
+
+def medians(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Take the median of every time, to three digits."""
+    return {name: float(f"{np.median([row[name] for row in rows if name in row]):.3g}") for name in rows[0]}
+
+
+def ratio(rows: list[dict[str, float]], plain: str, ours: str) -> float:
+    """Take the median ratio of two times over the readings that are done both ways."""
+    return round(float(np.median([row[plain] / row[ours] for row in rows if plain in row])), 1)
+
+
 def main() -> None:
     """Write the medians."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--circles", type=int, default=5, metavar="N")
+    parser.add_argument("--circles", type=int, default=5, metavar="N", help="and as many of each other shape")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    rows = [row for k in range(arguments.circles) for row in follow(FIRST_CIRCLE + k)]
-    medians = {name: float(np.median([row[name] for row in rows if name in row])) for name in rows[0]}
-    both = [row for row in rows if "plain_map_s" in row]
-
-    def ratio(plain: str, ours: str) -> float:
-        return round(float(np.median([row[plain] / row[ours] for row in both])), 1)
-
-    found = {
-        "command": f"python benchmarks/inquiry_speed.py --circles {arguments.circles}",
-        "decisions": len(rows),
-        "median": {name: float(f"{value:.3g}") for name, value in medians.items()},
-        "ratio": {
-            "map, closed form over ours": ratio("plain_map_s", "map_s"),
-            "inference, nested sampling over ours": ratio("nested_sampling_s", "inference_s"),
-        },
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
-    }
-    arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+    looks = {"circle": circle} | {name: partial(other_shape, name) for name in SHAPES if name != "circle"}
+    found = {}
+    for name, look in looks.items():
+        rows = [row for run in range(arguments.circles) for row in look(run)]
+        found[name] = {
+            "decisions": len(rows),
+            "median": medians(rows),
+            "ratio": {
+                "map, closed form over ours": ratio(rows, "plain_map_s", "map_s"),
+                "inference, nested sampling over ours": ratio(rows, "nested_sampling_s", "inference_s"),
+            },
+            "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        }
+    command = f"python benchmarks/inquiry_speed.py --circles {arguments.circles}"
+    arguments.out.write_text(json.dumps({"command": command, **found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

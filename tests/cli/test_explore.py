@@ -1,10 +1,14 @@
 """What `probewise explore` says of the choices it offers."""
 
 import json
+import math
+from dataclasses import replace
 
 import pytest
 
+from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
+from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
 
@@ -69,3 +73,71 @@ def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, mon
         (_, naive, _), (_, ssf, _) = views
         assert ssf.mean.tolist() == [line["belief"]["mean"][name] for name in ssf.names] != naive.mean.tolist()
     assert "naive model makes of the same readings" in (tmp_path / "found" / "report.html").read_text()
+
+
+@pytest.fixture
+def at_14_mm(sensor_file):
+    """The sensor's description says at which height it was calibrated."""
+    write_sensor(replace(read_sensor(sensor_file), instrumentation=Instrumentation(height_mm=14.0)), sensor_file)
+
+
+@pytest.mark.usefixtures("at_14_mm")
+def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept(explore, capsys):
+    more = ("--orientations", "0,90", "--heights", "10,14", "--repeats", "2", "--utility", "per-second")
+    status, lines = explore(*more, "--max-readings", 2)
+    assert status == 0
+    options = lines[0]["options"]
+    assert options["orientations_rad"] == [0.0, math.pi / 2]
+    assert (options["heights_mm"], options["calibrated_height_mm"], options["repeats"]) == ([10.0, 14.0], 14.0, [2])
+    first, second = (line["pose"] for line in lines[1:])
+    assert first == second
+    assert first["height_mm"] in (10.0, 14.0)
+    assert first["orientation_rad"] in (0.0, math.pi / 2)
+    status, resumed = explore(*more, "--max-readings", 3, "--resume")
+    assert status == 0
+    assert resumed[:3] == lines
+    capsys.readouterr()
+    status, _ = explore("--max-readings", 4, "--resume")
+    assert status == 2
+    said = capsys.readouterr().err
+    assert "options.heights_mm [10.0, 14.0] there, [] here" in said
+    assert "options.batch" not in said
+
+
+REFUSED = {
+    "no wrist": (("--orientations", "0,45", "--arm", "nxt:/dev/null"), "no joint of which turns its sensor"),
+    "one height": (("--heights", "10,14", "--arm", "nxt:/dev/null"), "which reads 14 mm above the surface"),
+    "a point sees no height": (("--heights", "10", "--model", "naive"), "which knows no height"),
+    "nor beside": (("--heights", "10", "--both-models"), "the naive model knows no height"),
+    "into the table": (("--heights", "0,10"), "finite, greater than 0"),
+    "no angle": (("--orientations", "0,north"), "no list of numbers"),
+    "no end": (("--orientations", "inf"), "no list of numbers"),
+    "never": (("--repeats", "1,0"), "no whole number above 0"),
+}
+
+
+@pytest.mark.usefixtures("at_14_mm")
+@pytest.mark.parametrize(("options", "why"), REFUSED.values(), ids=REFUSED)
+def test_what_an_arm_cannot_choose_is_refused_in_one_line(options, why, sensor_file, tmp_path, capsys):
+    out = tmp_path / "found"
+    assert main([str(word) for word in ("explore", "--sensor", sensor_file, "--out", out, *options)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert why in said
+    assert not out.exists()
+
+
+def test_a_height_is_refused_where_that_of_the_calibration_is_not_known(sensor_file, tmp_path, capsys):
+    out = tmp_path / "found"
+    assert main(["explore", "--sensor", str(sensor_file), "--out", str(out), "--heights", "10"]) == 2
+    assert "does not say at which height_mm it was calibrated" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behind(sensor_file, tmp_path, capsys):
+    out = tmp_path / "found"
+    command = ("explore", "--sensor", sensor_file, "--out", out, "--utility", "about:width_mm")
+    assert main([str(word) for word in command]) == 2
+    said = capsys.readouterr().err
+    assert "parameter is 'width_mm'; allowed: one of x_mm, y_mm, radius_mm" in said
+    assert not list(tmp_path.glob("found/*"))

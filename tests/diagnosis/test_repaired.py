@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.repaired import ModelSamples, over_orders
-from probewise.effects import Extent
+from probewise.diagnosis.repaired import ModelSamples, doubted, over_orders
+from probewise.effects import ArmKnock, Extent
 from probewise.recordings import two_way_plan
 
 PLAN = two_way_plan()
@@ -43,3 +43,21 @@ def test_one_order_alone_stays_as_it_is():
     one = samples_of(2)
     alone = over_orders([one], np.ones(1), rng=np.random.default_rng(0))
     np.testing.assert_array_equal(np.sort(alone.theta, axis=0), np.sort(one.theta, axis=0))
+
+
+def test_a_share_of_the_samples_is_without_the_effect():
+    knock = ArmKnock.for_extent(Extent(10.0, 60.0, PLAN))
+    sensor, plain = default_sensor(Extent(10.0, 60.0, PLAN), 2), samples_of(1)
+    z = 0.3 * np.random.default_rng(7).standard_normal((500, sensor.n_params))
+    own = np.tile([0.8, -0.4, 3.0, float(np.median(PLAN.time_s))], (500, 1))
+    chain = sensor.chain(PLAN, (knock,), n_nodes=16)
+    repaired = ModelSamples(chain, np.concatenate([sensor.theta(z), own], axis=1), np.full(500, 2.0), ("arm_knock",), 2)
+    mixed = doubted(repaired, plain, [knock], 0.3, rng=np.random.default_rng(0))
+    without = mixed.noise_sd == 1.0
+    # Four sd of a binomial of 500: fails by chance once in 16,000 seeds.
+    assert without.sum() == pytest.approx(150, abs=4 * np.sqrt(500 * 0.3 * 0.7))
+    rows = np.flatnonzero(without)
+    expected = plain.chain.predict(plain.theta[rows], PLAN)
+    # Two quadratures: where a sample turns the sensor, straight edges are not taken together.
+    np.testing.assert_allclose(chain.predict(mixed.theta[rows], PLAN), expected, rtol=1e-8)
+    np.testing.assert_array_equal(mixed.theta[~without], repaired.theta[~without])

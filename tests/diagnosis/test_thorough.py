@@ -74,6 +74,21 @@ def test_the_null_is_always_weighed_too(stepped):
     assert found.probabilities == stepped.probabilities
 
 
+def test_where_no_density_fits_a_second_run_joins(stepped, monkeypatch):
+    """Three times the live points: the error falls as their root."""
+    errors = []
+
+    def unsound(result, *_, **__):
+        errors.append(result.log_z_error)
+        return SimpleNamespace(sound=False)
+
+    monkeypatch.setattr(thorough.nested, "refine", unsound)
+    _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
+    for weighing, alone in zip(weighings, errors, strict=True):
+        assert weighing.agree
+        assert weighing.error < 0.85 * alone
+
+
 def moved(stepped, monkeypatch, gap, doubts=()):
     def weigh(candidate, noise, *_, **__):
         own = gap if candidate.names else 0.5

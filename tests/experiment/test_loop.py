@@ -499,3 +499,35 @@ def test_a_run_that_nothing_within_reach_can_advance_stops_and_says_so(small):
     assert "every reading within reach promises the same" in result.stop_reason
     assert len(result.steps) <= 4
     assert not result.reached
+
+
+ONE_PLACE = Grid(400.0, 300.0, 3, 3)  # of which (200, 0) is the only one within 30 mm of the arm
+
+
+def test_the_only_place_within_reach_is_read_while_it_tells_something(small):
+    """A blurred edge leaves a little to learn from the mean of further readings at one place."""
+    arm = small.arm(reach_mm=30.0, truth=(230.0, 40.0, 60.0))
+    result = run(arm, small.experiment(grid=ONE_PLACE), rng=rng(), max_readings=4)
+    assert [(pose.x_mm, pose.y_mm) for pose in arm.poses] == [(200.0, 0.0)] * 4
+    assert result.stop_reason.startswith("max_readings = 4 is reached")
+    bits = [info.bits for info in result.steps]
+    assert bits[0] > 0.05
+    assert result.steps[0].map.highest > result.steps[2].map.highest > 0
+
+
+def test_a_run_stops_when_the_only_place_within_reach_has_told_all(small):
+    """A sensor that says yes or no, and has said it."""
+    arm = small.arm(sensor=small.sensor(0.0), reach_mm=30.0)
+    result = run(arm, small.experiment(blur_mm=0.0, grid=ONE_PLACE), rng=rng(), max_readings=20)
+    assert len(arm.poses) == 1
+    assert result.stop_reason.startswith("the only reading within reach promises nothing more, 0: none would tell")
+    assert "the widest length is known to" in result.stop_reason
+
+
+def test_an_only_place_that_tells_nothing_is_refused(small):
+    """No circle of the prior comes near the one place within reach."""
+    far = small.circle(width_mm=80.0, radius_mm=(20.0, 40.0))
+    arm = small.arm(reach_mm=30.0)
+    with pytest.raises(ParameterError, match="no reading within reach is expected to tell anything"):
+        run(arm, small.experiment(shape=far, grid=ONE_PLACE), rng=rng())
+    assert arm.poses == []

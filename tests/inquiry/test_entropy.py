@@ -110,7 +110,7 @@ def test_only_places_within_reach_are_chosen_or_asked():
 
     result = entropy_map(Watched(), circles(50), grid, grid.plan("field"), reachable=reachable, noise_sd=1.0)
     assert min(seen) > 900.0
-    assert result.choose(rng=np.random.default_rng(4))[0] > 900.0
+    assert grid.places_mm[choose(result.values, result.reachable, rng=np.random.default_rng(4)), 0] > 900.0
     assert (result.values[~reachable] == 0).all()
     assert np.isnan(result.image).sum() == (~reachable).sum()
 

@@ -182,6 +182,26 @@ def test_three_readings_one_by_one_keep_the_evidence() -> None:
     assert fell_back < len(z) / 10
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("n_first", [1, 3])
+def test_the_last_of_several_updates_scatters_as_claimed(n_first: int) -> None:
+    """Sixty seeds, from one reading and from three up to six: mean and sd of z within what chance allows."""
+    z, n_updates, fell_back = np.empty(60), 0, 0
+    for seed in range(60):
+        rng, whole = np.random.default_rng([seed, 2]), _line(2000 + seed)
+        now: NestedResult | Weighted = run(whole.first(n_first), rng=rng, n_live=100)
+        for n in range(n_first + 1, 7):
+            part = whole.first(n)
+            now = update(now, part, rng=rng, fall_back=partial(run, part, rng=rng, n_live=100))
+            n_updates += 1
+            fell_back += now.run is not None
+        z[seed] = (now.log_z - whole.log_z) / now.log_z_error
+    assert abs(z.sum()) < norm.isf(FALSE_ALARM / 2) * np.sqrt(len(z))
+    assert np.sum(z**2) < chi2.isf(FALSE_ALARM, len(z))
+    assert np.std(z) > 0.5  # careful, but not twice too careful
+    assert fell_back < n_updates / 5
+
+
 def test_a_reading_that_surprises_is_inferred_from_scratch() -> None:
     """A reading thirty prior predictive sd off leaves none of the old samples: the run takes over, and is right."""
     rng, whole = np.random.default_rng(5), _line(5)

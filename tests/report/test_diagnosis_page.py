@@ -1,15 +1,18 @@
 """The page of a diagnosis: its first screen says the verdict, the chance, the gain and what to do."""
 
 import dataclasses
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from probewise.diagnosis import audit_recorded, diagnose
+from probewise.diagnosis import ParameterFound, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan
 from probewise.report import diagnosis as page
 from probewise.report.covariate import category_names, covariate_label, covariate_values
-from probewise.report.plots import gain_by_scan, mean_residuals
+from probewise.report.diagnosis_figures import gain_by_scan, mean_residuals
+from probewise.report.drawing import Bars, Line
+from probewise.report.words import readable
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
@@ -46,12 +49,50 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated):
 
 @pytest.mark.slow
 def test_every_place_has_its_covariate_row_by_row(saturated):
+    by_witness = covariate_values(saturated)
+    assert set(by_witness) == {place.witness for place in saturated.where}
     for place in saturated.where:
-        values = covariate_values(saturated, place)
+        values = by_witness[place.witness]
         rows = np.isfinite(values)
         assert rows.any()
         if place.start is not None and category_names(saturated, place) is None:
             assert values[rows].min() <= place.start <= place.end <= values[rows].max()
+
+
+@pytest.mark.slow
+def test_every_figure_is_svg_that_a_browser_can_read(saturated):
+    for name, image in page.figures(saturated).items():
+        assert name.endswith(".svg")
+        root = ElementTree.fromstring(image)
+        assert root.tag.endswith("svg")
+        assert b"nan" not in image
+
+
+@pytest.mark.slow
+def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
+    """Its mean says nothing where the miss changes its sign within the scan."""
+    scan = saturated.recording.plan.scan_names[0]
+    place = dataclasses.replace(saturated.where[0], covariate="scan", scan=scan, start=None, end=None)
+    drawn = page.figures(dataclasses.replace(saturated, where=(place,)))
+    shown = drawn[place.witness].decode()
+    assert shown.count("each reading") == 2
+    assert f"(mm), scan {scan}" in shown
+
+
+@pytest.mark.slow
+def test_scans_that_an_effect_is_bound_to_are_named(saturated):
+    bound = ParameterFound("scans", "scan", 5.5, 1.1, (4.0, 7.0))
+    effect = dataclasses.replace(
+        saturated.effects[0], probability=0.9, parameters=(bound,), scans=("edge_90_out", "edge_90_back")
+    )
+    found = dataclasses.replace(saturated, effects=(effect,))
+    html = page.write_page(found, page.figures(found), source="some.csv", seed=1)
+    assert "edge_90_out, edge_90_back" in html
+    assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]
+
+
+def test_numbers_are_written_as_people_write_them():
+    assert readable("(p = 2.2e-07) -0.3 mm in edge-90") == "(p = 2.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
 
 
 def test_labels_carry_units():
@@ -63,35 +104,31 @@ def test_labels_carry_units():
 def test_residuals_are_averaged_in_even_steps_with_their_chance():
     """Ten thousand readings of a step of two: the means stand at 0 and 2 in steps of the covariate."""
     x = np.linspace(0.0, 1.0, 10_000)
-    ax = mean_residuals(x, 2.0 * (x > 0.5), None, sd=1.0, label="x", unit="V")
-    (line, *_) = (part for part in ax.get_lines() if part.get_label() == "model as calibrated")
-    at, mean = line.get_data()
-    np.testing.assert_allclose(np.diff(at), 1 / 24, rtol=0.01)
-    np.testing.assert_allclose(mean, 2.0 * (at > 0.5), atol=0.01)
+    marks = mean_residuals(x, 2.0 * (x > 0.5), None, sd=1.0)
+    (line,) = (mark for mark in marks if isinstance(mark, Line))
+    np.testing.assert_allclose(np.diff(line.x), 1 / 24, rtol=0.01)
+    np.testing.assert_allclose(line.y, 2.0 * (line.x > 0.5), atol=0.01)
 
 
-def test_categories_are_named_on_the_axis():
-    ax = mean_residuals(
-        np.repeat([-1.0, 1.0], 30),
-        np.zeros(60),
-        np.zeros(60),
-        sd=1.0,
-        label="way",
-        unit="V",
-        names={-1.0: "back", 1.0: "forth"},
-    )
-    assert [text.get_text() for text in ax.get_xticklabels()] == ["back", "forth"]
+def test_values_without_a_scale_stand_side_by_side():
+    way = np.repeat([-1.0, 1.0], 30)
+    area, before, after = mean_residuals(way, way, 0 * way, sd=1.0, names={-1.0: "back", 1.0: "forth"})
+    np.testing.assert_allclose(before.y, [-1.0, 1.0])
+    np.testing.assert_allclose(after.y, [0.0, 0.0])
+    assert (before.x < area.x).all()
+    assert (area.x < after.x).all()
 
 
 def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
-    scans = [(f"scan_{k}", float(k)) for k in range(40)]
-    ax = gain_by_scan(scans, 19.5, 1.9, most=4)
-    assert [text.get_text() for text in ax.get_yticklabels()] == ["scan 0", "scan 1", "scan 38", "scan 39"]
+    panel = gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
+    (bars,) = (mark for mark in panel.marks if isinstance(mark, Bars))
+    np.testing.assert_allclose(bars.length, [*range(39, 33, -1), *range(5, -1, -1)])
+    assert panel.y_names[0] == (0.0, "scan 39")
 
 
 @pytest.mark.slow
 def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
     worse = dataclasses.replace(saturated.improvement, heldout_log_density_per_reading=-1.0, heldout_sd=0.1)
     found = dataclasses.replace(saturated, improvement=worse)
-    drawn = {**page.figures(saturated), "gain.png": b""}
+    drawn = {**page.figures(saturated), "gain.svg": b""}
     assert "Worse than before" in page.write_page(found, drawn, source="some.csv", seed=1)

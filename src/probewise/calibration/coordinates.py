@@ -57,29 +57,36 @@ class MomentCoordinates:
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters, (n_samples, 6 N + 2); also the prior's log density over them, (n_samples,)."""
         n = self.prior.n_gaussians
-        g = x[:, : 6 * n].reshape(len(x), n, 6)
+        # A row for each kind of coordinate, (6, N, n_samples): every operation then runs along memory.
+        g = np.ascontiguousarray(x[:, : 6 * n].reshape(len(x), n, 6).transpose(2, 1, 0))
         # A sampler asks far outside too; nothing there may overflow.
-        log_mass, log_x, log_y = (np.clip(g[..., k], -100.0, 100.0) for k in (0, 3, 4))
-        r = np.tanh(g[..., 5])
+        log_variance = g[3:5].clip(-100.0, 100.0)
+        log_first, log_ratio = g[0, 0].clip(-100.0, 50.0), g[0, 1:].clip(-100.0, 0.0)
+        r = np.tanh(g[5])
         rest = np.maximum(1.0 - r * r, 1e-12)
+        log_rest, both = np.log(rest), log_variance.sum(axis=0)
         out = np.empty_like(g)
-        a, b = 0.5 * np.exp(-log_x) / rest, 0.5 * np.exp(-log_y) / rest
-        out[..., 3], out[..., 4], out[..., 5] = a, b, -r * np.sqrt(a * b)
-        det = a * b * rest
-        scale = self.prior.amplitude_scale(det[:, 0])
-        out[:, 0, 0] = scale * np.exp(np.minimum(log_mass[:, 0], 50.0))
-        first = np.log(out[:, 0, 0]) - 0.5 * np.log(det[:, 0])
-        out[:, 1:, 0] = np.exp(np.minimum(log_mass[:, 1:], 0.0) + first[:, None] + 0.5 * np.log(det[:, 1:]))
-        share = _shares(g)
-        out[..., 1:3] = g[..., 1:3]
-        others = np.einsum("nk,nkj->nj", share[:, 1:], g[:, 1:, 1:3])
-        out[:, 0, 1:3] = (g[:, 0, 1:3] - others) / share[:, :1]
-        theta = np.concatenate([out.reshape(len(x), 6 * n), x[:, 6 * n :]], axis=1)
+        np.divide(0.5 * np.exp(-log_variance), rest, out=out[3:5])
+        product = out[3] * out[4]
+        np.multiply(-r, np.sqrt(product), out=out[5])
+        log_a = np.log(self.prior.amplitude_scale(product[0] * rest[0])) + log_first
+        # The others' masses follow from the first one's: a = mass times the root of A B - C^2.
+        half_log_det = -0.5 * (both + log_rest)
+        log_a = np.concatenate([log_a[None], log_ratio + (log_a - half_log_det[0]) + half_log_det[1:]])
+        np.exp(log_a, out=out[0])
+        ratio = np.exp(log_ratio)
+        whole = 1.0 + ratio.sum(axis=0)
+        out[1:3] = g[1:3]
+        out[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
+        theta = np.empty_like(x)
+        theta[:, : 6 * n] = out.transpose(2, 1, 0).reshape(len(x), 6 * n)
+        theta[:, 6 * n :] = x[:, 6 * n :]
         # d(A, B, C) / d(log variances, area tangent), d a / d log a, and the first centre from the whole's.
-        jacobian = np.log(out[..., 0]) - 3.0 * np.log(2.0) - 1.5 * (log_x + log_y) - 2.0 * np.log(rest)
-        log_density = self.prior.log_prob(theta) + jacobian.sum(axis=1) - 2.0 * np.log(share[:, 0]) + math.lgamma(n + 1)
-        falling = np.diff(np.concatenate([np.zeros((len(x), 1)), g[:, 1:, 0]], axis=1), axis=1) <= 0.0
-        usable = falling.all(axis=1) & (np.abs(g[..., 3:5]) < 100.0).all(axis=(1, 2)) & np.isfinite(theta).all(axis=1)
+        jacobian = log_a - 1.5 * both - 2.0 * log_rest
+        log_density = self.prior.log_prob(theta) + jacobian.sum(axis=0) + 2.0 * np.log(whole)
+        log_density += math.lgamma(n + 1) - 3.0 * n * math.log(2.0)
+        falling = (g[0, 1:2] <= 0.0).all(axis=0) & (g[0, 2:] <= g[0, 1:-1]).all(axis=0)
+        usable = falling & (np.abs(g[3:5]) < 100.0).all(axis=(0, 1)) & np.isfinite(theta).all(axis=1)
         return theta, np.where(usable, log_density, -np.inf)
 
 

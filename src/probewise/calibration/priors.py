@@ -133,14 +133,16 @@ class SSFPrior:
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
         self._require_columns(theta)
-        g = theta[:, :-2].reshape(len(theta), self.n_gaussians, 6)
-        a, product, c = g[..., 0], np.maximum(g[..., 3], 0) * np.maximum(g[..., 4], 0), g[..., 5]
+        # A row for each kind of parameter, (6, N, n_samples): every operation then runs along memory.
+        g = np.ascontiguousarray(theta[:, :-2].reshape(len(theta), self.n_gaussians, 6).transpose(2, 1, 0))
+        precisions = np.maximum(g[3:5], 0.0)
+        product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)
         inside = (scale > 0) & (np.abs(c) <= self.max_correlation * scale * (1 + 1e-12))
         a_scale = self.amplitude_scale(np.where(inside, product - c * c, 1.0))
-        each = self.amplitude.log_prob(a / a_scale) - np.log(a_scale * np.where(inside, scale, 1.0))
-        each += self.offset_mm.log_prob(g[..., 1:3]).sum(axis=2) + self.precision.log_prob(g[..., 3:5]).sum(axis=2)
-        total = np.where(inside, each - math.log(2 * self.max_correlation), -np.inf).sum(axis=1)
+        each = self.amplitude.log_prob(g[0] / a_scale) - np.log(a_scale * np.where(inside, scale, 1.0))
+        each += self.offset_mm.log_prob(g[1:3]).sum(axis=0) + self.precision.log_prob(g[3:5]).sum(axis=0)
+        total = np.where(inside, each - math.log(2 * self.max_correlation), -np.inf).sum(axis=0)
         total += self.i_min.log_prob(theta[:, -2]) + self.i_max.log_prob(theta[:, -1])
         return np.asarray(total)
 

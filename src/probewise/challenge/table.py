@@ -193,7 +193,7 @@ def _held_out(done: list[Result]) -> list[Row]:
 
 
 def _gains_of(results: Sequence[Result], best: str) -> FloatArray:
-    """List what the repaired and the best model gain over the null, by case and scan kept back, (n_cases, n_scans, 2)."""
+    """List what the repaired and the best model gain over the null, (n_cases, n_scans, 2)."""
     gains = [[_gains(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
 

@@ -14,21 +14,17 @@ __all__ = ["nested_progress"]
 
 
 @contextlib.contextmanager
-def nested_progress(*, quiet: bool) -> Iterator[Callable[[int, State], None]]:
-    """Yield what `calibrate` calls after every round: a line for each number of Gaussians."""
-    bars: dict[int, tqdm[Never]] = {}
+def nested_progress(*, quiet: bool) -> Iterator[Callable[[int | str, State], None]]:
+    """Yield what is called after every round: a line for each number of Gaussians, or hypothesis by name."""
+    bars: dict[int | str, tqdm[Never]] = {}
 
-    def show(n_gaussians: int, state: State) -> None:
-        if n_gaussians not in bars:
+    def show(what: int | str, state: State) -> None:
+        if what not in bars:
             for bar in bars.values():
                 bar.close()
-            bars[n_gaussians] = tqdm(
-                desc=f"{n_gaussians} Gaussian{'s' if n_gaussians > 1 else ''}",
-                unit=" points",
-                disable=True if quiet else None,
-                leave=True,
-            )
-        bar = bars[n_gaussians]
+            said = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
+            bars[what] = tqdm(desc=said, unit=" points", disable=True if quiet else None, leave=True)
+        bar = bars[what]
         bar.update(state.n_dead - bar.n)
         bar.set_postfix_str(f"ln Z {state.log_z:.1f}, at most {state.log_z_remaining - state.log_z:+.1f} to come")
 

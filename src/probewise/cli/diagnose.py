@@ -30,16 +30,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sensor", type=Path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
     )
+    parser.add_argument(
+        "--thorough",
+        action="store_true",
+        help="weigh the leading hypotheses again by nested sampling, which wins where it disagrees (a minute or two)",
+    )
     add_out_directory(parser)
     add_common(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose and write diagnosis.json, both models, the next plan, report.html and the figures."""
+    from functools import partial
+
     import numpy as np
 
     from probewise.calibration import read_sensor
-    from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join
+    from probewise.cli._progress import nested_progress
+    from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
     from probewise.recordings import read_recording
     from probewise.report import diagnosis as report
 
@@ -59,12 +67,15 @@ def run(arguments: argparse.Namespace) -> int:
         shapes.append(shape)
     if len(shapes) > 1:
         raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
-    diagnosis_rng, files_rng = np.random.default_rng(arguments.seed).spawn(2)
+    diagnosis_rng, files_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(3)
     joined = join(recordings)
     null = None
     if sensor is not None and shapes:
         null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
-    diagnosis = diagnose(joined, sensor=None if shapes else sensor, null=null, rng=diagnosis_rng)
+    with nested_progress(quiet=arguments.quiet) as show:
+        thorough = partial(weigh_thoroughly, rng=nested_rng, progress=show) if arguments.thorough else None
+        known = None if shapes else sensor
+        diagnosis = diagnose(joined, sensor=known, null=null, thorough=thorough, rng=diagnosis_rng)
     if null is not None:
         diagnosis = null.with_described_field(diagnosis)
     audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,6 +82,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="infer the SSF's size and place and both levels along with the shape, from what sensor.json says of them",
     )
     parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
+    more = parser.add_argument_group("more than a place", "what else the robot may choose, of an arm that can")
+    more.add_argument(
+        "--orientations", type=_numbers, metavar="DEG,...", help="how the sensor may be turned, such as 0,45,90"
+    )
+    more.add_argument(
+        "--heights", type=_numbers, metavar="MM,...", help="how high above the surface it may read, such as 10,14"
+    )
+    more.add_argument(
+        "--repeats", type=_counts, metavar="N,...", help="how often it may read on the spot, such as 1,2,4"
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the journal in DIR")
     add_common(parser)
 
@@ -109,6 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
     sensor = read_sensor(arguments.sensor)
     run_rng, truth_rng, other_rng = np.random.default_rng(arguments.seed).spawn(3)
     shape, utility = posing.shape_named(arguments.shape, field), utility_named(arguments.utility)
+    orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
     experiment = posing.experiment_for(
         sensor,
         shape,
@@ -117,9 +129,20 @@ def run(arguments: argparse.Namespace) -> int:
         utility=utility,
         learn_sensor=arguments.learn_sensor,
         batch=arguments.batch,
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+        heights_mm=heights_mm,
     )
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
-    other = posing.experiment_for(sensor, shape, field, model=other_model, utility=utility)
+    other = posing.experiment_for(
+        sensor,
+        shape,
+        field,
+        model=other_model,
+        utility=utility,
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+    )
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
     arm: Instrument
@@ -140,7 +163,6 @@ def run(arguments: argparse.Namespace) -> int:
     levels = (means["I_min"], means["I_max"])
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     folder = out / "frames"
-    folder.mkdir(parents=True, exist_ok=True)
     steps: list[Step] = []
     others: list[Step] = []
     frames, readings = [], []
@@ -167,6 +189,7 @@ def run(arguments: argparse.Namespace) -> int:
                 views = {arguments.model: (step, experiment), other_model: (shadow, other)}
                 titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
                 frames.append(report.frame_of_both(titled, readings, levels=levels, truth_mm=truth_mm))
+            folder.mkdir(exist_ok=True)
             write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
             if arguments.live:
                 write_text_atomically(out / "live.html", report.live_page(step, frames[-1]))
@@ -191,6 +214,42 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Read "A,B,...", each number once, for argparse."""
+    try:
+        values = tuple(float(cell) for cell in text.split(","))
+    except ValueError:
+        values = (math.nan,)
+    if not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,45,90")
+    return tuple(dict.fromkeys(values))
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    """Read "N,M,...", whole numbers above zero, each once, for argparse."""
+    return tuple(dict.fromkeys(positive_int(cell) for cell in text.split(",")))
+
+
+def _choices(
+    arguments: argparse.Namespace, geometry: Geometry | None
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
+    """Take orientations in radians, heights and repeats that may be chosen, of an arm that can."""
+    turns, heights_mm = arguments.orientations, arguments.heights
+    asked = {"--orientations": turns, "--heights": heights_mm}
+    refused = {}
+    if geometry is not None:
+        refused = {
+            "--orientations": "none with the LEGO arm, no joint of which turns its sensor",
+            "--heights": f"none with the LEGO arm, which reads {geometry.read_height_mm:g} mm above the surface",
+        }
+    elif arguments.both_models:
+        refused = {"--heights": "none with --both-models, for the naive model knows no height"}
+    for option, allowed in refused.items():
+        if asked[option] is not None:
+            raise ParameterError(option, ",".join(f"{value:g}" for value in asked[option]), allowed)
+    return tuple(math.radians(turn) for turn in turns or (0.0,)), heights_mm or (), arguments.repeats or (1,)
 
 
 def _field(text: str | None, geometry: Geometry | None) -> Field:

@@ -51,6 +51,13 @@ class Bank:
         first = int(self.widths[:at].sum())
         return self.columns[:, first : first + int(self.widths[at])]
 
+    def take(self, members: IntArray) -> Bank:
+        """Keep these templates."""
+        starts = np.cumsum(self.widths) - self.widths
+        at = [np.arange(starts[k], starts[k] + self.widths[k]) for k in members]
+        columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
+        return Bank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
+
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
         """Weigh each template against a fit, as `block_log_bayes_factors` does.
 

@@ -16,9 +16,11 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.covariates import Covariate
+from probewise.diagnosis.evidence import Blocks, Linearised
 
-__all__ = ["unknown_templates"]
+__all__ = ["unknown_templates", "unlike_named"]
 
+_LIKE = 0.9  # cosine from which what has no name is what has one
 _MOST_GROUPS = 24
 _FEW_SCANS = 6
 _MEMORIES = (3.0, 10.0, 30.0)  # readings
@@ -62,6 +64,25 @@ def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope
     found += [("ends of scans", template) for template in _ends(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return Bank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
+
+
+def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
+    """Leave out single bases of which what survives looks like that of a named effect, cosine 0.9 and more.
+
+    A window that reaches to the end of the recording is a light that was switched on: what has a name
+    must not be found without it.
+    """
+    single = np.flatnonzero(bases.widths == 1)
+    if single.size == 0 or named.widths.size == 0:
+        return bases
+    alone = bases.take(single).columns
+    own = Blocks.of(problem, list(alone.T[:, :, None]), [""] * len(single)).u
+    starts = np.cumsum(named.widths) - named.widths
+    templates = [named.columns[:, a : a + w] for a, w in zip(starts, named.widths, strict=True)]
+    blocks = Blocks.of(problem, templates, named.labels)
+    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
+    like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
+    return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))
 
 
 def _family(covariate: Covariate, template: FloatArray) -> str:

@@ -29,7 +29,7 @@ from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.noise import noise_statistics, steps_within_scans
 from probewise.diagnosis.null import Null
-from probewise.diagnosis.repaired import ModelSamples, over_orders, sample_model
+from probewise.diagnosis.repaired import ModelSamples, doubted, over_orders, sample_model
 from probewise.diagnosis.search import search
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.unknown import correct
@@ -62,6 +62,7 @@ Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
 N_DRAWS = 999
 _LEAST_PROBABILITY = 1e-3
 _ALARM = 0.01
+_LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
 
@@ -196,6 +197,11 @@ class _Diagnoser:
             )
         best = self.search.best(mean_names, noise_of) or null
         samples = self._sample(best, noise_of)
+        written = samples
+        if verdict == "unknown" and foreseen:
+            plain = self._sample_of(self.search.candidates[best.n_gaussians, ()], noise_of)
+            share = max(1 - _by_mean(probabilities)[foreseen], _LEAST_DOUBT)
+            written = doubted(samples, plain, best.found.model.effects, share, rng=self.rng)
         null_samples = self._sample(null, noise_of)
         effects = self._effects(hypotheses, best, samples, noise_of)
         after = Linearised.of(best.found, best.evidence[noise_of].law)
@@ -228,7 +234,7 @@ class _Diagnoser:
             noise=self._noise(best, noise_of, after, samples),
             next_measurement=self._next(hypotheses, null),
             null=null_samples,
-            repaired=samples,
+            repaired=written,
             residuals_before=self._spread(null.found.residuals),
             residuals_after=self._spread(residuals_after),
             predicted_before=predicted_before,
@@ -270,11 +276,12 @@ class _Diagnoser:
         log_z = np.array([c.evidence[noise].log_z for c in alike])
         weights = np.exp(log_z - log_z.max())
         kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
-        parts = [
-            sample_model(c.found, c.evidence[noise], self.recording, weights=c.weights, rng=self.rng)
-            for c in itertools.compress(alike, kept)
-        ]
+        parts = [self._sample_of(c, noise) for c in itertools.compress(alike, kept)]
         return over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
+
+    def _sample_of(self, candidate: Candidate, noise: Names) -> ModelSamples:
+        evidence = candidate.evidence[noise]
+        return sample_model(candidate.found, evidence, self.recording, weights=candidate.weights, rng=self.rng)
 
     def _spread(self, values: FloatArray) -> FloatArray:
         out = np.full(len(self.recording), np.nan)

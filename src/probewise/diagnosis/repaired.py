@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -19,14 +20,14 @@ from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joint import JointProblem
 from probewise.diagnosis.null import Predictor
-from probewise.effects import NUISANCES, Extent, NoiseEffect, Quantisation
+from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.nested import diversify
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
 from probewise.sensor import ACCURATE_NODES
 
-__all__ = ["ModelSamples", "over_orders", "sample_model"]
+__all__ = ["ModelSamples", "doubted", "over_orders", "sample_model"]
 
 N_SAMPLES = 500
 N_STEPS = 12
@@ -166,6 +167,43 @@ def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.r
     ]
     noise_sd = [part.noise_sd[:count] for part, count in zip(parts, counts, strict=True)]
     return replace(largest, theta=np.concatenate(theta)[order], noise_sd=np.concatenate(noise_sd)[order])
+
+
+def doubted(
+    repaired: ModelSamples,
+    plain: ModelSamples,
+    effects: Sequence[NamedEffect[Any]],
+    share: float,
+    *,
+    rng: np.random.Generator,
+) -> ModelSamples:
+    """Let a share of the samples be those of the plain sensor, every effect's amplitudes 0 there.
+
+    Where it is not certain what is missing, a repair may fail in scans unlike those that it comes from; then the
+    plain sensor's samples are what keeps a prediction from being sure and wrong.
+
+    Parameters
+    ----------
+    repaired, plain
+        Samples with effects and without, `plain` of no more Gaussians, as many of each.
+    effects
+        Those on the mean.
+    share
+        Probability that it is none of these effects.
+    rng
+        Source of randomness.
+    """
+    absent = [f"{e.name}.{e.prior.names[k]}" for e in effects for k in e.amplitudes]
+    if not all(effect.amplitudes for effect in effects):  # nothing says how such an effect is absent
+        return repaired
+    rows = np.flatnonzero(rng.random(len(repaired.theta)) < share)
+    theta, n_sensor = repaired.theta.copy(), 6 * repaired.n_gaussians + 2
+    theta[rows, :n_sensor] = _halved(plain.theta[rows], plain.n_gaussians, repaired.n_gaussians)[:, :n_sensor]
+    for name in absent:
+        theta[rows, list(repaired.chain.names).index(name)] = 0.0
+    noise_sd = repaired.noise_sd.copy()
+    noise_sd[rows] = plain.noise_sd[rows]
+    return replace(repaired, theta=theta, noise_sd=noise_sd)
 
 
 def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.bank import Bank
-from probewise.diagnosis.bases import unknown_templates
+from probewise.diagnosis.bases import unknown_templates, unlike_named
 from probewise.diagnosis.convergence import require_finite
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
@@ -123,7 +123,10 @@ class _Searcher:
         slope = slope_along_the_move(null.found.model, null.found.z)[self.usable]
         self.covariates = tuple(covariates_of(self.recording.plan, self.usable, level, slope))
         starts = np.flatnonzero(steps_within_scans(self.recording) == 0)
-        self.bases = unknown_templates(self.covariates, level - level.min(), slope, starts)
+        bases = unknown_templates(self.covariates, level - level.min(), slope, starts)
+        named = [effect for name, effect in self.mean_effects.items() if name not in UNNAMED]
+        problem = Linearised.of(null.found, self._law_of(null))
+        self.bases = unlike_named(bases, self.templates.bank(null.found, named), problem)
         if self.depth > 1:
             self._screen_pairs(null)
         self._grow_beam()

@@ -22,7 +22,8 @@ __all__ = ["weigh_thoroughly"]
 
 N_LIVE = 200
 
-_MOST = 3  # hypotheses that are weighed again, the null apart
+_LEAST, _MOST = 2, 3  # hypotheses that are weighed again, the null apart
+_MORE = 2  # times as many live points where the posterior has no simple form
 _LEAST_PROBABILITY = 0.01
 
 Names = tuple[str, ...]
@@ -32,7 +33,7 @@ Progress = Callable[[str, nested.State], None]
 def weigh_thoroughly(
     search: Search, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress | None = None
 ) -> tuple[Search, tuple[Weighing, ...]]:
-    """Weigh the null and up to three leading hypotheses by nested sampling.
+    """Weigh two or three leading hypotheses, and the null, by nested sampling.
 
     Where the two disagree by more than a nat, and no run has doubts, nested sampling wins: the evidence of what
     was weighed is moved, and what is unknown beside it, and all probabilities are made anew. What Laplace misses
@@ -46,7 +47,8 @@ def weigh_thoroughly(
     rng
         Source of randomness.
     n_live
-        Live points of each run.
+        Live points of each run. Where no density fits its samples (`probewise.nested.refine`), a second run of
+        twice as many joins it.
     progress
         Called after every round with the label of what is being weighed, and the state.
 
@@ -76,7 +78,7 @@ def _leaders(search: Search) -> list[tuple[Candidate, Names]]:
         merged[mean] = merged.get(mean, 0.0) + p
     out: list[tuple[Candidate, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
-        if len(out) == _MOST or (out and merged[mean] < _LEAST_PROBABILITY):
+        if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
             break
         noise = _noise_of(search, mean)
         candidate = search.best(mean, noise)
@@ -110,13 +112,12 @@ def _weigh(
     show = None if progress is None else lambda state: progress(weighing.label, state)
     result = nested.run(problem, rng=rng, n_live=n_live, progress=show, return_interrupted=False)
     sharper = nested.refine(result, problem, rng=rng)
-    best = sharper if sharper.sound else result
-    return replace(
-        weighing,
-        nested=best.log_z + candidate.log_share,
-        error=best.log_z_error,
-        doubts=() if sharper.sound else tuple(result.warnings),
-    )
+    if sharper.sound:
+        return replace(weighing, nested=sharper.log_z + candidate.log_share, error=sharper.log_z_error)
+    again = nested.run(problem, rng=rng, n_live=_MORE * n_live, progress=show, return_interrupted=False)
+    both = nested.merge([result, again], rng=rng)
+    log_z = both.log_z + candidate.log_share
+    return replace(weighing, nested=log_z, error=both.log_z_error, doubts=tuple(both.warnings))
 
 
 def _moved(search: Search, gaps: dict[tuple[int, Names], float]) -> Search:

@@ -22,15 +22,16 @@ __all__ = ["ArmKnock", "GainStep"]
 
 @dataclass(frozen=True)
 class ArmKnock(SinceAMoment[Poses]):
-    """Arm or paper is pushed: from at_s on every place is (dx_mm, dy_mm) off."""
+    """The arm is pushed: from at_s on every place is (dx_mm, dy_mm) off, and the sensor turned by turn_deg."""
 
     typical_mm: float = 0.3
+    typical_deg: ClassVar[float] = 2.0
 
     name: ClassVar[str] = "arm_knock"
     stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "s")
+    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "deg", "s")
     covariates: ClassVar[tuple[str, ...]] = ("time", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
+    amplitudes: ClassVar[tuple[int, ...]] = (0, 1, 2)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -40,25 +41,31 @@ class ArmKnock(SinceAMoment[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        """Shift along X and along Y, and the moment."""
-        shift = HeavyTailed(self.typical_mm)
-        return Product({"dx_mm": shift, "dy_mm": shift, "at_s": Uniform(*self.open_s)})
+        """Shift along X and along Y, turn, and the moment."""
+        shift, turn = HeavyTailed(self.typical_mm), HeavyTailed(self.typical_deg)
+        return Product({"dx_mm": shift, "dy_mm": shift, "turn_deg": turn, "at_s": Uniform(*self.open_s)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the places of the readings taken after the moment."""
+        """Shift the places of the readings taken after the moment, and turn the sensor there."""
         since = self.since(theta, plan)
-        return replace(value, x_mm=value.x_mm + theta[:, :1] * since, y_mm=value.y_mm + theta[:, 1:2] * since)
+        return replace(
+            value,
+            x_mm=value.x_mm + theta[:, :1] * since,
+            y_mm=value.y_mm + theta[:, 1:2] * since,
+            orientation_rad=value.orientation_rad + np.deg2rad(theta[:, 2:3]) * since,
+        )
 
     def bank(self) -> FloatArray:
-        """One setting of two columns, in the middle of the time left open."""
-        at_s = sum(self.open_s) / 2
-        return np.array([[[self.typical_mm, 0.0, at_s], [0.0, self.typical_mm, at_s]]])
+        """One setting of three columns, in the middle of the time left open."""
+        sizes = np.diag([self.typical_mm, self.typical_mm, self.typical_deg])
+        return np.concatenate([sizes, np.full((3, 1), sum(self.open_s) / 2)], axis=1)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say when, and how far."""
         return (
-            f"from {give_or_take(mean[2], sd[2])} s on every place is off by {give_or_take(mean[0], sd[0])} mm along X "
-            f"and {give_or_take(mean[1], sd[1])} mm along Y: arm or paper was pushed"
+            f"from {give_or_take(mean[3], sd[3])} s on every place is off by {give_or_take(mean[0], sd[0])} mm along X "
+            f"and {give_or_take(mean[1], sd[1])} mm along Y, and the sensor turned by {give_or_take(mean[2], sd[2])} "
+            "degrees: arm or paper was pushed"
         )
 
 

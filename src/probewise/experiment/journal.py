@@ -242,20 +242,27 @@ def _pose_line(pose: Pose) -> dict[str, float]:
 
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
     """Raise FileError naming every setting in which a journal differs from the run that wants to resume it."""
-    here = json.loads(json.dumps(settings))
+    there, here = _flat(journal.settings), _flat(json.loads(json.dumps(settings)))
     different = sorted(
-        name
-        for name in {*journal.settings, *here} - {"format", "version", "spawn_key"}
-        if journal.settings.get(name) != here.get(name)
+        name for name in {*there, *here} - {"format", "version", "spawn_key"} if there.get(name) != here.get(name)
     )
     if different:
-        had = "; ".join(f"{name} {journal.settings.get(name)!r} there, {here.get(name)!r} here" for name in different)
+        had = "; ".join(f"{name} {there.get(name)!r} there, {here.get(name)!r} here" for name in different)
         raise FileError(
             journal.path,
             f"a run with other settings: {had}",
             "resume with the settings it was begun with, or begin a new journal under another name",
             row=1,
         )
+
+
+def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Name every single setting, so that a message shows what differs and no more: "options.repeats"."""
+    out: dict[str, Any] = {}
+    for name, value in settings.items():
+        inner = value.items() if isinstance(value, dict) else ()
+        out |= {f"{name}.{key}": item for key, item in inner} or {name: value}
+    return out
 
 
 @dataclass(eq=False)
@@ -267,7 +274,7 @@ class JournalWriter:
 
     @classmethod
     def begin(cls, path: str | Path, settings: Mapping[str, Any]) -> JournalWriter:
-        """Begin a new journal with these settings.
+        """Begin a new journal with these settings, in a directory that is made if missing.
 
         Raises
         ------
@@ -276,6 +283,7 @@ class JournalWriter:
         """
         if Path(path).exists():
             raise FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
         return cls(Path(path), open(path, "ab"))
 

@@ -94,9 +94,14 @@ def stop_reason(
     if known:
         return f"every length is known to better than {experiment.stop_sd_mm:g} mm"
     if outlook.flat:
+        promise = (
+            "every reading within reach promises the same"
+            if np.count_nonzero(outlook.reachable) > 1
+            else "the only reading within reach promises nothing more"
+        )
         return (
-            f"every reading within reach promises the same, {outlook.highest:.2g}: none would tell the hypotheses "
-            f"apart that are left; the widest length is known to {widest:.1f} mm"
+            f"{promise}, {outlook.highest:.2g}: none would tell the hypotheses apart that are left; "
+            f"the widest length is known to {widest:.1f} mm"
         )
     if max_readings is not None and n_readings >= max_readings:
         return f"max_readings = {max_readings} is reached; the widest length is known to {widest:.1f} mm"

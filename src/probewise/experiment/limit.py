@@ -37,7 +37,8 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_sample
     outlook = experiment.forecast.outlook(
         theta, weight, designs, designs.plan(PATTERN), np.arange(experiment.grid.n_places), experiment.noise_sd
     )
-    mass, levels = outlook.mass(weight), outlook.levels
+    _, mass = next(outlook.maps(weight))
+    levels = outlook.levels
     beside = levels[int(mass.sum(axis=0).argmax())]
     covered = float(mass[:, np.abs(levels - beside) > _MET * experiment.noise_sd].sum(axis=1).max())
     prior_bits = prior_entropy(prior, rng=rng)

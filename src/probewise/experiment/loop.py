@@ -57,7 +57,7 @@ def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> 
     ReachError
         If no place is reachable.
     ParameterError
-        If the prior has no mass, or every place promises the same.
+        If the prior has no mass, every place promises the same, or the only one nothing.
     """
     posterior = prior_particles(experiment.prior, experiment.n_particles, rng=rng)
     prospect, outlook = inquire(experiment, posterior, field, at=None, rng=rng)
@@ -236,11 +236,11 @@ def _steps(
     before: Journal | None,
 ) -> Iterator[Step]:
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
+    field = Field.under(instrument, experiment.grid)
+    first = _rng_of(seed, 0)
+    prior_bits = prior_entropy(experiment.prior, rng=first)
+    state = begin(experiment, field, rng=first)  # before there is a journal: what cannot begin leaves none
     with _writer(path, before, experiment, seed) as writer:
-        field = Field.under(instrument, experiment.grid)
-        first = _rng_of(seed, 0)
-        prior_bits = prior_entropy(experiment.prior, rng=first)
-        state = begin(experiment, field, rng=first)
         stopped = False
         while not stopped:
             number = len(state.readings) + 1

@@ -20,7 +20,6 @@ from probewise.experiment.particles import Block
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inference.student_t import StudentT
 from probewise.inquiry import (
-    AskedForecast,
     Designs,
     Finishing,
     Forecast,
@@ -203,8 +202,10 @@ class Experiment:
 
     @cached_property
     def forecast(self) -> Forecast:
-        """What predicts for many hypotheses at once, made when first asked for; a table knows one height only."""
-        return AskedForecast(self.model) if self.heights_mm else forecast_of(self.model)
+        """What predicts for many hypotheses at once, made when first asked for."""
+        if self.calibrated_height_mm is None:
+            return forecast_of(self.model)
+        return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)
 
     def problem(self, readings: Sequence[Reading]) -> SensorProblem:
         """Set up the inference from these readings."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -39,6 +40,8 @@ __all__ = ["SHAPES", "Model", "arm_over", "experiment_for", "shape_named", "surf
 
 Model: TypeAlias = Literal["ssf", "naive"]
 
+_USUAL_HEIGHT_MM = 14.0  # of the paper's sensor above the surface
+
 SHAPES: Mapping[str, Callable[[Field], Shape]] = {
     "circle": lambda field: Circle(field),
     "ellipse": lambda field: Ellipse(field),
@@ -64,6 +67,9 @@ def experiment_for(
     utility: Utility | None = None,
     learn_sensor: bool = False,
     batch: int = 1,
+    orientations_rad: tuple[float, ...] = (0.0,),
+    repeats: tuple[int, ...] = (1,),
+    heights_mm: tuple[float, ...] = (),
 ) -> Experiment:
     """Pose the experiment: a fitted sensor over a shape that is not known, read in whole LEGO units.
 
@@ -88,33 +94,36 @@ def experiment_for(
         calibration (see `sensor_prior`); for the SSF model.
     batch
         Readings that are chosen together.
+    orientations_rad, repeats, heights_mm
+        How the sensor may be turned, how often it may read on the spot and how high it may stand, for an arm that
+        can do so; heights for the SSF model of a sensor whose description says at which it was calibrated.
     """
     means = sensor.mean()
     levels = FixedLevels(means["I_min"], means["I_max"])
     scene = HypothesisScene(shape)
     noise_sd = float(sensor.noise_sd.mean())
-    grid = Grid(field.width_mm, field.height_mm)
-    worth = Finishing() if utility is None else utility
     lego = LegoScale()
-    ends = (lego.low, lego.high)
+    pose = partial(
+        Experiment,
+        shape,
+        noise_sd=noise_sd,
+        grid=Grid(field.width_mm, field.height_mm),
+        utility=Finishing() if utility is None else utility,
+        step=lego.step,
+        reading_range=(lego.low, lego.high),
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+        heights_mm=heights_mm,
+        calibrated_height_mm=_calibrated_height(sensor, model, heights_mm) if heights_mm else None,
+        batch=batch,
+        n_live=n_live,
+    )
     if model == "naive":
         if learn_sensor:
             raise ParameterError("learn_sensor", learn_sensor, 'False with the model "naive", which has no SSF')
         sd = math.hypot(noise_sd, 1 / math.sqrt(12))
-        likelihood = Naive(levels.i_min, sd, levels.i_max, sd)
-        return Experiment(
-            shape,
-            NaiveSensor(levels, scene),
-            likelihood,
-            noise_sd,
-            grid,
-            worth,
-            step=lego.step,
-            reading_range=ends,
-            batch=batch,
-            doubt_p=0.0,  # a reading on the edge never fits two levels, and the naive model knows no edge
-            n_live=n_live,
-        )
+        # A reading on the edge never fits two levels, and the naive model knows no edge.
+        return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
     n = sensor.n_gaussians
     mixture = mean_mixture(footprint_of(sensor.samples[:, : 6 * n], n), n_gaussians=n)
     effects = tuple(
@@ -122,31 +131,32 @@ def experiment_for(
         for effect in sensor.carried_effects
         if effect.stage is not Stage.NOISE  # readings far apart in place and time share no noise
     )
+    likelihood = Rounded(noise_sd, lego.step or 1.0, lego.low, lego.high)
     if learn_sensor:
-        chain = Chain(AdjustedMixture(mixture), FreeLevels(), scene, effects, n_nodes=FAST_NODES)
-    else:
-        chain = Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES)
-    return Experiment(
-        shape,
-        chain,
-        Rounded(noise_sd, lego.step or 1.0, *ends),
-        noise_sd,
-        grid,
-        worth,
-        sensor_prior=sensor_prior(sensor) if learn_sensor else None,
-        step=lego.step,
-        reading_range=ends,
-        batch=batch,
-        n_live=n_live,
-    )
+        free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, effects, n_nodes=FAST_NODES)
+        return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
+    return pose(Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES), likelihood)
+
+
+def _calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
+    """Take the height of the calibration: what the sensor sees at another follows from it."""
+    height_mm = sensor.instrumentation.height_mm
+    if model == "naive":
+        raise ParameterError("heights_mm", heights_mm, 'none with the model "naive", which knows no height')
+    if height_mm is None:
+        allowed = "none with this sensor: its description does not say at which height_mm it was calibrated"
+        raise ParameterError("heights_mm", heights_mm, allowed)
+    return height_mm
 
 
 def world_like(sensor: FittedSensor) -> World:
-    """Build the world that a sensor.json describes: its mean field as the spot, its levels and noise."""
+    """Build the world that a sensor.json describes: its mean field as the spot, its levels, noise and height."""
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
     spot = Spot(np.asarray(field.values), field.pixel_mm, corner)
-    return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=float(sensor.noise_sd.mean()))
+    height_mm = sensor.instrumentation.height_mm or _USUAL_HEIGHT_MM
+    noise_sd = float(sensor.noise_sd.mean())
+    return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=noise_sd, height_mm=height_mm)
 
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -104,10 +105,18 @@ class Step(ShowsItself):
         """Label of the most probable shape of a set; empty where there is one shape only."""
         return max(self.shapes, key=self.shapes.__getitem__, default="")
 
+    @property
+    def stance(self) -> str:
+        """How the sensor stood, as far as that was chosen, to be read after the place; empty where nothing was."""
+        pose, designs = self.reading.pose, self.map.designs
+        turned = f", turned {math.degrees(pose.orientation_rad):.0f}°" if len(designs.orientations_rad) > 1 else ""
+        raised = "" if pose.height_mm is None else f", {pose.height_mm:g} mm up"
+        return turned + raised
+
     def summary(self) -> str:
         """Say in one line what was read and what is now believed."""
         believed = ", ".join(
-            f"{name} {mean:.1f} ± {sd:.1f}"
+            f"{name} {mean:.{_decimals(name)}f} ± {sd:.{_decimals(name)}f}"
             for name, mean, sd in zip(self.names, self.mean, self.sd, strict=True)
             if np.isfinite(mean)
         )
@@ -115,7 +124,7 @@ class Step(ShowsItself):
         if self.shapes:
             believed = f"{self.likely_shape} (p = {self.shapes[self.likely_shape]:.2f}): {believed}"
         return (
-            f"reading {self.number}: {self.reading.value:g} at ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm; "
+            f"reading {self.number}: {self.reading.value:g} at ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm{self.stance}; "
             f"{believed}; {self.bits:.1f} bits"
         )
 
@@ -186,9 +195,14 @@ class Exploration(ShowsItself):
         lines += [f"{label:<12} p = {probability:.3f}" for label, probability in last.shapes.items()]
         width = max(9, *(len(name) for name in (*last.names, *last.sensor)))
         lines += [
-            f"{name:<{width}}  {mean:.2f} ± {sd:.2f}"
+            f"{name:<{width}}  {mean:.{1 + _decimals(name)}f} ± {sd:.{1 + _decimals(name)}f}"
             for name, mean, sd in zip(last.names, last.mean, last.sd, strict=True)
             if np.isfinite(mean)
         ]
         lines += [f"{name:<{width}}  {mean:.3g} ± {sd:.2g} (sensor)" for name, (mean, sd) in last.sensor.items()]
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.notes)])
+
+
+def _decimals(name: str) -> int:
+    """Decimals of a parameter by its unit, so that an angle of a milliradian shows as a tenth of a millimetre does."""
+    return 3 if name.endswith("_rad") else 1

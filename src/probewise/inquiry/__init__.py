@@ -3,7 +3,9 @@
 Hypotheses that are still believed predict a reading at every place of a fine grid; where
 their predictions differ most, a reading tells most. The worth of a reading is a small function
 behind one seam, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses; `InformationGain`
-asks the whole posterior and leaves out what is only noise.
+asks the whole posterior and leaves out what is only noise. Thousands of hypotheses are not asked one by one
+(`AskedForecast`) but looked up: discs in a table of the sensor's own (`DiscForecast`), ellipses and convex polygons in
+tables of what the unit Gaussian sees of a corner and of a bent edge (`SilhouetteForecast`).
 """
 
 from probewise.inquiry.batch import choose_several
@@ -12,13 +14,14 @@ from probewise.inquiry.choice import best_places, choose
 from probewise.inquiry.designs import Design, Designs
 from probewise.inquiry.discs import DiscTable
 from probewise.inquiry.finishing import Finishing
-from probewise.inquiry.forecast import AskedForecast, DiscForecast, Forecast, Outlook, forecast_of
+from probewise.inquiry.forecast import AskedForecast, Forecast, Outlook
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.information import bits_gained, gaussian_entropy, neighbour_entropy, prior_entropy
 from probewise.inquiry.labels import FunctionValue, Label, ParameterValue, WhichShape
 from probewise.inquiry.named import UTILITY_NAMES, utility_named
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.readout import Readout, entropy_bits
+from probewise.inquiry.tabled import DiscForecast, SilhouetteForecast, forecast_of
 from probewise.inquiry.telling_apart import Rival, tell_apart
 from probewise.inquiry.utility import (
     InformationAbout,
@@ -53,6 +56,7 @@ __all__ = [
     "ReadingEntropy",
     "Readout",
     "Rival",
+    "SilhouetteForecast",
     "Utility",
     "UtilityMap",
     "WhichShape",

@@ -56,8 +56,8 @@ def _after_imagined(
     prospect: Prospect, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
     """Draw a result of one design for each posterior and take it in."""
-    model, readout = prospect.forecast.model, prospect.readout
-    level = model.predict(prospect.theta, prospect.plan.take(prospect.rows[[row]]))[:, 0]
+    readout = prospect.readout
+    level = prospect.forecast.predict(prospect.theta, prospect.plan.take(prospect.rows[[row]]))[:, 0]
     sd = readout.noise_sd / np.sqrt(prospect.designs.n_repeats[prospect.rows[row]])
     out = []
     for weight in weights:

@@ -66,12 +66,13 @@ class Designs:
 
     @cached_property
     def combinations(self) -> tuple[Design, ...]:
-        """What is combined with each place, as designs at the field's corner."""
+        """What is combined with each place, as designs at the field's corner; repeats of one way to stand in a row."""
         names = [name for name, _ in self.settings]
         return tuple(
             Design(0.0, 0.0, turn, n, tuple(zip(names, values, strict=True)))
-            for turn, n in product(self.orientations_rad, self.repeats)
+            for turn in self.orientations_rad
             for values in product(*(values for _, values in self.settings))
+            for n in self.repeats
         )
 
     def __getitem__(self, row: int) -> Design:

@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
+from probewise.inquiry.spans import ROWS, Interval, Ring, Spans, single
 from probewise.recordings.plan import Plan
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
@@ -33,7 +34,6 @@ _FLAT = 1e-5  # share of the levels' difference by which a level counts as that 
 _DIRECTIONS = 128
 _BENDS = 8
 _TINY = 1e-30
-_ROWS = 3  # of the grid at a time: what is weighed there stays in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,29 +150,25 @@ class DiscTable:
         """
         n_levels = len(levels)
         per_level = 1.0 / (levels[1] - levels[0])
-        ends = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64)
+        dark, bright = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64).tolist()
         nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int16)
-        margin = self._margin_of(nearest, ends)
+        margin = self._margin_of(nearest, (dark, bright))
+        discs = single(theta)
         mass = np.empty((grid.n_places, n_levels))
         turn = turn_rad.reshape(grid.n_y, grid.n_x)
-        for start in range(0, grid.n_y, _ROWS):
-            rows = slice(start, start + _ROWS)
-            spans = _Spans.of(theta, grid, rows, margin)
-            own = mass[start * grid.n_x : (start + _ROWS) * grid.n_x]
+        for start in range(0, grid.n_y, ROWS):
+            y_mm = single(grid.y_mm[start : start + ROWS])
+            spans = _spans(discs, grid, y_mm, margin)
+            ring = spans.ring()
+            level: IntArray = np.full(len(ring.place), bright)  # a place on the very edge is inside
             if margin > 0.0:
-                ring = spans.ring()
-                key = ring.place * n_levels + nearest.reshape(-1)[self._entry(ring, turn[rows].ravel())]
-                near = np.bincount(key, weight[ring.hypothesis], minlength=own.size)
-                own[:] = near.reshape(own.shape)
-            else:
-                own[:] = 0.0
-            bright = spans.inside(weight)
-            dark = weight.sum() - bright - own.sum(axis=1)
-            own[:, ends[1]] += bright
-            own[:, ends[0]] += dark
+                away = _Away.of(discs, spans, ring, y_mm, turn[start : start + ROWS].ravel())
+                level = nearest.reshape(-1)[self._entry(away)]
+            rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
+            mass[rows] = spans.weigh(weight, ring, level, (dark, bright), n_levels)
         return mass
 
-    def _margin_of(self, nearest: IntArray, ends: IntArray) -> float:
+    def _margin_of(self, nearest: IntArray, ends: tuple[int, int]) -> float:
         """Distance from an edge beyond which the nearest of a list of levels is that of no edge."""
         if self.margin_mm == 0.0:
             return 0.0
@@ -180,21 +176,16 @@ class DiscTable:
         off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
         return float(np.abs(distance[off]).max(initial=0.0))
 
-    def _entry(self, ring: _Ring, turn_rad: FloatArray) -> IntArray:
-        """Index of the table's nearest entry for pairs of hypothesis and place."""
+    def _entry(self, away: _Away) -> IntArray:
+        """Index of the table's nearest entry for pairs of disc and place."""
         _, n_directions, n_distances = self.levels.shape
-        x, y = ring.x_mm, ring.y_mm
-        step = np.sqrt(x * x + y * y) - ring.radius_mm
-        step += self.margin_mm
+        step = away.distance_mm + np.float32(self.margin_mm)
         step *= self._per_mm
         step += 0.5
-        if turn_rad.any():
-            cosine, sine = (f(turn_rad).astype(np.float32)[ring.place] for f in (np.cos, np.sin))
-            x, y = cosine * x + sine * y, cosine * y - sine * x
-        turn = _pseudo_angle(x, y)
+        turn = _pseudo_angle(away.x_mm, away.y_mm)
         turn *= (n_directions - 1) / 4.0
         turn += 0.5
-        bend = (1.0 / ring.radius_mm - self.bend_per_mm[0]) * self._per_bend + 0.5
+        bend = (1.0 / away.radius_mm - self.bend_per_mm[0]) * self._per_bend + 0.5
         entry = bend.astype(np.int32) * n_directions
         entry += turn.astype(np.int32)
         entry *= n_distances
@@ -210,82 +201,43 @@ class DiscTable:
         return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Spans:
-    """Where discs cross some rows of a grid, (n_spans,) each: which row, which disc, and columns there.
+def _spans(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> Spans:
+    """Find where discs, (n_samples, 3), cross rows of a grid, (n_rows,), both in single precision."""
+    x, y, radius = discs.T
+    every_up = y_mm[:, None] - y
+    row, hypothesis = np.nonzero(np.abs(every_up) <= radius + np.float32(margin_mm))
+    x, radius, up = x[hypothesis], radius[hypothesis], every_up[row, hypothesis]
 
-    The row, counted from the first of them, is `up_mm` above the disc's centre. Columns from `first` to `last`
-    are in the disc or near its edge, those from `inner_first` to `inner_last` deep inside; where none is, these
-    are `last` + 1 and `last`. Single precision holds a place to a ten-thousandth of a millimetre.
-    """
+    def within(reach: FloatArray) -> Interval:
+        half = np.sqrt(np.maximum(reach * reach - up * up, 0.0))
+        return np.where(np.abs(up) < reach, x - half, np.inf), x + half
 
-    grid: Grid
-    n_rows: int
-    row: IntArray
-    hypothesis: IntArray
-    x_mm: FloatArray
-    up_mm: FloatArray
-    radius_mm: FloatArray
-    first: IntArray
-    last: IntArray
-    inner_first: IntArray
-    inner_last: IntArray
-
-    @classmethod
-    def of(cls, theta: FloatArray, grid: Grid, rows: slice, margin_mm: float) -> Self:
-        x, y, radius = theta.astype(np.float32).T
-        every_up = grid.y_mm[rows, None].astype(np.float32) - y
-        row, hypothesis = np.nonzero(np.abs(every_up) <= radius + np.float32(margin_mm))
-        x, radius, up = x[hypothesis], radius[hypothesis], every_up[row, hypothesis]
-        per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
-
-        def columns(reach: FloatArray) -> tuple[IntArray, IntArray]:
-            half = np.sqrt(np.maximum(reach * reach - up * up, 0.0))
-            first = np.ceil(np.maximum((x - half) * per_mm, 0.0)).astype(np.int32)
-            last = np.floor(np.clip((x + half) * per_mm, -1.0, grid.n_x - 1.0)).astype(np.int32)
-            return np.minimum(first, last + 1), last
-
-        first, last = columns(radius + np.float32(margin_mm))
-        inner = np.maximum(radius - np.float32(margin_mm), 0.0)
-        inner_first, inner_last = columns(inner)
-        none = np.flatnonzero((np.abs(up) >= inner) | (inner_first > inner_last))
-        inner_first[none], inner_last[none] = last[none] + 1, last[none]
-        return cls(grid, len(every_up), row, hypothesis, x, up, radius, first, last, inner_first, inner_last)
-
-    def inside(self, weight: FloatArray) -> FloatArray:
-        """Weight of the discs that each place of the rows lies deep in, (n_rows * n_x,)."""
-        width = self.grid.n_x + 1
-        own, size = weight[self.hypothesis], self.n_rows * width
-        begins = np.bincount(self.row * width + self.inner_first, own, minlength=size)
-        ends = np.bincount(self.row * width + self.inner_last + 1, own, minlength=size)
-        return np.cumsum((begins - ends).reshape(self.n_rows, width), axis=1)[:, :-1].ravel()
-
-    def ring(self) -> _Ring:
-        """Pairs of hypothesis and place in the ring about the edge: left of what is deep inside, then right of it."""
-        n = len(self.row)
-        count = np.concatenate([self.inner_first - self.first, self.last - self.inner_last])
-        begin = np.concatenate([self.first, self.inner_last + 1])
-        # Repeating is the slow step: it is done once, and everything else is looked up.
-        part = np.repeat(np.arange(2 * n), count)
-        column = (begin - np.cumsum(count, dtype=np.int32) + count)[part]
-        column += np.arange(len(part), dtype=np.int32)
-        part[int(count[:n].sum()) :] -= n
-        x = column.astype(np.float32)
-        x *= np.float32(self.grid.width_mm / (self.grid.n_x - 1))
-        x -= self.x_mm[part]
-        column += (self.row * self.grid.n_x).astype(np.int32)[part]
-        return _Ring(self.hypothesis[part], column, x, self.up_mm[part], self.radius_mm[part])
+    outer = radius + np.float32(margin_mm)
+    inner = np.maximum(radius - np.float32(margin_mm), 0.0)
+    return Spans.between(grid, len(y_mm), row, hypothesis, within(outer), within(inner))
 
 
 @dataclass(frozen=True, eq=False)
-class _Ring:
-    """Pairs of hypothesis and place near its edge: place relative to the centre, and the radius, all (n_pairs,)."""
+class _Away:
+    """Pairs of disc and place near its edge, (n_pairs,) each: place relative to the centre in the sensor's frame."""
 
-    hypothesis: IntArray
-    place: IntArray
     x_mm: FloatArray
     y_mm: FloatArray
     radius_mm: FloatArray
+    distance_mm: FloatArray
+
+    @classmethod
+    def of(cls, discs: FloatArray, spans: Spans, ring: Ring, y_mm: FloatArray, turn_rad: FloatArray) -> Self:
+        own = discs[spans.hypothesis]
+        up, radius = (y_mm[spans.row] - own[:, 1])[ring.span], own[:, 2][ring.span]
+        x = single(ring.column)
+        x *= np.float32(spans.grid.width_mm / (spans.grid.n_x - 1))
+        x -= own[:, 0][ring.span]
+        distance = np.sqrt(x * x + up * up) - radius
+        if turn_rad.any():
+            cosine, sine = (single(f(turn_rad))[ring.place] for f in (np.cos, np.sin))
+            return cls(cosine * x + sine * up, cosine * up - sine * x, radius, distance)
+        return cls(x, up, radius, distance)
 
 
 def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.inquiry.forecast import predicted, spread_levels, thinned
+from probewise.inquiry.forecast import spread_levels, thinned
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
 
@@ -78,7 +78,7 @@ def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
     away = prospect.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()
     n = len(designs)
-    answers = predicted(prospect.forecast.model, prospect.theta[rows], prospect.plan.take(prospect.rows[designs]))
+    answers = prospect.forecast.predict(prospect.theta[rows], prospect.plan.take(prospect.rows[designs]))
     sd = prospect.readout.noise_sd
     levels = spread_levels(float(answers.min()), float(answers.max()), sd / _PER_SD)
     index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)

@@ -1,7 +1,8 @@
-"""What hypotheses predict at every design: weights of levels, by a table of discs or by asking them one by one."""
+"""What hypotheses predict at every design, as weights of levels; by asking them one by one, where no table serves."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,20 +10,15 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.discs import DiscTable
-from probewise.inquiry.grid import Grid
 from probewise.inquiry.sight import Sight
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["AskedForecast", "DiscForecast", "Forecast", "Outlook", "forecast_of", "predicted"]
+__all__ = ["AskedForecast", "Forecast", "Outlook", "by_combination", "predicted", "spread_levels", "thinned"]
 
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
 _MOST_ASKED = 400  # hypotheses that are asked one by one
-# Levels a noise sd. Rounding to the nearest adds to the noise's variance 2 % where thousands of hypotheses
-# average over it; of a few each counts by itself.
-_PER_SD_OF_MANY = 2.0
-_PER_SD_OF_FEW = 8.0
+_PER_SD = 8.0  # levels a noise sd: of a few hundred hypotheses each counts by itself
 
 
 class Outlook(Protocol):
@@ -33,8 +29,18 @@ class Outlook(Protocol):
         """Evenly spaced noise-free readings, (n_levels,); a prediction counts for the nearest."""
         ...
 
-    def mass(self, weight: FloatArray) -> FloatArray:
-        """Weight of the hypotheses that predict each level, (n_samples,) -> (n_designs, n_levels)."""
+    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Weigh the hypotheses that predict each level, one combination of the designs with all places after another.
+
+        Parameters
+        ----------
+        weight
+            Of the hypotheses, (n_samples,).
+
+        Yields
+        ------
+        Which of the designs that are looked at these are, (n,), and the weight of each level there, (n, n_levels).
+        """
         ...
 
 
@@ -43,7 +49,11 @@ class Forecast(Protocol):
 
     @property
     def model(self) -> SensorModel:
-        """The sensor model that answers for single hypotheses."""
+        """The sensor model that readings are held against."""
+        ...
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings of hypotheses at the rows of a plan, (n_samples, n_params) -> (n_samples, n_points)."""
         ...
 
     def outlook(
@@ -66,47 +76,14 @@ class Forecast(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class DiscForecast:
-    """All hypotheses, from the table of what the sensor reads of a disc."""
-
-    model: SensorModel
-    table: DiscTable
-
-    def outlook(
-        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> Outlook:
-        """See `Forecast.outlook`."""
-        levels = spread_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD_OF_MANY)
-        turns = plan.orientation_rad.reshape(-1, designs.grid.n_places)
-        return _DiscOutlook(self.table, theta, designs.grid, turns, rows, levels)
-
-
-@dataclass(frozen=True, eq=False)
-class _DiscOutlook:
-    table: DiscTable
-    theta: FloatArray
-    grid: Grid
-    turns_rad: FloatArray
-    rows: IntArray
-    levels: FloatArray
-
-    def mass(self, weight: FloatArray) -> FloatArray:
-        """See `Outlook.mass`: one map for each way that the sensor stands; the table knows no other setting."""
-        some = weight > 0
-        maps: dict[bytes, FloatArray] = {}
-        for turn in self.turns_rad:
-            if turn.tobytes() not in maps:
-                maps[turn.tobytes()] = self.table.mass(self.theta[some], weight[some], self.grid, self.levels, turn)
-        every = [maps[turn.tobytes()] for turn in self.turns_rad]
-        whole = every[0] if len(every) == 1 else np.concatenate(every)
-        return whole if len(self.rows) == len(whole) else whole[self.rows]
-
-
-@dataclass(frozen=True, eq=False)
 class AskedForecast:
     """Any model: at most 400 hypotheses, taken evenly by their weight, asked at every design."""
 
     model: SensorModel
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """See `Forecast.predict`."""
+        return predicted(self.model, theta, plan)
 
     def outlook(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
@@ -114,10 +91,10 @@ class AskedForecast:
         """See `Forecast.outlook`."""
         asked, share = thinned(weight, _MOST_ASKED)
         answers = predicted(self.model, theta[asked], plan.take(rows))
-        levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD_OF_FEW)
+        levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD)
         per_level = 1.0 / (levels[1] - levels[0])
         index = np.rint((answers - levels[0]) * per_level).astype(np.int32)
-        return _AskedOutlook(asked, share / weight[asked], index, levels)
+        return _AskedOutlook(asked, share / weight[asked], index, levels, rows, designs.grid.n_places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,20 +103,25 @@ class _AskedOutlook:
     stands_for: FloatArray
     index: IntArray
     levels: FloatArray
+    rows: IntArray
+    n_places: int
 
-    def mass(self, weight: FloatArray) -> FloatArray:
-        """See `Outlook.mass`."""
-        n_designs, n_levels = self.index.shape[1], len(self.levels)
-        key = self.index + np.arange(n_designs) * n_levels
-        own = np.repeat(weight[self.asked] * self.stands_for, n_designs)
-        counted = np.bincount(key.ravel(), own, minlength=n_designs * n_levels)
-        return np.asarray(counted.reshape(n_designs, n_levels), dtype=np.float64)
+    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """See `Outlook.maps`."""
+        own, n_levels = weight[self.asked] * self.stands_for, len(self.levels)
+        for _, at, places in by_combination(self.rows, self.n_places):
+            n = len(places)
+            key = self.index[:, at] + np.arange(n) * n_levels
+            counted = np.bincount(key.ravel(), np.repeat(own, n), minlength=n * n_levels)
+            yield at, np.asarray(counted.reshape(n, n_levels), dtype=np.float64)
 
 
-def forecast_of(model: SensorModel) -> Forecast:
-    """Choose the way that a model allows: the table where it can be made."""
-    table = DiscTable.of(model)
-    return AskedForecast(model) if table is None else DiscForecast(table if table.margin_mm else model, table)
+def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:
+    """Split rows of designs, (n,): number of the combination, which of the rows are of it, and their places."""
+    combination, place = np.divmod(rows, n_places)
+    for number in np.unique(combination).tolist():
+        at = np.flatnonzero(combination == number)
+        yield number, at, place[at]
 
 
 def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:

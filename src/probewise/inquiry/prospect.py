@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, require_finite
 from probewise.errors import ShapeError
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import Forecast, Outlook, predicted
+from probewise.inquiry.forecast import Forecast, Outlook
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 
@@ -83,7 +83,7 @@ class Prospect:
     @cached_property
     def predicted(self) -> FloatArray:
         """Noise-free readings of the few samples at every design that can be taken, (n_drawn, n)."""
-        answers = predicted(self.forecast.model, self.drawn, self.plan.take(self.rows))
+        answers = self.forecast.predict(self.drawn, self.plan.take(self.rows))
         require_finite("predicted", answers)
         return answers
 
@@ -95,43 +95,43 @@ class Prospect:
 
     def information(self, weight: FloatArray) -> FloatArray:
         """Give the bits expected of the reading at every design, were the hypotheses so weighted, (n_samples,)."""
-        mass = self.outlook.mass(weight)
-        return np.maximum(self.reading_entropy(mass) - self.noise_entropy(mass), 0.0)
-
-    def reading_entropy(self, mass: FloatArray) -> FloatArray:
-        """Entropy, bits, of the reading at every design: levels (n, n_levels), noise, rounding and range together.
-
-        `mass` may be that of some hypotheses only; it is taken to one.
-        """
-        out = np.zeros(len(self.rows))
-        level = mass.argmax(axis=1)
-        settled = mass[np.arange(len(mass)), level] >= _SETTLED * mass.sum(axis=1)
-        for rows, chance in self._chances:
-            known = rows[settled[rows]]
-            out[known] = entropy_bits(chance)[level[known]]
-            rest = rows[~settled[rows]]
-            for start in range(0, len(rest), _BLOCK):
-                block = rest[start : start + _BLOCK]
-                part = mass[block].astype(np.float32)
-                part /= part.sum(axis=1, keepdims=True)
-                out[block] = entropy_bits(part @ chance)
+        out = np.empty(len(self.rows))
+        for at, mass in self.outlook.maps(weight):
+            chance = self._chance(at)
+            out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
         return out
 
-    def noise_entropy(self, mass: FloatArray) -> FloatArray:
-        """Entropy, bits, that the reading at every design would have if the hypothesis were known, on average."""
-        out = np.zeros(len(self.rows))
-        for rows, chance in self._chances:
-            out[rows] = (mass @ entropy_bits(chance).astype(np.float64))[rows]
-        return np.asarray(out / mass.sum(axis=1))
+    def reading_entropy(self, weight: FloatArray) -> FloatArray:
+        """Give the entropy, bits, of the reading at every design: levels, noise, rounding and range together.
 
-    @cached_property
-    def _chances(self) -> list[tuple[IntArray, FloatArray]]:
-        """Designs of each number of repeats, and the probability of each cell given each level."""
-        repeats = self.designs.n_repeats[self.rows]
-        return [
-            (
-                np.flatnonzero(repeats == n),
-                self.readout.probability(self.outlook.levels, repeats=int(n), fine=_CELL).astype(np.float32),
-            )
-            for n in np.unique(repeats)
-        ]
+        The weights, (n_samples,), may leave out some hypotheses; they are taken to one.
+        """
+        out = np.empty(len(self.rows))
+        for at, mass in self.outlook.maps(weight):
+            out[at] = _entropy_of_readings(mass, self._chance(at))
+        return out
+
+    def _chance(self, at: IntArray) -> FloatArray:
+        """Probability of each cell given each level, for designs that are read equally often."""
+        n = int(self.designs.n_repeats[self.rows[at[0]]])
+        chance = self.readout.probability(self.outlook.levels, repeats=n, fine=_CELL)
+        return np.asarray(chance.astype(np.float32))
+
+
+def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
+    """Entropy, bits, of the cell that is read, of weights of levels (n, n_levels) that are taken to one: (n,)."""
+    level = mass.argmax(axis=1)
+    settled = mass[np.arange(len(mass)), level] >= _SETTLED * mass.sum(axis=1)
+    out = np.asarray(entropy_bits(chance)[level], dtype=np.float64)
+    rest = np.flatnonzero(~settled)
+    for start in range(0, len(rest), _BLOCK):
+        block = rest[start : start + _BLOCK]
+        part = mass[block].astype(np.float32)
+        part /= part.sum(axis=1, keepdims=True)
+        out[block] = entropy_bits(part @ chance)
+    return out
+
+
+def _entropy_of_noise(mass: FloatArray, chance: FloatArray) -> FloatArray:
+    """Entropy, bits, that is left on average when the level is known, of weights of levels (n, n_levels): (n,)."""
+    return np.asarray(mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1))

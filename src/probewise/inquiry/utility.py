@@ -84,11 +84,11 @@ class InformationAbout:
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Bits at every design, (n,)."""
         labels = self.of(prospect.names, prospect.theta, prospect.weight)
-        bits = prospect.reading_entropy(prospect.outlook.mass(prospect.weight))
+        bits = prospect.reading_entropy(prospect.weight)
         for value in np.unique(labels):
             weight = np.where(labels == value, prospect.weight, 0.0)
             if weight.sum() > 0:
-                bits -= weight.sum() * prospect.reading_entropy(prospect.outlook.mass(weight))
+                bits -= weight.sum() * prospect.reading_entropy(weight)
         return np.maximum(bits, 0.0)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ReachError, ShapeError
 from probewise.inquiry.choice import best_places, choose
-from probewise.inquiry.designs import Design, Designs
+from probewise.inquiry.designs import Designs
 from probewise.inquiry.forecast import AskedForecast
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.prospect import Prospect
@@ -58,22 +58,18 @@ class UtilityMap:
 
     @property
     def flat(self) -> bool:
-        """Whether every design that can be taken promises the same, so that none can be preferred."""
+        """Whether there is nothing to choose: all that can be taken promise the same, or the only one nothing."""
         values = self.values[self.reachable]
-        return bool(np.ptp(values) <= FLAT)
+        return bool(np.ptp(values) <= FLAT and (len(values) > 1 or values[0] <= FLAT))
 
     @property
     def best(self) -> BoolArray:
         """The designs that tie for the best, shape (n_designs,)."""
         return best_places(self.values, self.reachable)
 
-    def choose_design(self, *, rng: np.random.Generator) -> Design:
-        """Draw the next design at random among the best."""
-        return self.designs[choose(self.values, self.reachable, rng=rng)]
-
     def choose(self, *, rng: np.random.Generator) -> tuple[float, float]:
         """Draw the next place (x_mm, y_mm) at random among the best."""
-        design = self.choose_design(rng=rng)
+        design = self.designs[choose(self.values, self.reachable, rng=rng)]
         return design.x_mm, design.y_mm
 
 

@@ -35,7 +35,7 @@ class Clusters:
         """Give each point to the cluster whose Gaussian is densest there, (n, n_params) -> (n,)."""
         if len(self) == 1:
             return np.zeros(len(u), dtype=np.int64)
-        z = np.einsum("cij,cnj->cni", self.inverse_root, u[None, :, :] - self.mean[:, None, :])
+        z = (u[None, :, :] - self.mean[:, None, :]) @ self.inverse_root.transpose(0, 2, 1)
         return np.asarray(np.argmin(0.5 * np.einsum("cni,cni->cn", z, z) + self.log_det[:, None], axis=0))
 
     @staticmethod

@@ -174,15 +174,16 @@ class Evaluator:
                 yield self.problem.log_likelihood(part)
 
     def _numbers(self, answer: object, theta: FloatArray) -> FloatArray:
-        first = f"first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
         try:
             values = np.asarray(answer, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise NotConvergedError(f"the likelihood returned what are no numbers ({error}); {first}") from error
+            raise NotConvergedError(
+                f"the likelihood returned what are no numbers ({error}); {self._first(theta)}"
+            ) from error
         if values.shape != (len(theta),):
             raise NotConvergedError(
                 f"the likelihood returned shape {values.shape}; "
-                f"allowed: ({len(theta)},), one number a hypothesis; {first}"
+                f"allowed: ({len(theta)},), one number a hypothesis; {self._first(theta)}"
             )
         return values
 
@@ -198,7 +199,7 @@ class Evaluator:
         culprit = None if isinstance(error, BrokenExecutor) else self._culprit(theta)
         if culprit is not None:
             return f"the likelihood raised {said}; at {self._show(culprit)}"
-        return f"the likelihood raised {said}; first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
+        return f"the likelihood raised {said}; {self._first(theta)}"
 
     def _culprit(self, theta: FloatArray) -> FloatArray | None:
         """Ask again, half by half, for a hypothesis that fails by itself; None where it is the batch that fails."""
@@ -216,6 +217,9 @@ class Evaluator:
         except Exception:
             return True
         return False
+
+    def _first(self, theta: FloatArray) -> str:
+        return f"first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
 
     def _show(self, row: FloatArray) -> str:
         return ", ".join(f"{name} = {value:.10g}" for name, value in zip(self.names, row, strict=True))

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
-from scipy.stats import kstest
 
 from probewise._arrays import FloatArray, IntArray
 
 __all__ = ["Evidence", "insertion_p_value", "integrate", "log_volumes"]
 
-_SIMULATED_AT_A_TIME = 1_000_000
+_SIMULATED_AT_A_TIME = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +131,8 @@ def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.ran
     rng
         Spreads the discrete ranks evenly.
     """
+    from scipy.stats import kstest  # here, since it takes a second to import that most runs of the program do without
+
     if len(rank) < 20:
         return 1.0
     position = (rank + rng.random(len(rank))) / (n_below_or_above + 1.0)

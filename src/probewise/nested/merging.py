@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, ParameterError
@@ -121,7 +121,7 @@ def agreement_of(results: Iterable[NestedResult]) -> Agreement:
     weight = 1.0 / np.square(log_z_error)
     middle = float(weight @ log_z / weight.sum())
     chi_square = float(weight @ np.square(np.asarray(log_z) - middle))
-    return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chi2.sf(chi_square, len(log_z) - 1)))
+    return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chdtrc(len(log_z) - 1, chi_square)))
 
 
 def alive_at_death(
@@ -208,4 +208,4 @@ def _possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
 def _combined(p_values: Sequence[float]) -> float:
     """Combine independent p values (Fisher)."""
     statistic = -2.0 * float(np.log(np.maximum(p_values, 1e-300)).sum())
-    return float(chi2.sf(statistic, 2 * len(p_values)))
+    return float(chdtrc(2 * len(p_values), statistic))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.space import Space
 
 __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
@@ -155,6 +156,7 @@ class SliceMove:
         """Return the ends of one chain from each start; see `Move`."""
         n_chains, n_params = start.u.shape
         space = evaluate.space
+        walls = _walls(space)
         clusters = find_clusters(live)
         n_lines = max(_FEWEST_STEPS, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
@@ -173,26 +175,26 @@ class SliceMove:
 
         def begin(rows: IntArray) -> None:
             """Lay the next step's line, bracket and level."""
-            root, inverse = view.measures(rows, home[rows])[1:3]
-            kinds, at = kind[rows, step[rows]], np.arange(rows.size)
-            toward = np.einsum("nij,nj->ni", root, frames[rows, step[rows]])
-            along = np.flatnonzero(kinds == _AXIS)
+            kinds, measure = kind[rows, step[rows]], view.measure(rows, home[rows])
+            toward = np.zeros((rows.size, n_params))
+            along, follow = np.flatnonzero(kinds == _AXIS), np.flatnonzero(kinds == _DIFFERENCE)
+            turned = np.flatnonzero((kinds != _AXIS) & (kinds != _DIFFERENCE))
+            if turned.size:
+                frame = frames[rows[turned], step[rows[turned]]]
+                toward[turned] = self.width * np.matmul(view.root[measure[turned]], frame[:, :, None])[:, :, 0]
             if along.size:
                 which = axis[rows[along], step[rows[along]]]
-                marginal = np.sqrt((root[along, which] ** 2).sum(axis=1))
-                conditional = 1.0 / np.sqrt((inverse[along, :, which] ** 2).sum(axis=1))
-                toward[along] = 0.0
-                toward[along, which] = conditional * (marginal / conditional) ** rng.random(along.size)
-            line[rows] = self.width * toward
-            follow = at[kinds == _DIFFERENCE]
+                least, widening = view.conditional[measure[along], which], view.widening[measure[along], which]
+                toward[along, which] = self.width * least * widening ** rng.random(along.size)
             if follow.size:
                 n = len(live)
                 first = rng.integers(n - 1, size=follow.size)
                 second = (first + rng.integers(1, n - 1, size=follow.size)) % (n - 1)
                 # Counted from behind the chain's own start, so that neither is it.
                 behind = view.own_row[rows[follow]] + 1
-                line[rows[follow]] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
-            low[rows], high[rows] = _bracket(now.u[rows], line[rows], space.low, space.high, rng)
+                toward[follow] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
+            line[rows] = toward
+            low[rows], high[rows] = _bracket(now.u[rows], toward, walls, rng)
             level[rows] = now.log_density[rows] - rng.standard_exponential(rows.size)
 
         active = np.arange(n_chains)
@@ -202,7 +204,10 @@ class SliceMove:
             t, low[rows], high[rows] = _candidates(low[rows], high[rows], n_ahead, rng)
             of = np.repeat(np.arange(rows.size), n_ahead)
             chain = rows[of]
-            candidate = np.clip(now.u[chain] + t.reshape(-1, 1) * line[chain], space.low, space.high)
+            ahead = now.u[rows][:, None, :] + t[:, :, None] * line[rows][:, None, :]
+            candidate = ahead.reshape(-1, n_params)
+            if walls is not None:
+                np.clip(candidate, *walls, out=candidate)
             least = level[chain]
             ok = np.ones(chain.size, dtype=bool)
             place = home[chain]
@@ -220,7 +225,8 @@ class SliceMove:
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
                     candidate[first], log_growth = view.hop(who, now.u[who], home[who], goal[first])
                     least[first] -= log_growth
-                    ok[first] = ((candidate[first] >= space.low) & (candidate[first] <= space.high)).all(axis=1)
+                    if walls is not None:
+                        ok[first] = ((candidate[first] >= walls[0]) & (candidate[first] <= walls[1])).all(axis=1)
                 place = clusters.assign(candidate)
                 ok &= (kinds == _DIFFERENCE) | (place == goal)
             asked = np.flatnonzero(ok)
@@ -309,10 +315,18 @@ class _View:
 
     A metric that knows the start stretches the lines through it and shrinks those past it; with
     150 live points in 20 dimensions that alone raised log Z by more than one.
+
+    The measures of the clusters stand first, then each chain's own of the cluster that it began in: mean, root,
+    inverse root and log determinant, and of every axis the conditional sd and how much greater the marginal one is.
     """
 
-    clusters: Clusters
-    own: Clusters  # of each chain's start, without it
+    mean: FloatArray
+    root: FloatArray
+    inverse_root: FloatArray
+    log_det: FloatArray
+    conditional: FloatArray
+    widening: FloatArray
+    n_clusters: int
     own_home: IntArray
     own_row: IntArray  # where the start stands among the live points
 
@@ -321,33 +335,55 @@ class _View:
         same = (live[None, :, :] == u[:, None, :]).all(axis=2)
         # A start that is no live point is in no cluster's measure either.
         own_home = np.where(same.any(axis=1), home, -1)
-        return cls(clusters, clusters.without(u, home), own_home, np.argmax(same, axis=1))
-
-    def measures(self, rows: IntArray, home: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Mean, root, inverse root and log determinant of cluster `home` as chains `rows` see it."""
-        common, own, mine = self.clusters, self.own, home == self.own_home[rows]
-        return (
-            np.where(mine[:, None], own.mean[rows], common.mean[home]),
-            np.where(mine[:, None, None], own.root[rows], common.root[home]),
-            np.where(mine[:, None, None], own.inverse_root[rows], common.inverse_root[home]),
-            np.where(mine, own.log_det[rows], common.log_det[home]),
+        own = clusters.without(u, home)
+        root, inverse = (
+            np.concatenate([clusters.root, own.root]),
+            np.concatenate([clusters.inverse_root, own.inverse_root]),
         )
+        conditional = 1.0 / np.sqrt((inverse**2).sum(axis=1))
+        return cls(
+            np.concatenate([clusters.mean, own.mean]),
+            root,
+            inverse,
+            np.concatenate([clusters.log_det, own.log_det]),
+            conditional,
+            np.sqrt((root**2).sum(axis=2)) / conditional,
+            len(clusters),
+            own_home,
+            np.argmax(same, axis=1),
+        )
+
+    def measure(self, rows: IntArray, home: IntArray) -> IntArray:
+        """Find the measure by which chains `rows` see cluster `home`."""
+        return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
     def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
         """Map points to their counterparts in other clusters; also the log of the volume they grow by."""
-        mean, _, inverse, log_det = self.measures(rows, home)
-        goal_mean, goal_root, _, goal_log_det = self.measures(rows, goal)
-        z = np.einsum("nij,nj->ni", inverse, u - mean)
-        return goal_mean + np.einsum("nij,nj->ni", goal_root, z), goal_log_det - log_det
+        here, there = self.measure(rows, home), self.measure(rows, goal)
+        z = np.matmul(self.inverse_root[here], (u - self.mean[here])[:, :, None])
+        moved = self.mean[there] + np.matmul(self.root[there], z)[:, :, 0]
+        return moved, self.log_det[there] - self.log_det[here]
+
+
+Walls: TypeAlias = tuple[FloatArray, FloatArray]
+
+
+def _walls(space: Space) -> Walls | None:
+    """Least and greatest value of each coordinate; None where nothing bounds any."""
+    low, high = space.low, space.high
+    return (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
 
 
 def _bracket(
-    u: FloatArray, line: FloatArray, lowest: FloatArray, highest: FloatArray, rng: np.random.Generator
+    u: FloatArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Place a bracket of length one at random about each point, cut where the line leaves the space."""
     low = -rng.random(len(u))
+    if walls is None:
+        return low, low + 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        to_low, to_high = (lowest - u) / line, (highest - u) / line
-    entry = np.where(line == 0, -np.inf, np.minimum(to_low, to_high)).max(axis=1)
-    leave = np.where(line == 0, np.inf, np.maximum(to_low, to_high)).min(axis=1)
+        to_low, to_high = (walls[0] - u) / line, (walls[1] - u) / line
+    still = line == 0
+    entry = np.where(still, -np.inf, np.minimum(to_low, to_high)).max(axis=1)
+    leave = np.where(still, np.inf, np.maximum(to_low, to_high)).min(axis=1)
     return np.maximum(low, entry), np.minimum(low + 1.0, leave)

@@ -7,9 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.special import gammaln, logsumexp
 
 from probewise._arrays import FloatArray
@@ -87,6 +84,11 @@ def find_parts(x: FloatArray) -> Clusters:
     Pieces are what nearest neighbours join, so they are found at any scale and in any number (a lattice of modes,
     which no two Gaussians explain); what is too small to be measured goes to the nearest.
     """
+    # Here, since they take a quarter of a second to import that most runs of the program do without.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     n_samples, n_params = x.shape
     if n_samples <= _LINKS:
         return Clusters.of([x])

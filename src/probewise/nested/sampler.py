@@ -306,14 +306,16 @@ def _result(
     if now.n_stuck > _STUCK_SHARE * n_dead:
         notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
     order = live.points.order()
-    points = Points.join(*(d.points for d in dead), live.points.take(order))
+    parts = [*(d.points for d in dead), live.points.take(order)]
+    theta = np.concatenate([part.theta for part in parts])
+    log_likelihood, label = (np.concatenate([getattr(p, name) for p in parts]) for name in ("log_likelihood", "label"))
     n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(n_live, 0, -1)])
     evidence = integrate(
-        points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
+        log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
     origin = Origin.join(*(d.origin for d in dead), live.origin.take(order))
     parent = np.where(origin.parent >= 0, np.argsort(origin.ident)[origin.parent], -1)
-    born = birth_rows(points.log_likelihood, points.label, origin.log_birth, origin.birth_label)
+    born = birth_rows(log_likelihood, label, origin.log_birth, origin.birth_label)
     remembered = chain_memory(parent, born, n_at_death)
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
@@ -329,10 +331,10 @@ def _result(
         notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")
     return NestedResult(
         names=evaluate.names,
-        theta=points.theta,
-        log_likelihood=points.log_likelihood,
+        theta=theta,
+        log_likelihood=log_likelihood,
         log_weight=evidence.log_weight,
-        label=points.label,
+        label=label,
         log_birth=origin.log_birth,
         birth_label=origin.birth_label,
         parent=parent,

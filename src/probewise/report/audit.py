@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-from probewise.diagnosis import EffectAudit, PlanAudit
+from probewise.diagnosis import PlanAudit
 from probewise.diagnosis.commands import minutes_of
 from probewise.diagnosis.sights import ALIAS
+from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import audit_matrix, png
 from probewise.report.words import count, number
 
-__all__ = ["answer", "audit_table", "figures", "write_page"]
+__all__ = ["answer", "figures", "write_page"]
 
 
 def answer(audit: PlanAudit) -> str:
@@ -31,26 +32,6 @@ def figures(audit: PlanAudit) -> dict[str, bytes]:
     """Draw the figure of an audit: PNG by file name."""
     names, sights = [e.name for e in audit.effects], [e.sight for e in audit.effects]
     return {"audit.png": png(audit_matrix(names, sights, audit.cosines, alias=ALIAS))}
-
-
-def audit_table(effects: Sequence[EffectAudit]) -> Markup:
-    """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows."""
-    rank = ("invisible", "aliased", "fine")
-    return table(
-        ("effect", "seen", "survives", "looks like", "seen from (λ = 8)"),
-        (
-            (
-                effect.name.replace("_", " "),
-                effect.sight,
-                number(effect.share, 2),
-                effect.reason or ", ".join(f"{n.replace('_', ' ')} {c:.3f}" for n, c in effect.alike[:4]) or "–",
-                "; ".join(_smallest(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
-            )
-            for effect in sorted(effects, key=lambda e: rank.index(e.sight))
-        ),
-        caption="Survives: share of its trace that the sensor's own parameters do not absorb. Looks like: effects "
-        "that imitate a typical setting of it, with the cosine.",
-    )
 
 
 def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
@@ -103,7 +84,3 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
             f"the plan is in cure_plan.csv. Left after that: {', '.join(left) or 'nothing'}."
         ),
     )
-
-
-def _smallest(parameter: str, unit: str, amount: float | None) -> str:
-    return f"{parameter.replace('_', ' ')} not at all" if amount is None else f"{parameter} {amount:.2g} {unit}"

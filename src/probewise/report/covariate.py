@@ -11,7 +11,7 @@ from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.covariates import covariates_of
 from probewise.report.words import unit_name
 
-__all__ = ["category_names", "covariate_label", "covariate_values"]
+__all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words"]
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 WORDS = {
@@ -27,23 +27,40 @@ _STEP_MM = 0.25
 
 def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
     """Name a covariate with its unit; `unit` is the reading's."""
-    units = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
-    said = WORDS.get(name, name.replace("_", " "))
+    said, own = covariate_words(name), covariate_unit(name, unit)
     if scan is not None and name != "scan":
         said += f", scan {scan}"
-    return said + (f" ({units[name]})" if name in units else "")
+    return said + (f" ({own})" if own else "")
 
 
-def covariate_values(diagnosis: Diagnosis, place: Place) -> FloatArray:
-    """Give each row's value of the covariate of a place, (n_points,); NaN for rows that it does not speak of."""
+def covariate_words(name: str) -> str:
+    """Name a covariate."""
+    return WORDS.get(name, name.replace("_", " "))
+
+
+def covariate_unit(name: str, unit: str) -> str:
+    """Name its unit, "" where it has none that is known; `unit` is the reading's."""
+    return {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}.get(name, "")
+
+
+def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
+    """Give each row's value of the covariate of each place, (n_points,), by the place's witness.
+
+    NaN for rows that a place does not speak of.
+    """
+    if not diagnosis.where:
+        return {}
     plan = diagnosis.recording.plan
     usable = np.flatnonzero(diagnosis.recording.usable)
-    level, slope = diagnosis.predicted_before[usable], _slope(diagnosis)[usable]
-    out = np.full(len(plan), np.nan)
-    for covariate in covariates_of(plan, usable, level, slope):
-        # Of the covariate `scan` a place names the scan that stands out; all others are shown beside it.
-        if covariate.name == place.covariate and (covariate.scan == place.scan or place.covariate == "scan"):
-            out[usable[covariate.rows]] = covariate.values
+    covariates = covariates_of(plan, usable, diagnosis.predicted_before[usable], _slope(diagnosis)[usable])
+    out = {}
+    for place in diagnosis.where:
+        values = np.full(len(plan), np.nan)
+        for covariate in covariates:
+            # Of the covariate `scan` a place names the scan that stands out; all others are shown beside it.
+            if covariate.name == place.covariate and (covariate.scan == place.scan or place.covariate == "scan"):
+                values[usable[covariate.rows]] = covariate.values
+        out[place.witness] = values
     return out
 
 

@@ -103,7 +103,7 @@ def live_page(step: Step, picture: bytes) -> str:
 def errors_text(step: Step, truth: Mapping[str, float]) -> str:
     """Say how far from the truth the estimates are."""
     return ", ".join(
-        f"{_plain(name)} {signed(float(mean) - truth[name], 1)} ± {number(float(sd), 1)}"
+        f"{_plain(name)} {signed(float(mean) - truth[name], _decimals(name))} ± {number(float(sd), _decimals(name))}"
         for name, mean, sd in zip(step.names, step.mean, step.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
@@ -113,7 +113,7 @@ def answer(run: Exploration) -> str:
     """Say in one sentence what was found."""
     what = found_shape(run)
     known = ", ".join(
-        f"{_plain(name)} {number(float(mean), 1)} ± {number(float(sd), 1)}{_unit(name)}"
+        f"{_plain(name)} {number(float(mean), _decimals(name))} ± {number(float(sd), _decimals(name))}{_unit(name)}"
         for name, mean, sd in zip(run.last.names, run.last.mean, run.last.sd, strict=True)
         if np.isfinite(mean) and name != "shape"
     )
@@ -140,7 +140,7 @@ def steps_table(run: Exploration) -> Markup:
         (
             (
                 str(s.number),
-                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}",
+                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.stance}",
                 f"{s.reading.value:g}",
                 number(s.widest_mm, 1),
                 number(s.bits, 1),
@@ -225,6 +225,11 @@ def write_page(
 
 def _plain(name: str) -> str:
     return name.removesuffix("_mm").removesuffix("_rad").replace("_", " ").replace(".", " ")
+
+
+def _decimals(name: str) -> int:
+    """Decimals of a parameter: an angle in radians needs more than a length in mm."""
+    return 3 if name.endswith("_rad") else 1
 
 
 def _unit(name: str) -> str:

@@ -59,11 +59,12 @@ def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
     return element("dl", *(fragment(element("dt", term), element("dd", value)) for term, value in pairs))
 
 
-def figure(png: bytes, caption: str, *, alt: str = "") -> Markup:
-    """Embed a PNG with its caption; the caption is the text for those who cannot see it unless `alt` is given."""
-    source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-    image = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}">')
-    return element("figure", image, element("figcaption", caption))
+def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
+    """Embed a PNG or an SVG; the caption is the text for those who cannot see it unless `alt` is given."""
+    kind = "svg+xml" if image.startswith(b"<svg") else "png"
+    source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
+    shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}">')
+    return element("figure", shown, element("figcaption", caption))
 
 
 def page(
@@ -122,6 +123,7 @@ code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
 @media (max-width: 34rem) {
   p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
+  figure { overflow-x: auto; } figure img[src^="data:image/svg"] { min-width: 42rem; max-width: none; }
 }
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }
 """

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 
-__all__ = ["count", "number", "probability", "signed", "unit_name"]
+__all__ = ["count", "number", "probability", "readable", "signed", "unit_name"]
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float, digits: int) -> str:
@@ -15,6 +18,15 @@ def number(value: float, digits: int) -> str:
 def signed(value: float, digits: int) -> str:
     """Write a coordinate; what rounds to zero has no sign."""
     return number(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
+
+
+def readable(text: str) -> str:
+    """Write the numbers of a text as people do: 2 × 10⁻⁷ for 2e-07, and a true minus sign."""
+
+    def power(found: re.Match[str]) -> str:
+        return f"{found[1]}\u00a0×\u00a010{str(int(found[2])).translate(_RAISED)}"
+
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power, text))
 
 
 def count(n: int, noun: str) -> str:

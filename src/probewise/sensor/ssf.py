@@ -58,16 +58,18 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     """
     if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:
         raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (n_samples, {6 * n_gaussians})")
-    a, u, v, aa, bb, cc = np.moveaxis(theta.reshape(len(theta), 1, n_gaussians, 6), -1, 0)
+    # A row for each kind of parameter, (6, n_gaussians, n_samples): operations then run along memory.
+    rows = np.ascontiguousarray(theta.reshape(len(theta), n_gaussians, 6).transpose(2, 1, 0))
+    a, u, v, aa, bb, cc = rows
     determinant = aa * bb - cc * cc
     if not ((determinant > 0) & (aa > 0)).all():
         raise ParameterError("A B - C^2", float(determinant.min()), "greater than 0, with A > 0 and B > 0")
     mass = a / np.sqrt(determinant)
-    total = mass.sum(axis=-1, keepdims=True)
+    total = mass.sum(axis=0)
     if not (total > 0).all() or not (a >= 0).all():
         raise ParameterError("a", float(a.min()), "0 or more, one of them greater")
     half = 0.5 / determinant
-    return Footprint(mass / total, u, v, half * bb, half * aa, -half * cc)
+    return Footprint(*(part.T[:, None] for part in (mass / total, u, v, half * bb, half * aa, -half * cc)))
 
 
 class SSFModel(Protocol):

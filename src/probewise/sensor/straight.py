@@ -6,7 +6,7 @@ the readings alone (angles, distances, which of them are alike) is worked out wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,13 +14,14 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
 from probewise.sensor._normal import CENTRE, PER_SD, replace_by_cumulative
-from probewise.sensor.gaussian import Spot, mass_in_quadrant, turned
+from probewise.sensor.gaussian import Spot, beyond_corner, mass_in_quadrant, turned
 from probewise.sensor.stages import Footprint, Poses
 
 __all__ = ["StraightCorners", "StraightEdges", "columns_of"]
 
 _BLOCK = 2**14  # elements at a time: stays in the cache
 _FEW_ANGLES = 16  # up to so many the product with zeros is cheaper than picking columns
+_SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # closer than that, rounding alone tells angles (radians) and places apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,22 +66,8 @@ class StraightEdges:
         )
 
     @cached_property
-    def _angles(self) -> tuple[FloatArray, IntArray]:
-        """Distinct angles, and which of them is each reading's."""
-        distinct, which = np.unique(self.turn_rad, return_inverse=True)
-        return distinct, which.reshape(-1)
-
-    @cached_property
-    def _hand_out(self) -> FloatArray:
-        """Matrix that gives each reading its angle's (1/sd, shift/sd), in cells of the table, (2 n_angles, n_rows)."""
-        distinct, which = self._angles
-        own = np.eye(len(distinct))[:, which]
-        return np.concatenate([own * self.distance_mm, own])
-
-    @cached_property
-    def _plain(self) -> bool:
-        """Whether all is white inside and black outside."""
-        return bool((self.inside == 1.0).all() and (self.outside == 0.0).all())
+    def _views(self) -> _EdgeViews:
+        return _EdgeViews.of(self)
 
     @cached_property
     def _place(self) -> slice | None:
@@ -90,40 +77,24 @@ class StraightEdges:
 
     def see(self, footprint: Footprint, out: FloatArray) -> None:
         """Write what each hypothesis' footprint sees into the columns `rows` of `out`, (n_samples, n_points)."""
-        share = np.empty((len(out), len(self.rows))) if self._place is None else out[:, self._place]
-        if len(self.distance_mm) == 1 and footprint.weight.shape[1] == 1 and not _varies(footprint):
-            self._see_by_product(footprint, share)
+        seen = np.empty((len(out), len(self.rows))) if self._place is None else out[:, self._place]
+        if len(self.distance_mm) == 1 and not _varies(footprint):
+            self._views.see(footprint, seen)
         else:
-            self._see_each(footprint, share)
-        if not self._plain:
-            share *= self.inside - self.outside
-            share += self.outside
+            self._see_each(footprint, seen)
+            seen *= self.inside - self.outside
+            seen += self.outside
         if self._place is None:
-            out[:, self.rows] = share
-
-    def _see_by_product(self, footprint: Footprint, share: FloatArray) -> None:
-        """See with a footprint that no reading changes: Gaussians projected once an angle, handed out in a product."""
-        distinct, which = self._angles
-        per_sd, shift = (np.moveaxis(a, 2, 1) for a in _projected(footprint, distinct))
-        both = np.concatenate([per_sd * PER_SD, shift * per_sd * PER_SD + CENTRE], axis=2)
-        n_gaussians, n_angles = per_sd.shape[1:]
-        step = max(1, _BLOCK // (n_gaussians * len(self.rows)))
-        for start in range(0, len(share), step):
-            block = slice(start, start + step)
-            here = _rows_of(both, block)
-            if n_angles <= _FEW_ANGLES:
-                cells = (here.reshape(-1, 2 * n_angles) @ self._hand_out).reshape(len(here), n_gaussians, -1)
-            else:
-                cells = here[..., which] * self.distance_mm
-                cells += here[..., n_angles + which]
-            replace_by_cumulative(cells)
-            np.matmul(_rows_of(footprint.weight, block), cells, out=share[block, None])
+            out[:, self.rows] = seen
 
     def _see_each(self, footprint: Footprint, share: FloatArray) -> None:
         """See from places that change with the hypothesis, or with a footprint that changes with the reading."""
-        angles, which = (self.turn_rad, np.arange(len(self.rows))) if _varies(footprint) else self._angles
-        here = Footprint(*(columns_of(getattr(footprint, f.name), self.rows) for f in fields(footprint)))
-        per_sd, shift = _projected(here, angles)
+        weight, *moments = (columns_of(a, self.rows) for a in (footprint.weight, *_moments(footprint)))
+        if _varies(footprint):
+            angles, which = self.turn_rad, np.arange(len(self.rows))
+        else:
+            angles, which = np.unique(self.turn_rad, return_inverse=True)
+        per_sd, shift = np.broadcast_arrays(*_projected(angles[:, None], *moments))
         share[:] = 0.0
         step = max(1, _BLOCK // len(self.rows))
         for start in range(0, len(share), step):
@@ -133,7 +104,70 @@ class StraightEdges:
                 cells = cells * (_rows_of(per_sd, block)[:, which, g] * PER_SD)
                 cells += CENTRE
                 replace_by_cumulative(cells)
-                share[block] += cells * _rows_of(here.weight, block)[:, :, g]
+                share[block] += cells * _rows_of(weight, block)[:, :, g]
+
+
+@dataclass(frozen=True, eq=False)
+class _EdgeViews:
+    """The views that readings have of straight edges, each once: scans out and back and from both sides share them.
+
+    An edge seen from its other side is the same view with black and white exchanged. `angle_rad` (n_angles,), from 0 to
+    pi; `hand_out` gives each view its angle's (1/sd, shift/sd); `which` angle and what `distance_mm` is each view's,
+    (n_views,); `view` of each reading, and the readings' `low` and `gain`: what they see of it, (n_rows,).
+    """
+
+    angle_rad: FloatArray
+    which: IntArray
+    distance_mm: FloatArray
+    view: IntArray
+    low: FloatArray
+    gain: FloatArray
+
+    @classmethod
+    def of(cls, edges: StraightEdges) -> _EdgeViews:
+        """Find the views of edges whose distance no hypothesis changes."""
+        n_half_turns = np.floor(edges.turn_rad / np.pi + _SAME_ANGLE)
+        behind = n_half_turns % 2 == 1
+        angle = np.round((edges.turn_rad - n_half_turns * np.pi) / _SAME_ANGLE) * _SAME_ANGLE
+        distance = np.round(np.where(behind, -1.0, 1.0) * edges.distance_mm[0] / _SAME_MM) * _SAME_MM
+        views, view = np.unique(np.stack([angle, distance]), axis=1, return_inverse=True)
+        angles, which = np.unique(views[0], return_inverse=True)
+        low, high = np.where(behind, edges.inside, edges.outside), np.where(behind, edges.outside, edges.inside)
+        return cls(angles, which, views[1], view.reshape(-1), low, high - low)
+
+    @cached_property
+    def _hand_out(self) -> FloatArray:
+        """Matrix that gives each view its angle's (1/sd, shift/sd), in cells of the table, (2 n_angles, n_views)."""
+        own = np.eye(len(self.angle_rad))[:, self.which]
+        return np.concatenate([own * self.distance_mm, own])
+
+    def see(self, footprint: Footprint, out: FloatArray) -> None:
+        """Write what the readings see with a footprint that none of them changes, (n_samples, n_rows).
+
+        Gaussians are projected once an angle and handed out in a product, a block of hypotheses at a time.
+        """
+        weight, *moments = _samples_last(footprint)
+        per_sd, shift = _projected(self.angle_rad[:, None, None], *moments)
+        n_angles, n_gaussians, n_samples = np.broadcast(per_sd, shift, weight).shape
+        both = np.empty((2 * n_angles, n_gaussians, n_samples))
+        both[:n_angles] = per_sd * PER_SD
+        np.multiply(shift, both[:n_angles], out=both[n_angles:])
+        both[n_angles:] += CENTRE
+        both = both.transpose(1, 2, 0)
+        weight = np.broadcast_to(weight, (n_gaussians, n_samples))[..., None]
+        step = max(1, _BLOCK // (n_gaussians * len(self.distance_mm)))
+        for start in range(0, n_samples, step):
+            here = both[:, start : start + step]
+            if n_angles <= _FEW_ANGLES:
+                cells = here @ self._hand_out
+            else:
+                cells = here[..., self.which] * self.distance_mm
+                cells += here[..., n_angles + self.which]
+            replace_by_cumulative(cells)
+            cells *= weight[:, start : start + step]
+            seen = cells.sum(axis=0)[:, self.view]
+            seen *= self.gain
+            np.add(seen, self.low, out=out[start : start + step] if n_samples > 1 else out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +195,18 @@ class StraightCorners:
             Poses(*(columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))),
         )
 
+    @cached_property
+    def _views(self) -> _CornerViews:
+        return _CornerViews.of(self)
+
     def see(self, footprint: Footprint, out: FloatArray) -> None:
         """Write what each hypothesis' footprint sees into the columns `rows` of `out`, (n_samples, n_points)."""
         poses = self.poses
-        turn = poses.orientation_rad[..., None]
-        moments = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
-        moved = turned(turn, *(columns_of(a, self.rows) for a in moments))
+        still = len(poses.x_mm) == len(poses.y_mm) == len(poses.orientation_rad) == 1
+        if still and not _varies(footprint):
+            out[:, self.rows] = self._views.see(footprint)
+            return
+        moved = turned(poses.orientation_rad[..., None], *(columns_of(a, self.rows) for a in _moments(footprint)))
         spots = Spot(poses.x_mm[..., None], poses.y_mm[..., None], *moved)  # (n_samples, n_rows, n_gaussians)
         (corner_x, corner_y), (to_x, to_y) = self.corner_mm.T[..., None], self.direction.T[..., None]
         found = mass_in_quadrant(corner_x, corner_y, to_x, to_y, spots)
@@ -174,18 +214,70 @@ class StraightCorners:
         out[:, self.rows] = self.outside + (self.inside - self.outside) * share
 
 
+@dataclass(frozen=True, eq=False)
+class _CornerViews:
+    """The places from which readings see corners, each once: the four quadrants about one corner share it.
+
+    What lies beyond the corner along x, along y and along both makes up every quadrant. `turn_rad`: the sensor's
+    orientation, (n_views,) or the one of all; `x_mm`, `y_mm`: the corner from where it stands, (n_views,). `hand_out`
+    (3 n_views, n_rows) and `low` (n_rows,) turn the three shares into what the readings see.
+    """
+
+    turn_rad: FloatArray
+    x_mm: FloatArray
+    y_mm: FloatArray
+    hand_out: FloatArray
+    low: FloatArray
+
+    @classmethod
+    def of(cls, corners: StraightCorners) -> _CornerViews:
+        """Find the views of corners where no hypothesis changes the sensor's place."""
+        poses = corners.poses
+        x, y = corners.corner_mm[:, 0] - poses.x_mm[0], corners.corner_mm[:, 1] - poses.y_mm[0]
+        turn = np.broadcast_to(poses.orientation_rad[0], x.shape)
+        places = [np.round(a / same) * same for a, same in ((turn, _SAME_ANGLE), (x, _SAME_MM), (y, _SAME_MM))]
+        views, view = np.unique(np.stack(places), axis=1, return_inverse=True)
+        (to_x, to_y), gain = corners.direction.T, corners.inside - corners.outside
+        # Of the mass q beyond both, p beyond along x and s along y: q, s - q, p - q or 1 - p - s + q.
+        parts = (to_x * to_y, np.where(to_y < 0, to_x, 0.0), np.where(to_x < 0, to_y, 0.0))
+        own = np.eye(views.shape[1])[:, view.reshape(-1)] * gain
+        low = corners.outside + np.where((to_x < 0) & (to_y < 0), gain, 0.0)
+        turns = views[0] if np.ptp(views[0]) > 0 else views[0, :1]
+        return cls(turns, views[1], views[2], np.concatenate([own * part for part in parts]), low)
+
+    def see(self, footprint: Footprint) -> FloatArray:
+        """See with a footprint that no reading changes, (n_samples or 1, n_rows)."""
+        weight, *moments = _samples_last(footprint)
+        turn, x, y = (a[:, None, None] for a in (self.turn_rad, self.x_mm, self.y_mm))
+        dx, dy, var_x, var_y, cov_xy = turned(turn, *moments)
+        sd_x, sd_y = np.sqrt(var_x), np.sqrt(var_y)
+        shares = beyond_corner((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
+        # From (n_views, n_gaussians, n_samples), the Gaussians summed up, to (3 n_views, n_samples).
+        beyond = np.concatenate([(share * weight).sum(axis=1) for share in shares])
+        return np.asarray(beyond.T @ self.hand_out + self.low)
+
+
 def _varies(footprint: Footprint) -> bool:
-    """Whether its Gaussians change with the reading."""
-    moments = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
-    return any(a.shape[1] > 1 for a in moments)
+    """Whether its Gaussians, or what each holds of the light, change with the reading."""
+    return any(a.shape[1] > 1 for a in (footprint.weight, *_moments(footprint)))
 
 
-def _projected(footprint: Footprint, angle_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Project the Gaussians on axes at these angles: 1/sd and mean, (n_samples, n_angles, n_gaussians) both."""
-    c, s = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
-    variance = c * c * footprint.var_u + s * s * footprint.var_v + 2 * c * s * footprint.cov_uv
-    per_sd, mean = np.broadcast_arrays(1 / np.sqrt(variance), c * footprint.u_mm + s * footprint.v_mm)
-    return per_sd, mean
+def _samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
+    """Take weight and moments of a footprint that no reading changes, (n_gaussians, n_samples or 1) each."""
+    return tuple(a[:, 0].T for a in (footprint.weight, *_moments(footprint)))
+
+
+def _moments(footprint: Footprint) -> tuple[FloatArray, ...]:
+    return (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
+
+
+def _projected(
+    angle_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Project Gaussians on axes at these angles: 1/sd and mean; all broadcast."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    variance = c * c * var_u + s * s * var_v + 2 * c * s * cov_uv
+    return np.asarray(1 / np.sqrt(variance)), c * u_mm + s * v_mm
 
 
 def _rows_of(array: FloatArray, block: slice) -> FloatArray:

@@ -14,12 +14,10 @@ from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot,
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
 from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
-from probewise.report.plots.repair import gain_by_scan, mean_residuals, readings_before_and_after
 from probewise.report.plots.scene import playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
 from probewise.report.plots.study import readings_needed, widths_of_runs
 from probewise.report.plots.verdict import hypothesis_probabilities
-from probewise.report.plots.witness import witness
 
 __all__ = [
     "AxesGrid",
@@ -27,19 +25,16 @@ __all__ = [
     "calibration_check",
     "confusion_matrix",
     "corner_plot",
-    "gain_by_scan",
     "grid_of_axes",
     "hypothesis_probabilities",
     "information_gained",
     "insertion_plot",
     "log_evidences",
-    "mean_residuals",
     "playing_field",
     "png",
     "posterior_widths",
     "predicted_against_recorded",
     "reach_map",
-    "readings_before_and_after",
     "readings_by_orientation",
     "readings_needed",
     "reliability_diagram",
@@ -49,5 +44,4 @@ __all__ = [
     "ssf_by_order",
     "trace_plot",
     "widths_of_runs",
-    "witness",
 ]

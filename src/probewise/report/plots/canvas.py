@@ -15,16 +15,12 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
+
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
 __all__ += ["AxesGrid", "axes_or_new", "grid_of_axes", "png", "tidy"]
 
 AxesGrid: TypeAlias = NDArray[Any]
-
-# Okabe and Ito's palette: told apart with any common colour vision.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
-YELLOW, BLUE, VERMILLION, PURPLE = "#f0e442", "#0072b2", "#d55e00", "#cc79a7"
-GREY = "#8c8c8c"
-CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
 # The paper's copper tones. They start above black, so that black squares and blue outlines
 # stay legible, and lightness rises evenly, so that the map also reads in grey.

@@ -1,0 +1,133 @@
+"""Ellipses under a known footprint: the nearest point of the edge, and how it bends there, decide what is seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.spans import Interval, single
+from probewise.inquiry.unit_gaussian import seen_of_bend
+from probewise.scene import EllipseRegion
+from probewise.sensor import FixedMixture
+
+__all__ = ["CrossedEllipses", "Ellipses"]
+
+_TINY = np.float32(1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipses:
+    """Hold ellipses in the lab frame, and, for each Gaussian, in the frame in which that is the unit one.
+
+    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1, dx and dy from where the footprint's middle
+    lies over the ellipse's: `lab` (5, n_ellipses) holds that place, then xx, xy, yy. `grows` is what one sd of the
+    footprint adds to the scale of each ellipse at most, `off` what the Gaussians' distance from that middle adds.
+    `into` maps a place to the frames of the semi-axes `axes`, (n_gaussians, 2, n_ellipses), major and minor:
+    (n_gaussians, 2, 3, n_ellipses), the last but one what is multiplied with x, with y, and added.
+    `rows_mm` (2, n_ellipses) are the lowest and the highest point.
+    """
+
+    rows_mm: FloatArray
+    share: FloatArray
+    lab: FloatArray
+    grows: FloatArray
+    off: FloatArray
+    into: FloatArray
+    axes: FloatArray
+
+    @classmethod
+    def of(cls, region: EllipseRegion, footprint: FixedMixture) -> Self:
+        """Take ellipses, (n_ellipses of them), under a footprint in the lab frame."""
+        cosine, sine = np.cos(region.angle_rad), np.sin(region.angle_rad)
+        turn = np.stack([np.stack([cosine, sine], axis=-1), np.stack([-sine, cosine], axis=-1)], axis=1)
+        form = np.einsum("nki,nk,nkj->nij", turn, region.semi_axes_mm**-2, turn)
+        middle = footprint.weights @ footprint.means_mm
+        root = np.linalg.cholesky(footprint.covs_mm2)
+        squared, frame = np.linalg.eigh(np.einsum("gki,nkl,glj->gnij", root, form, root, optimize=True))
+        into = np.einsum("gnki,gkj->gnij", frame, np.linalg.inv(root))
+        constant = np.einsum("gnij,gnj->gni", into, footprint.means_mm[:, None] - region.center_mm)
+        axes = squared.transpose(0, 2, 1) ** -0.5
+        away = np.linalg.norm(footprint.means_mm - middle, axis=1).max()
+        half_mm = np.linalg.norm(turn[:, :, 1] * region.semi_axes_mm, axis=1)
+        return cls(
+            single(region.center_mm[:, 1] + np.stack([-half_mm, half_mm])),
+            single(footprint.weights),
+            single(np.stack([*(region.center_mm - middle).T, form[:, 0, 0], form[:, 0, 1], form[:, 1, 1]])),
+            single((1.0 / axes[:, 1]).max(axis=0)),
+            single(away / region.semi_axes_mm.min(axis=1)),
+            single(np.concatenate([into, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)),
+            single(axes),
+        )
+
+    def along(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
+        """Cross ellipses with rows of places, both (n_crossings,)."""
+        lab, grows, off, into, axes = (
+            values.take(which, axis=-1) for values in (self.lab, self.grows, self.off, self.into, self.axes)
+        )
+        lab[1] = y_mm - lab[1]
+        return CrossedEllipses(self.share, lab, grows, off, into[:, :, 0], into[:, :, 1] * y_mm + into[:, :, 2], axes)
+
+
+@dataclass(frozen=True, eq=False)
+class CrossedEllipses:
+    """Ellipses crossed by rows: as `Ellipses`, with one along the last axis for every crossing.
+
+    In the frames of the semi-axes a place is `slope` x + `base`, (n_gaussians, 2, n_crossings); the second row of
+    `lab` is how far the row is above the ellipse.
+    """
+
+    share: FloatArray
+    lab: FloatArray
+    grows: FloatArray
+    off: FloatArray
+    slope: FloatArray
+    base: FloatArray
+    axes: FloatArray
+
+    def within(self, reach: float) -> Interval:
+        """Find where the edge is farther than `reach` sds inside; no farther beside than that where it is negative.
+
+        An ellipse scaled by 1 + d / (its shortest semi-axis) holds all that is within d of it, since no support is
+        shorter than that axis; and likewise inwards.
+        """
+        x_mm, up, xx, xy, yy = self.lab
+        scale = 1.0 - np.float32(reach) * self.grows - np.float32(np.sign(reach)) * self.off
+        room = scale * scale * xx - (xx * yy - xy * xy) * up * up
+        half = np.sqrt(np.maximum(room, 0.0)) / xx
+        middle = x_mm - xy / xx * up
+        return np.where((room > 0) & (scale > 0), middle - half, np.inf), middle + half
+
+    def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
+        """Share of the footprint over the ellipse with the sensor at places of crossings, both (n_pairs,).
+
+        The nearest point is found by one step along the circle of curvature from the point on the same ray.
+        """
+        out = single(np.zeros(x_mm.shape))
+        for share, slope, base, axes in zip(self.share, self.slope, self.base, self.axes, strict=True):
+            p, q = (np.abs(s.take(crossing) * x_mm + b.take(crossing)) for s, b in zip(slope, base, strict=True))
+            a, b = (axis.take(crossing) for axis in axes)
+            cosine, sine = _direction(p / a, q / b)
+            bent = a * a - b * b
+            u, v = bent / a * (cosine * cosine * cosine), -bent / b * (sine * sine * sine)  # the centre of curvature
+            ratio = _length(a * cosine - u, b * sine - v) / np.maximum(_length(p - u, q - v), _TINY)
+            cosine, sine = _direction(
+                np.maximum((p - u) * ratio + u, 0.0) / a, np.maximum((q - v) * ratio + v, 0.0) / b
+            )
+            steep_p, steep_q = cosine / a, sine / b
+            steep = _length(steep_p, steep_q)
+            distance = ((a * cosine - p) * steep_p + (b * sine - q) * steep_q) / steep
+            around = a * b * steep
+            out = out + share * seen_of_bend(distance, 1.0 / (around * around * steep))
+        return out
+
+
+def _length(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.sqrt(x * x + y * y)
+
+
+def _direction(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    length = np.maximum(_length(x, y), _TINY)
+    return x / length, y / length

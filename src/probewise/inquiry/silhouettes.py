@@ -1,0 +1,135 @@
+"""What a known sensor reads of any ellipses and convex polygons, from tables of the unit Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+from scipy.special import ndtri
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.ellipses import Ellipses
+from probewise.inquiry.grid import Grid
+from probewise.inquiry.polygons import Polygons
+from probewise.inquiry.spans import ROWS, Interval, Spans, single, whole
+from probewise.inquiry.unit_gaussian import REACH
+from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
+from probewise.sensor import FixedMixture
+
+__all__ = ["Silhouettes"]
+
+
+class _Crossed(Protocol):
+    """Shapes of one kind, each crossed by a row of places."""
+
+    def within(self, reach: float) -> Interval:
+        """Find where along the row the footprint is `reach` sds inside, or no farther than -`reach` sds beside."""
+        ...
+
+    def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
+        """Share of the footprint over the shape with the sensor at places of crossings, both (n_pairs,)."""
+        ...
+
+
+class _Kind(Protocol):
+    """Shapes of one kind under a footprint."""
+
+    @property
+    def rows_mm(self) -> FloatArray:
+        """Lowest and highest y of each shape, (2, n_shapes)."""
+        ...
+
+    def along(self, which: IntArray, y_mm: FloatArray) -> _Crossed:
+        """Cross shapes with rows of places, arrays of one shape."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouettes:
+    """Shapes under a footprint in the lab frame, by kind: rows of the hypotheses, and their geometry.
+
+    `footprint_mm` says how far off the sensor the middle of a Gaussian is at most, and its widest sd.
+    """
+
+    n_shapes: int
+    parts: tuple[tuple[IntArray, _Kind], ...]
+    footprint_mm: tuple[float, float]
+
+    @classmethod
+    def of(cls, region: Region, footprint: FixedMixture) -> Self | None:
+        """Take the regions of hypotheses; None for any that are not white ellipses and convex polygons."""
+        parts = []
+        for rows, part in _by_kind(region):
+            kind = _kind_of(part, footprint)
+            if kind is None:
+                return None
+            parts.append((rows, kind))
+        off = np.linalg.norm(footprint.means_mm, axis=1).max()
+        widest = np.sqrt(np.linalg.eigvalsh(footprint.covs_mm2).max())
+        return cls(region.n_regions, tuple(parts), (float(off), float(widest)))
+
+    def seen(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Share of the footprint over every shape, with the sensor at places, (n_places,) -> (n_shapes, n_places)."""
+        out = np.empty((self.n_shapes, len(x_mm)))
+        for rows, kind in self.parts:
+            every = np.repeat(np.arange(len(rows)), len(x_mm))
+            crossed = kind.along(every, np.tile(single(y_mm), len(rows)))
+            seen = crossed.seen(np.arange(len(every)), np.tile(single(x_mm), len(rows)))
+            out[rows] = seen.reshape(len(rows), len(x_mm))
+        return out
+
+    def mass(self, weight: FloatArray, grid: Grid, dark: float, bright: float, levels: FloatArray) -> FloatArray:
+        """Weigh the levels that the shapes' readings have at every place of a grid.
+
+        Parameters
+        ----------
+        weight
+            What each shape weighs, (n_shapes,).
+        grid
+            The places.
+        dark, bright
+            What is read outside and inside.
+        levels
+            Evenly spaced levels, (n_levels,), from the darkest to the brightest; a reading counts for the nearest.
+
+        Returns
+        -------
+        Weight by place and level, (n_places, n_levels), each row summing to that of all shapes.
+        """
+        n_levels = len(levels)
+        first, per_level = float(levels[0]), 1.0 / float(levels[1] - levels[0])
+        lowest, per_share = (dark - first) * per_level, (bright - dark) * per_level
+        ends = round(lowest), round(lowest + per_share)
+        # So far from any edge the nearest level is that of no edge; half of half a level, for two edges may add up.
+        reach = min(REACH, -float(ndtri(0.25 / max(abs(per_share), 1.0))))
+        pad_mm = self.footprint_mm[0] + reach * self.footprint_mm[1]
+        mass = np.zeros((grid.n_places, n_levels))
+        for rows, kind in self.parts:
+            own = weight[rows]
+            bottom, top = kind.rows_mm + np.array([[-pad_mm], [pad_mm]], dtype=np.float32)
+            for start in range(0, grid.n_y, ROWS):
+                y_mm = single(grid.y_mm[start : start + ROWS])
+                row, which = np.nonzero((y_mm[:, None] >= bottom) & (y_mm[:, None] <= top) & (own > 0))
+                crossed = kind.along(which, y_mm[row])
+                spans = Spans.between(grid, len(y_mm), row, which, crossed.within(-reach), crossed.within(reach))
+                ring = spans.ring()
+                seen = crossed.seen(ring.span, single(grid.x_mm)[ring.column])
+                level = whole(lowest + per_share * seen + 0.5)
+                block = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
+                mass[block] += spans.weigh(own, ring, level, ends, n_levels)
+        return mass
+
+
+def _by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
+    if isinstance(region, MixtureOfRegions):
+        yield from region.rows()
+    else:
+        yield np.arange(region.n_regions), region
+
+
+def _kind_of(region: Region, footprint: FixedMixture) -> _Kind | None:
+    if not isinstance(region, (EllipseRegion, PolygonRegion)) or (region.outside, region.inside) != (0.0, 1.0):
+        return None
+    return Ellipses.of(region, footprint) if isinstance(region, EllipseRegion) else Polygons.of(region, footprint)

@@ -1,0 +1,130 @@
+"""Which places of a grid lie in shapes, and which near their edges: row by row, for many shapes at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.grid import Grid
+
+__all__ = ["ROWS", "Interval", "Ring", "Spans", "single", "whole"]
+
+ROWS = 3
+"""Rows of a grid that are weighed at a time: what is counted there stays in the cache."""
+
+Interval = tuple[FloatArray, FloatArray]
+"""From where to where along a row, mm, one array each; nowhere where the first is above the second."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ring:
+    """Pairs of a span and a place near the edge, (n_pairs,): which span, which column, and which place of the rows."""
+
+    span: IntArray
+    column: IntArray
+    place: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """Where shapes cross some rows of a grid, (n_spans,) each: which row, which shape, and columns there.
+
+    The row is counted from the first of them. Columns from `first` to `last` are in the shape or near its edge,
+    those from `inner_first` to `inner_last` deep inside; where none is, these are `last` + 1 and `last`.
+    """
+
+    grid: Grid
+    n_rows: int
+    row: IntArray
+    hypothesis: IntArray
+    first: IntArray
+    last: IntArray
+    inner_first: IntArray
+    inner_last: IntArray
+
+    @classmethod
+    def between(
+        cls, grid: Grid, n_rows: int, row: IntArray, hypothesis: IntArray, outer: Interval, inner: Interval
+    ) -> Self:
+        """Find the columns of intervals, (n_spans,) each: in the shape or near its edge, and deep inside.
+
+        Parameters
+        ----------
+        grid, n_rows, row, hypothesis
+            The grid, how many of its rows are looked at, and the row and the shape of each span.
+        outer, inner
+            Intervals along the row, in single precision, which holds a place to a ten-thousandth of a millimetre.
+        """
+        per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
+
+        def columns(interval: Interval) -> tuple[IntArray, IntArray]:
+            first = whole(np.ceil(np.clip(interval[0] * per_mm, 0.0, grid.n_x)))
+            last = whole(np.floor(np.clip(interval[1] * per_mm, -1.0, grid.n_x - 1.0)))
+            return np.minimum(first, last + 1), last
+
+        first, last = columns(outer)
+        inner_first, inner_last = columns(inner)
+        none = np.flatnonzero(inner_first > inner_last)
+        inner_first[none], inner_last[none] = last[none] + 1, last[none]
+        return cls(grid, n_rows, row, hypothesis, first, last, inner_first, inner_last)
+
+    def ring(self) -> Ring:
+        """Pairs of span and place in the ring about the edge: left of what is deep inside, then right of it."""
+        n = len(self.row)
+        count = np.concatenate([self.inner_first - self.first, self.last - self.inner_last])
+        begin = np.concatenate([self.first, self.inner_last + 1])
+        # Repeating is the slow step: it is done once, and everything else is looked up.
+        span = np.repeat(np.arange(2 * n), count)
+        column = whole(begin - np.cumsum(count) + count)[span]
+        column += whole(np.arange(len(span)))
+        span[int(count[:n].sum()) :] -= n
+        return Ring(span, column, column + whole(self.row * self.grid.n_x)[span])
+
+    def weigh(
+        self, weight: FloatArray, ring: Ring, level: IntArray, ends: tuple[int, int], n_levels: int
+    ) -> FloatArray:
+        """Weigh the levels read at every place of the rows.
+
+        Parameters
+        ----------
+        weight
+            What each shape weighs, (n_shapes,).
+        ring, level
+            Pairs near the edges, and the number of the level that is read there, (n_pairs,).
+        ends, n_levels
+            Numbers of the levels of no edge, outside and inside, and how many levels there are.
+
+        Returns
+        -------
+        Weight by place and level, (n_rows * n_x, n_levels), each row summing to that of all shapes.
+        """
+        n_places = self.n_rows * self.grid.n_x
+        near = np.bincount(ring.place * n_levels + level, weight[self.hypothesis][ring.span], n_places * n_levels)
+        mass = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # NumPy counts nothing in whole numbers
+        inside = self._inside(weight)
+        outside = weight.sum() - inside - mass.sum(axis=1)
+        mass[:, ends[1]] += inside
+        mass[:, ends[0]] += outside
+        return mass
+
+    def _inside(self, weight: FloatArray) -> FloatArray:
+        """Weight of the shapes that each place of the rows lies deep in, (n_rows * n_x,)."""
+        width = self.grid.n_x + 1
+        own, size = weight[self.hypothesis], self.n_rows * width
+        begins = np.bincount(self.row * width + self.inner_first, own, minlength=size)
+        ends = np.bincount(self.row * width + self.inner_last + 1, own, minlength=size)
+        return np.cumsum((begins - ends).reshape(self.n_rows, width), axis=1)[:, :-1].ravel()
+
+
+def single(values: NDArray[Any]) -> FloatArray:
+    """Round to single precision, which the checker of types does not tell from double."""
+    return cast(FloatArray, np.asarray(values, dtype=np.float32))
+
+
+def whole(values: NDArray[Any]) -> IntArray:
+    """Cut to whole numbers of 32 bits, which the checker of types does not tell from 64."""
+    return cast(IntArray, values.astype(np.int32))

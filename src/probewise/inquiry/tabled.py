@@ -1,0 +1,233 @@
+"""What all hypotheses predict at every design, from tables: one of discs, or those of the unit Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.designs import Designs
+from probewise.inquiry.discs import DiscTable
+from probewise.inquiry.forecast import AskedForecast, Forecast, Outlook, by_combination, predicted, spread_levels
+from probewise.inquiry.grid import Grid
+from probewise.inquiry.silhouettes import Silhouettes
+from probewise.recordings.plan import Instrumentation, Plan
+from probewise.scene import HypothesisScene, Shape, outlines
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor.commanded import height_ratio
+from probewise.sensor.stages import SensorModel
+
+__all__ = ["DiscForecast", "SilhouetteForecast", "forecast_of"]
+
+_PER_SD = 2.0  # levels a noise sd: rounding adds 2 % to its variance, and thousands of hypotheses average over it
+_N_CHECKED = 64  # shapes of the prior, at 16 places each
+_PLACES = 16
+_MOST_OFF = 0.005  # rms share of the difference between dark and bright
+_REACH = 3.0  # sds of the footprint about an edge
+_FEW = 1000  # rows of a plan
+_MOST_WAYS = 8  # in which the sensor stands
+
+
+@dataclass(frozen=True, eq=False)
+class DiscForecast:
+    """All hypotheses, from the table of what the sensor reads of a disc."""
+
+    model: SensorModel
+    table: DiscTable
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """See `Forecast.predict`."""
+        return predicted(self.model, theta, plan)
+
+    def outlook(
+        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
+    ) -> Outlook:
+        """See `Forecast.outlook`."""
+        levels = spread_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD)
+        turns = plan.orientation_rad.reshape(-1, designs.grid.n_places)
+        return _DiscOutlook(self.table, theta, designs.grid, turns, rows, levels)
+
+
+@dataclass(frozen=True, eq=False)
+class _DiscOutlook:
+    table: DiscTable
+    theta: FloatArray
+    grid: Grid
+    turns_rad: FloatArray
+    rows: IntArray
+    levels: FloatArray
+
+    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """See `Outlook.maps`: one map for each way that the sensor stands; the table knows no other setting."""
+        some = weight > 0
+        stood, mass = None, np.empty(0)
+        for number, at, places in by_combination(self.rows, self.grid.n_places):
+            turn = self.turns_rad[number]
+            if stood is None or not np.array_equal(stood, turn):
+                stood, mass = turn, self.table.mass(self.theta[some], weight[some], self.grid, self.levels, turn)
+            yield at, mass if len(places) == len(mass) else mass[places]
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteForecast:
+    """All hypotheses of any ellipses and convex polygons, from tables of what the unit Gaussian sees.
+
+    They hold the readings of a known mixture of Gaussians to 0.5 % of the difference between dark and bright in the
+    mean square: held against the model itself when they are made.
+    """
+
+    model: Chain
+    mixture: FixedMixture
+    levels: FixedLevels
+    shape: Shape
+
+    @classmethod
+    def of(cls, model: SensorModel, *, highest: float = 1.0) -> Self | None:
+        """Make one, or return None for a model that the tables do not serve.
+
+        Parameters
+        ----------
+        model
+            A known mixture over a hypothesised scene, without effects, whose shapes are wide against its footprint.
+        highest
+            Greatest height at which the sensor may stand, over that of its calibration: there its footprint is widest.
+        """
+        if not isinstance(model, Chain) or model.effects or not isinstance(model.scene, HypothesisScene):
+            return None
+        if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
+            return None
+        made = cls(model, model.ssf, model.levels, model.scene.shape)
+        return made if made._is_faithful(max(highest, 1.0)) else None
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """See `Forecast.predict`: at few places for every pair by the tables; at many only where shapes can show."""
+        if len(plan) > _FEW:
+            return predicted(self.model, theta, plan)
+        ways, which = np.unique(np.stack([plan.orientation_rad, _heights(plan)]), axis=1, return_inverse=True)
+        out = np.empty((len(theta), len(plan)))
+        for number, way in enumerate(ways.T.tolist()):
+            rows = np.flatnonzero(which.ravel() == number)
+            silhouettes = self._silhouettes(theta, *way)
+            if silhouettes is None or ways.shape[1] > _MOST_WAYS:
+                return predicted(self.model, theta, plan)
+            dark, bright = self._ends(way[1])
+            out[:, rows] = dark + (bright - dark) * silhouettes.seen(plan.x_mm[rows], plan.y_mm[rows])
+        return out
+
+    def outlook(
+        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
+    ) -> Outlook:
+        """See `Forecast.outlook`; asked one by one where the arm turns the sensor from place to place."""
+        turns, heights = (a.reshape(-1, designs.grid.n_places) for a in (plan.orientation_rad, _heights(plan)))
+        asked = partial(AskedForecast(self.model).outlook, theta, weight, designs, plan, rows, noise_sd)
+        if (turns != turns[:, :1]).any() or set(plan.covariates) - {"height_mm"}:
+            return asked()
+        ways = list(zip(turns[:, 0].tolist(), heights[:, 0].tolist(), strict=True))
+        sights = {}
+        for turn, height in dict.fromkeys(ways):
+            silhouettes = self._silhouettes(theta, turn, height)
+            if silhouettes is None:
+                return asked()
+            sights[turn, height] = _Sight(silhouettes, *self._ends(height))
+        low = min(min(sight.dark, sight.bright) for sight in sights.values())
+        high = max(max(sight.dark, sight.bright) for sight in sights.values())
+        levels = spread_levels(low, high, noise_sd / _PER_SD)
+        return _SilhouetteOutlook(sights, ways, designs.grid, rows, levels)
+
+    def _silhouettes(self, theta: FloatArray, turn_rad: float, height: float) -> Silhouettes | None:
+        """Put shapes under the sensor, turned, at `height` times that of its calibration."""
+        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+        stands = height * np.array([[cosine, -sine], [sine, cosine]])
+        seen = FixedMixture(
+            self.mixture.weights, self.mixture.means_mm @ stands.T, stands @ self.mixture.covs_mm2 @ stands.T
+        )
+        return Silhouettes.of(self.shape.region(theta), seen)
+
+    def _ends(self, height: float) -> tuple[float, float]:
+        """Give the readings beside the shape and deep inside: light fades with the square of the height."""
+        return self.levels.i_min, self.levels.i_min + (self.levels.i_max - self.levels.i_min) / height**2
+
+    def _is_faithful(self, highest: float) -> bool:
+        """Hold the tables against the model, at places about the edges of some shapes of the prior."""
+        prior, rng = self.shape.prior, np.random.default_rng(0)
+        theta = prior.from_unit_cube(rng.random((_N_CHECKED, len(prior.names))))
+        silhouettes = self._silhouettes(theta, 0.0, highest)
+        dark, bright = self._ends(highest)
+        if silhouettes is None or dark == bright:
+            return False
+        reach = _REACH * highest * float(np.sqrt(np.linalg.eigvalsh(self.mixture.covs_mm2).max()))
+        quick, asked = [], []
+        for row, outline in enumerate(outlines(self.shape.region(theta))):
+            place = outline[rng.integers(len(outline), size=_PLACES)] + rng.uniform(-reach, reach, (_PLACES, 2))
+            plan = _plan_at(place, highest)
+            quick.append(silhouettes.seen(plan.x_mm, plan.y_mm)[row])
+            asked.append(self.model.predict(theta[[row]], plan)[0])
+        off = np.array(quick) - (np.array(asked) - dark) / (bright - dark)
+        return bool(np.sqrt((off**2).mean()) < _MOST_OFF)
+
+
+class _Sight(NamedTuple):
+    """All shapes under a sensor that stands in one way, and what it reads beside and deep inside them."""
+
+    silhouettes: Silhouettes
+    dark: float
+    bright: float
+
+
+@dataclass(frozen=True, eq=False)
+class _SilhouetteOutlook:
+    sights: dict[tuple[float, float], _Sight]
+    ways: list[tuple[float, float]]
+    grid: Grid
+    rows: IntArray
+    levels: FloatArray
+
+    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """See `Outlook.maps`: one map for each way that the sensor stands, however often it reads there."""
+        stood, mass = None, np.empty(0)
+        for number, at, places in by_combination(self.rows, self.grid.n_places):
+            if stood != self.ways[number]:
+                stood = self.ways[number]
+                silhouettes, dark, bright = self.sights[stood]
+                mass = silhouettes.mass(weight, self.grid, dark, bright, self.levels)
+            yield at, mass if len(places) == len(mass) else mass[places]
+
+
+def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast:
+    """Choose the way that a model allows: tables where they can be made.
+
+    `highest` is the greatest height at which the sensor may stand, over that of its calibration, where it can be
+    chosen; None: it stands as it was calibrated.
+    """
+    table = DiscTable.of(model) if highest is None else None
+    if table is not None:
+        return DiscForecast(table if table.margin_mm else model, table)
+    return SilhouetteForecast.of(model, highest=highest or 1.0) or AskedForecast(model)
+
+
+def _heights(plan: Plan) -> FloatArray:
+    """Height of every row over that of the calibration, (n_points,)."""
+    ratio = height_ratio(plan)
+    return np.ones(len(plan)) if ratio is None else ratio
+
+
+def _plan_at(places_mm: FloatArray, height: float) -> Plan:
+    """Lay out readings at places, (n_points, 2), at `height` times that of the calibration."""
+    n = len(places_mm)
+    zero = np.zeros(n, dtype=np.int64)
+    return Plan(
+        x_mm=places_mm[:, 0],
+        y_mm=places_mm[:, 1],
+        orientation_rad=np.zeros(n),
+        time_s=np.zeros(n),
+        scan=zero,
+        scan_names=("table",),
+        pattern=zero,
+        pattern_names=("table",),
+        covariates={"height_mm": np.full(n, height)},
+        instrumentation=Instrumentation(height_mm=1.0),
+    )

@@ -1,0 +1,84 @@
+"""What the unit Gaussian sees of a corner and of a bent edge, tabulated once: any Gaussian over any shape is near one.
+
+Distances are in sds of the footprint across the edge, positive inside. The tables are even and the nearest entry
+counts: off by 0.4 % of the span between dark and bright in the mean square at most, less than noise hides.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from scipy.special import ndtr
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.spans import single, whole
+
+__all__ = ["N_OPENINGS", "REACH", "seen_of_bend", "seen_of_corner"]
+
+REACH = 4.0
+"""Sds beyond which an edge is not seen: 3e-5 of the span."""
+
+N_OPENINGS = 64
+"""Kinds of corner in the table: correlations of the two distances, evenly spaced in their arc sine."""
+
+_PER_SD = 32
+_N = int(2 * REACH * _PER_SD) + 1
+_N_BENDS = 64
+_NODES = 40
+
+
+def seen_of_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> FloatArray:
+    """Mass of the unit Gaussian within two edges: bivariate normal of their distances, arrays of one shape.
+
+    `opening` numbers the correlation r of the two distances: floor((arcsin(r) / pi + 1 / 2) N_OPENINGS).
+    """
+    index = opening * (_N * _N) + _entry(second) * _N
+    index += _entry(first)
+    return np.asarray(_corners().reshape(-1)[index])
+
+
+def seen_of_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
+    """Mass of the unit Gaussian within an edge that bends away, `bend` the curvature times the sd; one shape."""
+    index = whole(bend / (1.0 + bend) * _N_BENDS) * _N
+    index += _entry(distance)
+    return np.asarray(_bends().reshape(-1)[index])
+
+
+def _entry(distance: FloatArray) -> IntArray:
+    return whole(np.clip(distance, -REACH, REACH) * _PER_SD + (REACH * _PER_SD + 0.5))
+
+
+@cache
+def _corners() -> FloatArray:
+    """Tabulate the bivariate normal (N_OPENINGS, n, n), by Plackett's integral over the arc sine of the correlation.
+
+    d/dt F(h, k; sin t) = exp(-(h^2 - 2 h k sin t + k^2) / (2 cos^2 t)) / 2 pi (Plackett 1954), from F(h, k; 0), the
+    product; and F(h, k; -r) = F(h) - F(h, -k; r).
+    """
+    distance = np.linspace(-REACH, REACH, _N)
+    h, k = distance[:, None], distance[None, :]
+    half = N_OPENINGS // 2
+    step = np.pi / N_OPENINGS
+    node, share = np.polynomial.legendre.leggauss(3)
+    out = np.empty((N_OPENINGS, _N, _N), dtype=np.float32)
+    total, at = ndtr(h) * ndtr(k), 0.0
+    for n in range(half):
+        until = (n + 0.5) * step
+        for angle, part in zip(at + (until - at) * (node + 1) / 2, share * (until - at) / 2, strict=True):
+            away = (h * h - 2 * h * k * np.sin(angle) + k * k) / (2 * np.cos(angle) ** 2)
+            total += part / (2 * np.pi) * np.exp(-away)
+        at = until
+        out[half + n] = total
+        out[half - 1 - n] = ndtr(h) - total[:, ::-1]
+    return single(out)
+
+
+@cache
+def _bends() -> FloatArray:
+    """Tabulate (n_bends, n): along a parabola, E[F(distance - bend t^2 / 2)], t unit Gaussian, by Gauss and Hermite."""
+    node, share = np.polynomial.hermite_e.hermegauss(_NODES)
+    middle = (np.arange(_N_BENDS) + 0.5) / _N_BENDS
+    bend = (middle / (1.0 - middle))[:, None, None]
+    distance = np.linspace(-REACH, REACH, _N)[:, None]
+    return single(ndtr(distance - bend * node**2 / 2) @ (share / share.sum()))

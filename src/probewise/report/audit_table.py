@@ -1,0 +1,35 @@
+"""The table of an audit, which the page of a diagnosis shows too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from probewise.diagnosis import EffectAudit
+from probewise.report.html import Markup, table
+from probewise.report.words import number
+
+__all__ = ["audit_table"]
+
+
+def audit_table(effects: Sequence[EffectAudit]) -> Markup:
+    """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows."""
+    rank = ("invisible", "aliased", "fine")
+    return table(
+        ("effect", "seen", "survives", "looks like", "seen from (λ = 8)"),
+        (
+            (
+                effect.name.replace("_", " "),
+                effect.sight,
+                number(effect.share, 2),
+                effect.reason or ", ".join(f"{n.replace('_', ' ')} {c:.3f}" for n, c in effect.alike[:4]) or "–",
+                "; ".join(_smallest(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
+            )
+            for effect in sorted(effects, key=lambda e: rank.index(e.sight))
+        ),
+        caption="Survives: share of its trace that the sensor's own parameters do not absorb. Looks like: effects "
+        "that imitate a typical setting of it, with the cosine.",
+    )
+
+
+def _smallest(parameter: str, unit: str, amount: float | None) -> str:
+    return f"{parameter.replace('_', ' ')} not at all" if amount is None else f"{parameter} {amount:.2g} {unit}"

@@ -1,0 +1,38 @@
+"""Tables of the unit Gaussian over a corner and over a bent edge, against integrals done in another way."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import ndtr
+from scipy.stats import multivariate_normal, norm
+
+from probewise.inquiry.spans import single, whole
+from probewise.inquiry.unit_gaussian import N_OPENINGS, REACH, seen_of_bend, seen_of_corner
+
+HALF_STEP = 1 / 64  # sd, and the steepest slope of a distribution function is 0.4 per sd
+TO_NEAREST = 0.4 * HALF_STEP
+
+
+@pytest.mark.parametrize("correlation", [-0.95, -0.5, 0.0, 0.3, 0.9])
+def test_a_corner_shows_what_the_bivariate_normal_holds(correlation):
+    rng = np.random.default_rng(2)
+    h, k = rng.uniform(-3, 3, (2, 60))
+    opening = int((np.arcsin(correlation) / np.pi + 0.5) * N_OPENINGS)
+    found = seen_of_corner(single(h), single(k), whole(np.full(60, opening)))
+    expected = multivariate_normal.cdf(np.stack([h, k], axis=-1), cov=[[1, correlation], [correlation, 1]])
+    assert found == pytest.approx(expected, abs=2 * TO_NEAREST + 0.5 / (2 * N_OPENINGS))
+
+
+def test_a_corner_far_off_leaves_one_edge():
+    h = np.linspace(-3, 3, 41)
+    for opening in (0, N_OPENINGS // 2, N_OPENINGS - 1):
+        found = seen_of_corner(single(h), single(np.full(41, 50.0)), whole(np.full(41, opening)))
+        assert found == pytest.approx(ndtr(h), abs=TO_NEAREST + ndtr(-REACH))
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.1, 0.7, 3.0])
+def test_a_bent_edge_shows_what_lies_within_a_parabola(bend):
+    distance = np.linspace(-2.5, 3.5, 13)
+    found = seen_of_bend(single(distance), single(np.full(13, bend)))
+    expected = [quad(lambda t, d=d: norm.pdf(t) * ndtr(d - bend * t * t / 2), -8, 8)[0] for d in distance]
+    assert found == pytest.approx(np.array(expected), abs=TO_NEAREST + 0.5 * (1 + bend) ** 2 / 64 * 0.2)

@@ -63,6 +63,7 @@ N_DRAWS = 999
 _LEAST_PROBABILITY = 1e-3
 _ALARM = 0.01
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
+_DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
 
@@ -198,11 +199,11 @@ class _Diagnoser:
         best = self.search.best(mean_names, noise_of) or null
         samples = self._sample(best, noise_of)
         written = samples
-        if verdict == "unknown" and foreseen:
+        if verdict == "unknown" and best is not null:
             plain = self._sample_of(self.search.candidates[best.n_gaussians, ()], noise_of)
-            share = max(1 - _by_mean(probabilities)[foreseen], _LEAST_DOUBT)
+            share = max(1 - _by_mean(probabilities)[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
             written = doubted(samples, plain, best.found.model.effects, share, rng=self.rng)
-        null_samples = self._sample(null, noise_of)
+        null_samples = samples if best is null else self._sample(null, noise_of)
         effects = self._effects(hypotheses, best, samples, noise_of)
         after = Linearised.of(best.found, best.evidence[noise_of].law)
         where = self._where(null, problem, draws, best, effects, p_value)

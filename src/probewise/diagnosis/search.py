@@ -285,9 +285,14 @@ class _Searcher:
         return self.prior.log_mean(names)
 
     def _coincidence(self, n_gaussians: int) -> float:
-        """Give the nats against effects beside so few Gaussians, where the null alone has more."""
-        best = max(self._nulls(), key=lambda c: c.log_z).n_gaussians
-        return self.prior.coincidence * max(best - n_gaussians, 0)
+        """Give the nats against effects beside so few Gaussians, where the null alone has more.
+
+        Averaged over the null's orders: what an order wins by chance, by a fraction of a nat, must not count whole.
+        """
+        nulls = self._nulls()
+        log_z = np.array([c.log_z for c in nulls])
+        spared = np.array([max(c.n_gaussians - n_gaussians, 0) for c in nulls])
+        return float(logsumexp(log_z) - logsumexp(log_z - self.prior.coincidence * spared))
 
     def _templates(self, found: Fit, names: Sequence[str]) -> dict[str, EffectTemplates]:
         return {n: self.templates.of(found, self.mean_effects[n]) for n in names}

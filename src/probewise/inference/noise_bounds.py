@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from probewise._arrays import IntArray
+from probewise.effects import lattice_step
 from probewise.inference.student_t import StudentT
 from probewise.recordings.plan import Recording
 
@@ -26,8 +27,12 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_floor(recording: Recording) -> float:
-    """Least sd a reading can have: that of rounding to the declared step, or a thousandth of the span."""
-    step = recording.plan.instrumentation.step or 0.0
+    """Least sd a reading can have: that of rounding to the declared step, or a thousandth of the span.
+
+    Where no step is declared, that of the lattice on which all readings lie: without it, levels that happen to be on
+    the lattice too would leave no residual, and a law with a tail would take that for the noise.
+    """
+    step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
     return max(step / math.sqrt(12.0), 1e-3 * reading_span(recording))
 
 

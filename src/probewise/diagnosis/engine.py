@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeAlias
@@ -13,34 +12,27 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.audit import (
     Alias,
-    NextMeasurement,
     aliases,
-    covariance_of,
-    next_measurement,
     settle,
 )
-from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.convergence import require_converged
 from probewise.diagnosis.coordinates import LEAST_READINGS, sensor_from_posterior
 from probewise.diagnosis.evidence import Blocks, Linearised
-from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.gain import held_out_gain
+from probewise.diagnosis.fit import Fit, Model
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
-from probewise.diagnosis.noise import noise_statistics, steps_within_scans
+from probewise.diagnosis.mending import corrected, improvement_of
 from probewise.diagnosis.null import Null
+from probewise.diagnosis.reasons import reason_of
 from probewise.diagnosis.repaired import ModelSamples, doubted, over_orders, sample_model
+from probewise.diagnosis.rivals import next_readings
 from probewise.diagnosis.search import search
+from probewise.diagnosis.stating import effects_found, noise_found
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.diagnosis.unknown import correct
 from probewise.diagnosis.verdict import (
     Diagnosis,
     EffectFound,
     Hypothesis,
-    Improvement,
-    NoiseFound,
-    ParameterFound,
-    Verdict,
     credible_set,
     decide,
 )
@@ -49,7 +41,7 @@ from probewise.diagnosis.weighing import Weighing, with_agreement
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.inference import sd_floor
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
 __all__ = ["SensorPrior", "Thorough", "diagnose"]
@@ -177,7 +169,7 @@ class _Diagnoser:
             require_converged(null.found, Linearised.of(null.found, null.law))
         draws = problem.draws(N_DRAWS, rng=self.rng)
 
-        p_value = global_p_value(problem, self._looks(null.found), draws)
+        p_value = global_p_value(problem, self.search.looks(null.found), draws)
         pairs = self._aliases(problem, null.found)
         verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs))
         # Physics is named only where the test that counts every look has raised an alarm too.
@@ -204,19 +196,32 @@ class _Diagnoser:
             share = max(1 - _by_mean(probabilities)[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
             written = doubted(samples, plain, best.found.model.effects, share, rng=self.rng)
         null_samples = samples if best is null else self._sample(null, noise_of)
-        effects = self._effects(hypotheses, best, samples, noise_of)
+        effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
         after = Linearised.of(best.found, best.evidence[noise_of].law)
         where = self._where(null, problem, draws, best, effects, p_value)
-        improvement = self._improvement(null, best, noise_of, after, p_value)
+        improvement = improvement_of(self.search, null, best, noise_of, after, p_value, rng=self.rng)
         residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
         if verdict == "unknown" and not foreseen:
-            improvement, correction = self._corrected(null, best, after, noise, improvement)
+            improvement, correction = corrected(self.search, null, best, after, noise, improvement, rng=self.rng)
             residuals_after = residuals_after - correction
             change[self.usable] = correction
         candidates = [
             e.sentence(*_moments(samples.columns(e.name))) for e in best.found.model.effects if e.name in UNNAMED
         ]
-        reason = self._reason(verdict, combination, hypotheses, effects, p_value, few, pairs, where, noise, candidates)
+        reason = reason_of(
+            self.search,
+            verdict,
+            combination,
+            hypotheses,
+            effects,
+            p_value,
+            few,
+            pairs,
+            where,
+            noise,
+            candidates,
+            self.least_readings,
+        )
         predicted_before, predicted_after = (c.found.model.predict(c.found.z[None, :])[0] for c in (null, best))
         return Diagnosis(
             recording=self.recording,
@@ -232,8 +237,8 @@ class _Diagnoser:
             where=tuple(where),
             improvement=improvement,
             aliases=tuple(pairs),
-            noise=self._noise(best, noise_of, after, samples),
-            next_measurement=self._next(hypotheses, null),
+            noise=noise_found(self.search, best, noise_of, after, samples, rng=self.rng),
+            next_measurement=next_readings(self.search, hypotheses, null),
             null=null_samples,
             repaired=written,
             residuals_before=self._spread(null.found.residuals),
@@ -289,11 +294,6 @@ class _Diagnoser:
         out[self.usable] = values
         return out
 
-    def _looks(self, found: Fit) -> list[Bank]:
-        """List every template that a test looks at about a fit."""
-        missing = [e for k, e in self.built.items() if k not in self.noise_names and k not in found.model.names]
-        return [self.search.templates.bank(found, missing), self.search.unknown_bases]
-
     def _aliases(self, problem: Linearised, found: Fit) -> list[Alias]:
         """Compare what survives of the effects, each by the entry of its bank that fits best here."""
         telling: dict[str, FloatArray] = {}
@@ -346,238 +346,6 @@ class _Diagnoser:
         without = Model(model.sensor, tuple(e for e in model.effects if e is not effect), model.plan)
         return np.asarray(found.predicted - without.predict(found.z[None, keep])[0, self.usable])
 
-    def _effects(
-        self,
-        hypotheses: tuple[Hypothesis, ...],
-        best: Candidate,
-        samples: ModelSamples,
-        noise_of: tuple[str, ...],
-    ) -> tuple[EffectFound, ...]:
-        out, unit = [], self.recording.plan.instrumentation.unit
-        for name, effect in self.built.items():
-            p = sum(h.probability for h in hypotheses if name in h.effects)
-            if p <= _LEAST_PROBABILITY or name in NUISANCES or name in UNNAMED:
-                continue
-            holder, noise = (best, noise_of) if name in samples.effects else self._holder(name)
-            if holder is None:
-                effect, values, size = self._too_small(effect)
-            else:
-                effect = next((e for e in holder.found.model.effects if e.name == name), effect)
-                own = samples
-                if name not in samples.effects:
-                    evidence, weights = holder.evidence[noise], holder.weights
-                    own = sample_model(holder.found, evidence, self.recording, weights=weights, rng=self.rng, n_steps=0)
-                values, size = own.columns(name), self._size(holder, name, noise)
-            out.append(
-                EffectFound(
-                    name,
-                    min(p, 1.0),
-                    size,
-                    effect.sentence(values.mean(axis=0), values.std(axis=0)),
-                    (*_parameters(effect, values, unit), *_scans(effect, self.recording.plan)),
-                    effect.scans,
-                )
-            )
-        return tuple(sorted(out, key=lambda e: -e.probability))
-
-    def _holder(self, name: str) -> tuple[Candidate | None, tuple[str, ...]]:
-        """Find the most probable refitted candidate that holds an effect."""
-        ranked = sorted(self.search.probabilities.items(), key=lambda item: -item[1])
-        for (mean, noise), p in ranked:
-            if p > 0 and name in (*mean, *noise):
-                candidate = self.search.best(mean, noise)
-                if candidate is not None:
-                    return candidate, noise
-        return None, ()
-
-    def _too_small(self, effect: NamedEffect[Any]) -> tuple[NamedEffect[Any], FloatArray, float]:
-        """Bound an effect that is not felt: amplitudes by the linearised null, the rest as the prior has it.
-
-        Of its variants the one is taken that stands in the middle.
-        """
-        null = self.search.candidates[self.order, ()]
-        best = max(null.evidence.values(), key=lambda e: e.log_z)
-        problem = Linearised.of(null.found, best.law)
-        templates = self.search.templates.of(null.found, effect)
-        middle = len(templates.columns) // 2
-        effect = templates.variant(middle)
-        values = effect.prior.from_unit_cube(self.rng.random((N_DRAWS, len(effect.prior.names))))
-        if not effect.amplitudes:
-            return effect, values, 0.0
-        projected = problem.project(templates.columns[middle])
-        # A ridge of one prior scale keeps amplitudes that the plan cannot see from running off.
-        precision = projected.T @ projected + np.eye(projected.shape[1])
-        amount = np.linalg.solve(precision, projected.T @ problem.residual)
-        spread = np.linalg.cholesky(np.linalg.inv(precision))
-        draws = amount + self.rng.standard_normal((N_DRAWS, len(amount))) @ spread.T
-        for k in effect.amplitudes:
-            values[:, k] = draws @ templates.settings[middle][:, k]
-        # Signs that the prior rules out are folded back.
-        inside = np.isfinite(effect.prior.log_prob(values))
-        values[~inside] = np.abs(values[~inside])
-        return effect, values, float(np.linalg.norm(projected @ amount))
-
-    def _size(self, holder: Candidate, name: str, noise: tuple[str, ...]) -> float:
-        """Measure lambda: what is left on noise-free readings after a full refit without the effect."""
-        law = holder.evidence[noise].law
-        found = holder.found
-        if name in self.search.certain:
-            step = holder.evidence[noise].laid_out.settings[0, holder.evidence[noise].noise.columns_of(name)]
-            return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
-        if name in self.noise_names:
-            # On the noise: the evidence for it, as the effect of that many sd on the mean would leave.
-            gain = holder.evidence[noise].log_z - holder.evidence[tuple(n for n in noise if n != name)].log_z
-            return math.sqrt(2 * max(gain, 0.0))
-        clean = self.recording.readings.copy()
-        clean[self.usable] = found.predicted
-        others = tuple(e for e in found.model.effects if e.name != name)
-        model = Model(found.model.sensor, others, found.model.plan)
-        keep = np.ones(len(found.z), dtype=np.bool_)
-        keep[found.model.columns_of(name)] = False
-        noise_free = Recording(self.recording.plan, clean)
-        # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
-        refit = fit(model, noise_free, found.z[keep], law, sd_floor=found.sd, max_steps=12, tolerance=0.02)
-        return float(np.linalg.norm(law(refit.residuals))) / found.sd * math.sqrt(law.information)
-
-    def _improvement(
-        self, null: Candidate, best: Candidate, noise: tuple[str, ...], after: Linearised, p_value: float
-    ) -> Improvement:
-        rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
-        if best is null:
-            gain = best.evidence[noise].log_z - null.evidence[self.search.certain].log_z
-            return Improvement(gain, 0.0, 0.0, (), rms[0], rms[1], p_value)
-        law = best.evidence[noise].law
-        held = held_out_gain(null.found, best.found, self.recording, law, sd_floor=self.floor)
-        p_after = global_p_value(after, self._looks(best.found), after.draws(N_DRAWS // 2, rng=self.rng))
-        log_evidence = best.evidence[noise].log_z - null.evidence[self.search.certain].log_z
-        return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
-
-    def _corrected(
-        self, null: Candidate, best: Candidate, problem: Linearised, noise: tuple[str, ...], plain: Improvement
-    ) -> tuple[Improvement, FloatArray]:
-        """Repair what the named effects leave by bases without a name, where that predicts scans kept back."""
-        bases = self.search.unknown_bases
-        scan = self.recording.plan.scan[self.usable]
-        fixed = correct(best.found, problem, bases, scan)
-        if fixed.held_out.by_scan and fixed.held_out.per_reading <= 0:
-            return plain, np.zeros(len(fixed.change))
-        wider = replace(
-            best.found,
-            residuals=best.found.residuals - fixed.change,
-            slopes=np.concatenate([best.found.slopes, fixed.columns], axis=1),
-            z=np.concatenate([best.found.z, np.zeros(fixed.columns.shape[1])]),
-        )
-        after = Linearised.of(wider, problem.law)
-        p_after = global_p_value(after, self._looks(best.found), after.draws(N_DRAWS // 2, rng=self.rng))
-        plain_z = null.evidence[noise].log_z
-        named = dict(plain.heldout_by_scan)
-        by_scan = ((self.recording.plan.scan_names[int(k)], gained) for k, gained in fixed.held_out.by_scan)
-        gain = replace(
-            plain,
-            log_evidence=self.search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,
-            heldout_log_density_per_reading=plain.heldout_log_density_per_reading + fixed.held_out.per_reading,
-            heldout_sd=math.hypot(plain.heldout_sd, fixed.held_out.sd),
-            heldout_by_scan=tuple((name, gained + named.get(name, 0.0)) for name, gained in by_scan),
-            rms_after=float(np.sqrt(np.mean(wider.residuals**2))),
-            p_value_after=p_after,
-        )
-        return gain, fixed.change
-
-    def _noise(self, best: Candidate, noise: tuple[str, ...], after: Linearised, samples: ModelSamples) -> NoiseFound:
-        """Test the repaired model's residual for memory, heavy tails and a spread that follows the level."""
-        steps = steps_within_scans(self.recording)
-        own = after.residual[: after.n_points, None]
-        null = after.draws(N_DRAWS, rng=self.rng)[: after.n_points]
-        joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.found.predicted)
-        center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
-        worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
-        p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + N_DRAWS)
-        unit = self.recording.plan.instrumentation.unit
-        parameters = [_parameter("sd", unit, samples.noise_sd)]
-        for name in _in_vocabulary(noise):
-            parameters += _parameters(self.built[name], samples.columns(name), unit)
-        return NoiseFound("+".join(noise) or "white", p_value, tuple(parameters))
-
-    def _next(self, hypotheses: tuple[Hypothesis, ...], null: Candidate) -> NextMeasurement | None:
-        """Ask for the readings that tell the two leading refitted hypotheses about the mean apart."""
-        leaders: list[Candidate] = []
-        for hypothesis in hypotheses:
-            names = tuple(n for n in hypothesis.effects if n not in self.noise_names)
-            candidate = null if names in ((), ("unknown",)) else self.search.best(names, self.search.certain)
-            if candidate is not None and all(candidate.names != leader.names for leader in leaders):
-                leaders.append(candidate)
-            if len(leaders) == 2:
-                break
-        if len(leaders) < 2:
-            rival = self._rival_of(leaders[0], hypotheses)
-            if rival is None:
-                return None
-        else:
-            rival = (leaders[1].found.model, leaders[1].found.z, covariance_of(leaders[1].found))
-        found = leaders[0].found
-        return next_measurement((found.model, found.z, covariance_of(found)), rival, found.sd, self.recording.plan)
-
-    def _rival_of(
-        self, leader: Candidate, hypotheses: tuple[Hypothesis, ...]
-    ) -> tuple[Model, FloatArray, FloatArray] | None:
-        """Make a rival of the most probable effect that is not felt: just as large as lambda 3 here."""
-        ranked = [n for h in hypotheses for n in h.effects if n in self.built and n not in self.noise_names]
-        name = next((n for n in ranked if n not in leader.names), None)
-        if name is None:
-            return None
-        effect, found = self.built[name], leader.found
-        best = max(leader.evidence.values(), key=lambda e: e.log_z)
-        problem = Linearised.of(found, best.law)
-        templates = self.search.templates.of(found, effect)
-        sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
-        at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / 3.0))))
-        setting = templates.settings[at][0].copy()
-        for k in effect.amplitudes:
-            setting[k] *= min(3.0 / max(sizes[at], 1e-9), 50.0)
-        model = found.model.with_effect(templates.variant(at))
-        z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
-        covariance = np.zeros((len(z), len(z)))
-        covariance[: len(found.z), : len(found.z)] = covariance_of(found)
-        return model, z, covariance
-
-    def _reason(
-        self,
-        verdict: Verdict,
-        combination: tuple[str, ...],
-        hypotheses: tuple[Hypothesis, ...],
-        effects: tuple[EffectFound, ...],
-        p_value: float,
-        few: bool,
-        pairs: Sequence[Alias],
-        where: Sequence[Any],
-        noise: tuple[str, ...],
-        candidates: Sequence[str],
-    ) -> str:
-        n = len(self.usable)
-        if few and n >= self.least_readings:
-            return f"All {n} usable readings are equal: there is no signal to diagnose; scan across an edge."
-        if few:
-            return f"{n} usable readings are too few to tell; {self.least_readings} or more are needed."
-        by_name = {effect.name: effect for effect in effects}
-        if verdict == "clean":
-            order = max(self.search.order_probabilities, key=lambda k: self.search.order_probabilities[k])
-            ssf = "" if order == 0 else ", an SSF of one Gaussian," if order == 1 else f", an SSF of {order} Gaussians,"
-            return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
-        if verdict == "unknown":
-            if candidates:
-                like = "; ".join(candidates)
-                return f"Something is missing (p = {p_value:.2g}) that has no name; it is most like this: {like}."
-            place = f" It shows most in {where[0].covariate}." if where else ""
-            known = " and ".join(name.replace("_", " ") for name in self.search.beside(noise))
-            beside = f", beside {known}" if known else ""
-            return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
-        if verdict == "cannot_tell":
-            leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
-            cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
-            return f"These {n} readings are too few to decide between {leading}{cure}."
-        said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
-        return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g})."
-
 
 def _of_everything(found: Diagnosis, everything: Recording) -> Diagnosis:
     """Carry what part of a recording told to the whole of it: predictions and residuals of every row."""
@@ -625,26 +393,3 @@ def _moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _in_vocabulary(noise: tuple[str, ...]) -> tuple[str, ...]:
     """Leave out what is no name of the vocabulary's."""
     return tuple(name for name in noise if name not in NUISANCES)
-
-
-def _parameters(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
-    return tuple(
-        _parameter(name, _unit(own, unit), values[:, k])
-        for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
-    )
-
-
-def _scans(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
-    """Give the numbers of the scans that an effect is bound to, from 0 in order of taking; its sentence names them."""
-    numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
-    return (_parameter("scans", "scan", numbers),) if numbers.size else ()
-
-
-def _unit(own: str, unit: str) -> str:
-    """Write the unit with the reading's own for "reading"."""
-    return own.replace("reading", unit) if own.startswith("reading") else own
-
-
-def _parameter(name: str, unit: str, values: FloatArray) -> ParameterFound:
-    low, high = np.quantile(values, [0.025, 0.975])
-    return ParameterFound(name, unit, float(values.mean()), float(values.std()), (float(low), float(high)))

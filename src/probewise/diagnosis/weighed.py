@@ -22,6 +22,7 @@ from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.templates import TemplateMemory
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
 
 __all__ = ["STEERING", "Candidate", "Search", "weighed"]
 
@@ -102,6 +103,12 @@ class Search:
             if own == noise
         }
         return max(scores, key=lambda names: scores[names], default=())
+
+    def looks(self, found: Fit) -> list[Bank]:
+        """List every template that a test looks at about a fit."""
+        on_mean = [effect for effect in self.effects.values() if effect.stage is not Stage.NOISE]
+        missing = [effect for effect in on_mean if effect.name not in found.model.names]
+        return [self.templates.bank(found, missing), self.unknown_bases]
 
     @property
     def order(self) -> int:

@@ -1,0 +1,103 @@
+"""What a repair gains, and how what has no name is repaired by bases."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.gain import held_out_gain
+from probewise.diagnosis.locate import global_p_value
+from probewise.diagnosis.unknown import correct
+from probewise.diagnosis.verdict import Improvement
+from probewise.diagnosis.weighed import Candidate, Search
+
+__all__ = ["corrected", "improvement_of"]
+
+Names = tuple[str, ...]
+
+_N_DRAWS = 499
+
+
+def improvement_of(
+    search: Search,
+    null: Candidate,
+    best: Candidate,
+    noise: Names,
+    after: Linearised,
+    p_value: float,
+    *,
+    rng: np.random.Generator,
+) -> Improvement:
+    """Measure what the best candidate gains over the null: in evidence, on scans kept back, in what is left.
+
+    Parameters
+    ----------
+    search
+        What was weighed.
+    null, best, noise
+        The candidates, and the noise model of the best.
+    after
+        The best as a linear problem.
+    p_value
+        That nothing is missing from the null.
+    rng
+        Source of randomness, for the null law of the test of what is left.
+    """
+    rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
+    if best is null:
+        gain = best.evidence[noise].log_z - null.evidence[search.certain].log_z
+        return Improvement(gain, 0.0, 0.0, (), rms[0], rms[1], p_value)
+    law = best.evidence[noise].law
+    held = held_out_gain(null.found, best.found, search.recording, law, sd_floor=search.sd_floor)
+    p_after = global_p_value(after, search.looks(best.found), after.draws(_N_DRAWS, rng=rng))
+    log_evidence = best.evidence[noise].log_z - null.evidence[search.certain].log_z
+    return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
+
+
+def corrected(
+    search: Search,
+    null: Candidate,
+    best: Candidate,
+    problem: Linearised,
+    noise: Names,
+    plain: Improvement,
+    *,
+    rng: np.random.Generator,
+) -> tuple[Improvement, FloatArray]:
+    """Repair what the named effects leave by bases without a name, where that predicts scans kept back.
+
+    Returns
+    -------
+    improvement, change
+        `plain` with what the correction adds, and the correction of the usable readings, (n_usable,).
+    """
+    bases = search.unknown_bases
+    scan = search.recording.plan.scan[search.recording.usable]
+    fixed = correct(best.found, problem, bases, scan)
+    if fixed.held_out.by_scan and fixed.held_out.per_reading <= 0:
+        return plain, np.zeros(len(fixed.change))
+    wider = replace(
+        best.found,
+        residuals=best.found.residuals - fixed.change,
+        slopes=np.concatenate([best.found.slopes, fixed.columns], axis=1),
+        z=np.concatenate([best.found.z, np.zeros(fixed.columns.shape[1])]),
+    )
+    after = Linearised.of(wider, problem.law)
+    p_after = global_p_value(after, search.looks(best.found), after.draws(_N_DRAWS, rng=rng))
+    plain_z = null.evidence[noise].log_z
+    named = dict(plain.heldout_by_scan)
+    by_scan = ((search.recording.plan.scan_names[int(k)], gained) for k, gained in fixed.held_out.by_scan)
+    gain = replace(
+        plain,
+        log_evidence=search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,
+        heldout_log_density_per_reading=plain.heldout_log_density_per_reading + fixed.held_out.per_reading,
+        heldout_sd=math.hypot(plain.heldout_sd, fixed.held_out.sd),
+        heldout_by_scan=tuple((name, gained + named.get(name, 0.0)) for name, gained in by_scan),
+        rms_after=float(np.sqrt(np.mean(wider.residuals**2))),
+        p_value_after=p_after,
+    )
+    return gain, fixed.change

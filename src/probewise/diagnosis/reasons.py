@@ -1,0 +1,74 @@
+"""The verdict in one sentence."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+from probewise.diagnosis.audit import Alias
+from probewise.diagnosis.locate import Place
+from probewise.diagnosis.verdict import EffectFound, Hypothesis, Verdict
+from probewise.diagnosis.weighed import Search
+
+__all__ = ["reason_of"]
+
+Names = tuple[str, ...]
+
+
+def reason_of(
+    search: Search,
+    verdict: Verdict,
+    combination: Names,
+    hypotheses: tuple[Hypothesis, ...],
+    effects: tuple[EffectFound, ...],
+    p_value: float,
+    few: bool,
+    pairs: Sequence[Alias],
+    where: Sequence[Place],
+    noise: Names,
+    candidates: Sequence[str],
+    least_readings: int,
+) -> str:
+    """Say in one sentence what the verdict is and why.
+
+    Parameters
+    ----------
+    search
+        What was weighed.
+    verdict, combination, hypotheses, effects, p_value, where
+        As the diagnosis has them.
+    few
+        Whether there are too few readings to say anything.
+    pairs
+        What cannot be told apart.
+    noise
+        The most probable noise model.
+    candidates
+        What is unknown may be this: sentences.
+    least_readings
+        Fewest readings that a verdict is given on.
+    """
+    n = int(search.recording.usable.sum())
+    if few and n >= least_readings:
+        return f"All {n} usable readings are equal: there is no signal to diagnose; scan across an edge."
+    if few:
+        return f"{n} usable readings are too few to tell; {least_readings} or more are needed."
+    by_name = {effect.name: effect for effect in effects}
+    if verdict == "clean":
+        order = max(search.order_probabilities, key=lambda k: search.order_probabilities[k])
+        ssf = "" if order == 0 else ", an SSF of one Gaussian," if order == 1 else f", an SSF of {order} Gaussians,"
+        return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
+    if verdict == "unknown":
+        if candidates:
+            like = "; ".join(candidates)
+            return f"Something is missing (p = {p_value:.2g}) that has no name; it is most like this: {like}."
+        place = f" It shows most in {where[0].covariate}." if where else ""
+        known = " and ".join(name.replace("_", " ") for name in search.beside(noise))
+        beside = f", beside {known}" if known else ""
+        return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
+    if verdict == "cannot_tell":
+        leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
+        cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
+        return f"These {n} readings are too few to decide between {leading}{cure}."
+    said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
+    return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g})."

@@ -31,7 +31,7 @@ __all__ = ["ModelSamples", "doubted", "over_orders", "sample_model"]
 
 N_SAMPLES = 500
 N_STEPS = 12
-_WIDTHS = (1.0, 0.5)
+_WIDTHS = (1.0, 0.5, 0.25, 0.12)
 _LEAST_EFFECTIVE = 10  # one of so many draws counts at least, before Metropolis steps part them again
 
 
@@ -234,7 +234,7 @@ def _posterior_draws(
     steps = rng.standard_normal((N_SAMPLES, len(center)))
     if n_steps == 0:
         return center + steps @ factor
-    # Half of the draws stay nearer: where the posterior is bent they are the ones that lie in it.
+    # Most draws stay nearer: where the posterior is bent they are the ones that lie in it.
     steps *= rng.choice(_WIDTHS, (N_SAMPLES, 1))
     z = np.clip(center + steps @ factor, -FARTHEST, FARTHEST)
     squares = np.sum(steps**2, axis=1)

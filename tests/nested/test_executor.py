@@ -317,6 +317,8 @@ def test_ctrl_c_ends_the_run_and_every_worker(
         env={**os.environ, "PYTHONPATH": os.pathsep.join([folder, *sys.path])},
         start_new_session=True,
         text=True,
+        # Where the tests run in the background, SIGINT is ignored, and a child would inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         assert begun.stdout is not None

@@ -9,12 +9,12 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
+from probewise.diagnosis.annealing import anneal
 from probewise.diagnosis.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit
@@ -22,7 +22,6 @@ from probewise.diagnosis.joint import JointProblem
 from probewise.diagnosis.null import Predictor
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation
 from probewise.inference import sd_ceiling, sd_floor
-from probewise.nested import diversify
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
 from probewise.sensor import ACCURATE_NODES
@@ -30,9 +29,7 @@ from probewise.sensor import ACCURATE_NODES
 __all__ = ["ModelSamples", "doubted", "over_orders", "sample_model"]
 
 N_SAMPLES = 500
-N_STEPS = 12
-_WIDTHS = (1.0, 0.5, 0.25, 0.12)
-_LEAST_EFFECTIVE = 10  # one of so many draws counts at least, before Metropolis steps part them again
+N_WALKERS = 250
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,13 +94,13 @@ def sample_model(
     *,
     weights: Mapping[str, FloatArray],
     rng: np.random.Generator,
-    n_steps: int = N_STEPS,
+    annealed: bool = True,
 ) -> ModelSamples:
     """Draw from the posterior about a fit, under the noise model it was weighed with.
 
-    From its Laplace approximation, resampled by weight, and on from there by Metropolis-Hastings steps
-    (`nested.diversify`): where the SSF has several Gaussians the posterior is bent, and what the
-    approximation alone draws predicts new angles worse by tens of nats.
+    From its Laplace approximation, and on from there by tempering (`anneal`): where the SSF has several
+    Gaussians the posterior is bent, and what the approximation alone draws predicts new angles worse by
+    tens of nats.
 
     Parameters
     ----------
@@ -115,11 +112,11 @@ def sample_model(
         For each effect, the probability of each of its variants.
     rng
         Source of randomness.
-    n_steps
-        Metropolis-Hastings steps of each sample; 0 leaves what Laplace's approximation draws.
+    annealed
+        Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
     """
     law, floor, n_samples = noise.law, sd_floor(recording), N_SAMPLES
-    z = np.clip(_posterior_draws(found, noise, recording, n_steps, rng=rng), -FARTHEST, FARTHEST)
+    z = np.clip(_posterior_draws(found, noise, recording, annealed, rng=rng), -FARTHEST, FARTHEST)
     residuals = recording.readings - found.model.predict(z)
     sigma = law.scale(law(residuals[:, recording.usable].T), floor=floor)
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
@@ -220,9 +217,9 @@ def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
 
 
 def _posterior_draws(
-    found: Fit, noise: NoiseEvidence, recording: Recording, n_steps: int, *, rng: np.random.Generator
+    found: Fit, noise: NoiseEvidence, recording: Recording, annealed: bool, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, resampled by weight, then Metropolis steps."""
+    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then annealed."""
     law = noise.law
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
     sigma = law.scale(whitened)
@@ -231,28 +228,15 @@ def _posterior_draws(
     factor = np.linalg.inv(np.linalg.cholesky(curvature))
     normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / variance - found.z)
-    steps = rng.standard_normal((N_SAMPLES, len(center)))
-    if n_steps == 0:
-        return center + steps @ factor
-    # Most draws stay nearer: where the posterior is bent they are the ones that lie in it.
-    steps *= rng.choice(_WIDTHS, (N_SAMPLES, 1))
-    z = np.clip(center + steps @ factor, -FARTHEST, FARTHEST)
-    squares = np.sum(steps**2, axis=1)
-    log_q = logsumexp([-0.5 * squares / width**2 - len(center) * math.log(width) for width in _WIDTHS], axis=0)
+    if not annealed:
+        return np.asarray(center + rng.standard_normal((N_SAMPLES, len(center))) @ factor)
     problem = JointProblem(found.model, recording, noise.at_best, sd_floor(recording))
-    log_weight = problem.prior.log_prob(z) + problem.log_likelihood(z) - log_q
-    z = z[rng.choice(N_SAMPLES, N_SAMPLES, p=_tempered(log_weight, N_SAMPLES / _LEAST_EFFECTIVE))]
-    return diversify(z, problem, rng=rng, n_steps=n_steps)[0]
 
+    def log_p(z: FloatArray) -> FloatArray:
+        inside = (np.abs(z) < FARTHEST).all(axis=1)
+        return np.where(inside, problem.prior.log_prob(z) + problem.log_likelihood(z), -np.inf)
 
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Turn log weights into probabilities, flattened until at least so many samples count."""
-    for power in np.linspace(1.0, 0.0, 101):
-        weight = np.exp(power * (log_weight - log_weight.max()))
-        weight /= weight.sum()
-        if 1 / np.sum(weight**2) >= least:
-            break
-    return np.asarray(weight)
+    return anneal(center, factor, log_p, n_walkers=N_WALKERS, n_harvests=N_SAMPLES // N_WALKERS, rng=rng)
 
 
 def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:

@@ -62,7 +62,7 @@ def effects_found(
             own = samples
             if name not in samples.effects:
                 evidence, weights = holder.evidence[noise], holder.weights
-                own = sample_model(holder.found, evidence, search.recording, weights=weights, rng=rng, n_steps=0)
+                own = sample_model(holder.found, evidence, search.recording, weights=weights, rng=rng, annealed=False)
             values, size = own.columns(name), _size(search, holder, name, noise)
         out.append(
             EffectFound(

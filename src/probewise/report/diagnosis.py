@@ -133,9 +133,19 @@ def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
             ),
         ),
         paragraph(f"The smallest set that holds 95 %: {', '.join(diagnosis.credible).replace('_', ' ')}."),
+        *_candidates(diagnosis),
         *_weighings(diagnosis),
         *_effects(diagnosis),
     )
+
+
+def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+    """Say what something unknown may be, where it may be there at all."""
+    likely = [(name, p) for name, p in diagnosis.unknown_candidates if p > _LIKELY]
+    if not likely:
+        return ()
+    listed = ", ".join(f"{name.replace('_', ' ')} ({probability(p)})" for name, p in likely)
+    return (paragraph(f"What has no name may be, or depend on: {listed}."),)
 
 
 def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:

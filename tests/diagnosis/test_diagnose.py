@@ -227,3 +227,23 @@ def test_what_has_a_name_of_our_own_is_unknown_and_its_repair_predicts():
     assert found.repaired.effects == ("arm_knock",)
     assert found.improvement.rms_after < 1.1 * NOISE_SD
     assert found.improvement.p_value_after > 0.001
+
+
+def test_readings_beyond_the_declared_range_do_not_stop_it():
+    """A gradient drives the dark end below what the instrument can read: those rows are lost, the rest is diagnosed."""
+    plan = paper_plan()
+    limited = dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, min=8.0, max=None))
+    full = recording("paper", hidden.AmbientGradient(0.05, 0.0))
+    found = diagnose(Recording(limited, full.readings), rng=np.random.default_rng(0))
+    strict(found)
+    assert 24 < found.recording.usable.sum() < len(plan)
+    assert "ambient_gradient" in found.combination
+
+
+def test_rounding_coarser_than_the_fit_is_still_rounding():
+    full = recording("paper")
+    found = diagnose(
+        dataclasses.replace(full, readings=2.0 * np.round(full.readings / 2.0)), rng=np.random.default_rng(0)
+    )
+    strict(found)
+    assert "quantisation" in found.combination

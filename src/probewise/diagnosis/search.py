@@ -186,7 +186,10 @@ class _Searcher:
         return tuple(sorted({*names, *self.certain}))
 
     def _noise_model(self, names: Names, likely: Mapping[str, tuple[FloatArray, float]] | None = None) -> NoiseModel:
-        return NoiseModel(tuple(self.noise_effects[n] for n in names), self.recording, likely or {})
+        # What is certain is not asked again about each fit, whose own residual may be larger.
+        step = np.array([[lattice_step(self.recording.readings[self.usable])]])
+        known = {name: (step, 0.0) for name in self.certain}
+        return NoiseModel(tuple(self.noise_effects[n] for n in names), self.recording, {**known, **(likely or {})})
 
     def _log_noise(self, names: Names) -> float:
         uncertain = tuple(n for n in names if n not in self.certain)

@@ -129,13 +129,13 @@ def _size(search: Search, holder: Candidate, name: str, noise: Names) -> float:
         # On the noise: the evidence for it, as the effect of that many sd on the mean would leave.
         gain = holder.evidence[noise].log_z - holder.evidence[tuple(n for n in noise if n != name)].log_z
         return math.sqrt(2 * max(gain, 0.0))
-    clean = search.recording.readings.copy()
+    clean = np.full(len(search.recording), np.nan)
     clean[search.recording.usable] = found.predicted
     others = tuple(e for e in found.model.effects if e.name != name)
     model = Model(found.model.sensor, others, found.model.plan)
     keep = np.ones(len(found.z), dtype=np.bool_)
     keep[found.model.columns_of(name)] = False
-    noise_free = Recording(search.recording.plan, clean)
+    noise_free = Recording(search.recording.plan, clean).unlimited()
     # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
     refit = fit(model, noise_free, found.z[keep], law, sd_floor=found.sd, max_steps=12, tolerance=0.02)
     return float(np.linalg.norm(law(refit.residuals))) / found.sd * math.sqrt(law.information)

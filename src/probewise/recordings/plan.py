@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -158,6 +158,11 @@ class Recording(ShowsItself):
             if inst.max is not None:
                 ok &= self.readings <= inst.max
         return ok
+
+    def unlimited(self) -> Recording:
+        """Declare no range: what was calculated without noise may lie beyond it by a little, and counts too."""
+        instrumentation = replace(self.plan.instrumentation, min=None, max=None)
+        return Recording(replace(self.plan, instrumentation=instrumentation), self.readings, self.source)
 
     def take(self, rows: IntArray | BoolArray) -> Recording:
         """Keep these rows, in their order."""

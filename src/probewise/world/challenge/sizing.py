@@ -120,13 +120,13 @@ class Ruler:
     @cached_property
     def clean(self) -> Recording:
         """Noise-free readings without any effect."""
-        return self.setting.world.simulate(self.setting.plan, rng=None, look=self._look)
+        return self.setting.world.simulate(self.setting.plan, rng=None, look=self._look).unlimited()
 
     def recording(self, *concealed: Concealed) -> Recording:
         """Return the noise-free readings with these effects."""
         late = all(effect.stage in ANSWERING for effect in concealed)
         world = replace(self.setting.world, concealed=concealed)
-        return world.simulate(self.setting.plan, rng=None, look=self._look if late else None)
+        return world.simulate(self.setting.plan, rng=None, look=self._look if late else None).unlimited()
 
     def size(self, *concealed: Concealed) -> float:
         """Return lambda of the effects together, in units of the sd of the noise's normal part."""

@@ -7,6 +7,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import Diagnosis, model_with
+from probewise.effects import VOCABULARY, Extent
 from probewise.recordings.plan import Recording
 from probewise.world.challenge import NO_PHYSICS, Case, kept_back
 
@@ -17,7 +18,7 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     """Sum the log predictive densities of each scan kept back, in nats.
 
     "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", where all that is concealed
-    is in the vocabulary, is the model with just these effects, fitted to the same readings: nobody could have
+    is in the vocabulary and can show in this plan, is the model with just these effects, fitted to the same readings: nobody could have
     named better. "true" is beyond reach, since it knows the noise-free reading and the sd of the noise's
     normal part; it is the truth where the noise is white.
 
@@ -27,9 +28,11 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
-    hidden = case.truth.hidden
-    if hidden and all(h.in_vocabulary and h.name not in NO_PHYSICS for h in hidden):
-        models["right"] = model_with(case.recording, [h.name for h in hidden], rng=fitting)
+    extent = Extent.of(case.recording)
+    names = [h.name for h in case.truth.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
+    showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
+    if showing and len(showing) == len(case.truth.hidden):
+        models["right"] = model_with(case.recording, showing, rng=fitting)
     sensors = {
         name: samples.fitted_sensor(diagnosis.recording, rng=child)
         for (name, samples), child in zip(models.items(), drawing, strict=False)

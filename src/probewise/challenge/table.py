@@ -179,7 +179,7 @@ def _covering(intervals: list[list[float]]) -> Estimate:
 
 def _held_out(done: list[Result]) -> list[Row]:
     inside = [r for r in done if r["kind"] in ("single", "pair") and on_mean(r)]
-    gains = _gains_of(inside, "right")
+    gains = _gains_of([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
     white = [r for r in inside if r["noise_model"] == "white"]
     outside = [r for r in done if r["kind"] == "outside" and r["noise_model"] == "white"]
     worse = [_gains(r, _SCANS, "true")[0] < -1.0 for r in done]

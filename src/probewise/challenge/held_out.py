@@ -18,9 +18,9 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     """Sum the log predictive densities of each scan kept back, in nats.
 
     "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", where all that is concealed
-    is in the vocabulary and can show in this plan, is the model with just these effects, fitted to the same readings: nobody could have
-    named better. "true" is beyond reach, since it knows the noise-free reading and the sd of the noise's
-    normal part; it is the truth where the noise is white.
+    is in the vocabulary and can show in this plan, is the model with just these effects, fitted to the same
+    readings: nobody could have named better. "true" is beyond reach, since it knows the noise-free reading and
+    the sd of the noise's normal part; it is the truth where the noise is white.
 
     Returns
     -------

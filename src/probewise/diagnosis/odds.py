@@ -24,7 +24,8 @@ class PriorOdds:
     unknown (`foreseen`) is shared out over the effects of `UNNAMED`, the rest is like nothing foreseen.
     Of the noise: `white`, the rest over noise models, by size, then evenly. `coincidence` (nats) is what
     speaks against an effect that makes a Gaussian of the SSF superfluous, for each one: that physics looks
-    like an SSF's shape takes more than an even chance to believe.
+    like an SSF's shape takes more than an even chance to believe; `unknown_coincidence` the same of what has
+    no name, which bends to any shape: before it is believed, the SSF may have its Gaussians.
     """
 
     n_named: int = 24
@@ -38,6 +39,7 @@ class PriorOdds:
     white: float = 0.94
     noise_by_size: tuple[float, ...] = field(default=(0.057, 0.003))
     coincidence: float = 8.0
+    unknown_coincidence: float = 24.0
 
     @classmethod
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:

@@ -287,7 +287,7 @@ class _Searcher:
     def _log_prior(self, names: Names) -> float:
         return self.prior.log_mean(names)
 
-    def _coincidence(self, n_gaussians: int) -> float:
+    def _coincidence(self, n_gaussians: int, each: float | None = None) -> float:
         """Give the nats against effects beside so few Gaussians, where the null alone has more.
 
         Averaged over the null's orders: what an order wins by chance, by a fraction of a nat, must not count whole.
@@ -295,7 +295,7 @@ class _Searcher:
         nulls = self._nulls()
         log_z = np.array([c.log_z for c in nulls])
         spared = np.array([max(c.n_gaussians - n_gaussians, 0) for c in nulls])
-        return float(logsumexp(log_z) - logsumexp(log_z - self.prior.coincidence * spared))
+        return float(logsumexp(log_z) - logsumexp(log_z - (self.prior.coincidence if each is None else each) * spared))
 
     def _templates(self, found: Fit, names: Sequence[str]) -> dict[str, EffectTemplates]:
         return {n: self.templates.of(found, self.mean_effects[n]) for n in names}
@@ -480,7 +480,7 @@ class _Searcher:
                     continue
                 value = evidence.log_z + log_mean(np.array(list(by_family.values())))
                 if not candidate.names:
-                    value -= self._coincidence(candidate.n_gaussians)
+                    value -= self._coincidence(candidate.n_gaussians, self.prior.unknown_coincidence)
                 self.unknown[candidate.n_gaussians, candidate.names, noise] = value
                 if value > best and not candidate.names:
                     best = value

@@ -17,7 +17,7 @@ from probewise._display import ShowsItself
 from probewise._version import __version__
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
-from probewise.effects import UNNAMED, VOCABULARY
+from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.scene import KnownScene, Scene
@@ -29,8 +29,6 @@ T = TypeVar("T")
 
 FORMAT = "sensor/1"
 MIN_SAMPLES = 500
-_EFFECTS = {**VOCABULARY, **UNNAMED}
-
 # Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
 
@@ -115,9 +113,9 @@ class FittedSensor(ShowsItself):
         require_finite("noise_sd", noise_sd)
         if not (noise_sd > 0).all():
             raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
-        unknown = [name for name in self.effects if name not in _EFFECTS]
+        unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
-            raise ParameterError("effects", unknown[0], ", ".join(sorted(_EFFECTS)))
+            raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
         wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
@@ -136,7 +134,7 @@ class FittedSensor(ShowsItself):
     @property
     def carried_effects(self) -> tuple[AnyEffect, ...]:
         """The effects that act on new scans too."""
-        return tuple(_EFFECTS[name]() for name in self.effects if name not in BOUND_TO_SCANS)
+        return tuple(EFFECTS[name]() for name in self.effects if name not in BOUND_TO_SCANS)
 
     @property
     def carried_samples(self) -> FloatArray:
@@ -277,7 +275,7 @@ class FittedSensor(ShowsItself):
         """Return the unit of a parameter."""
         if "." in name:
             owner, _, parameter = name.partition(".")
-            effect = _EFFECTS[owner]() if owner in _EFFECTS else None
+            effect = EFFECTS[owner]() if owner in EFFECTS else None
             return "" if effect is None else dict(zip(effect.prior.names, effect.units, strict=True)).get(parameter, "")
         if name in ("I_min", "I_max"):
             return self.instrumentation.unit

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -99,6 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, infer, inquire; keep a journal and a picture of every step."""
     import webbrowser
+    from functools import partial
 
     import numpy as np
     from tqdm import tqdm
@@ -121,28 +123,20 @@ def run(arguments: argparse.Namespace) -> int:
     run_rng, truth_rng, other_rng = np.random.default_rng(arguments.seed).spawn(3)
     shape, utility = posing.shape_named(arguments.shape, field), utility_named(arguments.utility)
     orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
-    experiment = posing.experiment_for(
+    pose_it = partial(
+        posing.experiment_for,
         sensor,
         shape,
         field,
-        model=arguments.model,
         utility=utility,
-        learn_sensor=arguments.learn_sensor,
-        batch=arguments.batch,
         orientations_rad=orientations_rad,
         repeats=repeats,
-        heights_mm=heights_mm,
+    )
+    experiment = pose_it(
+        model=arguments.model, learn_sensor=arguments.learn_sensor, batch=arguments.batch, heights_mm=heights_mm
     )
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
-    other = posing.experiment_for(
-        sensor,
-        shape,
-        field,
-        model=other_model,
-        utility=utility,
-        orientations_rad=orientations_rad,
-        repeats=repeats,
-    )
+    other = pose_it(model=other_model) if arguments.both_models else None
     journal = out / "journal.jsonl"
     taken = _taken_before(journal, resume=arguments.resume)
     arm: Instrument
@@ -176,13 +170,14 @@ def run(arguments: argparse.Namespace) -> int:
         tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
     ):
         own = explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal)
-        seen = posing.Field.under(arm, other.grid)
-        pairs = beside(own, other, seen, rng=other_rng) if arguments.both_models else ((step, None) for step in own)
+        pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
+        if other is not None:
+            pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=other_rng)
         for step, shadow in pairs:
             steps.append(step)
             pose = step.reading.pose
             readings.append((pose.x_mm, pose.y_mm, step.reading.value))
-            if shadow is None:
+            if shadow is None or other is None:
                 frames.append(report.frame(step, experiment, readings, levels=levels, truth_mm=truth_mm))
             else:
                 others.append(shadow)

@@ -67,10 +67,8 @@ def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
     return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
 
 
-def aliases(
-    problem: Linearised, templates: Mapping[str, FloatArray], cures: Mapping[tuple[str, str], tuple[str, int]]
-) -> list[Alias]:
-    """List pairs of effects whose surviving templates have a cosine of 0.9 or more.
+def aliases(problem: Linearised, templates: Mapping[str, FloatArray]) -> list[Alias]:
+    """List pairs of effects whose surviving templates have a cosine of 0.9 or more; `settle` says what would part them.
 
     Parameters
     ----------
@@ -78,16 +76,12 @@ def aliases(
         The null fit.
     templates
         For each effect its most telling columns (n_points, k).
-    cures
-        For each pair, sorted, what would tell them apart and by how many readings; pairs without
-        an entry are said to need a repeat of the plan under other conditions.
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
         cosine = surviving_cosine(problem, templates[pair[0]], templates[pair[1]])
         if cosine >= ALIAS_COSINE:
-            settle_by, readings = cures.get(pair, ("no reading that this apparatus can take tells them apart", 0))
-            out.append(Alias(pair, cosine, settle_by, readings))
+            out.append(Alias(pair, cosine, "no reading that this apparatus can take tells them apart", 0))
     return sorted(out, key=lambda alias: -alias.cosine)
 
 

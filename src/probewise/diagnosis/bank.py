@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -48,13 +49,17 @@ class Bank:
 
     def __getitem__(self, at: int) -> FloatArray:
         """Give one template, (n_points, k)."""
-        first = int(self.widths[:at].sum())
+        first = int(self._starts[at])
         return self.columns[:, first : first + int(self.widths[at])]
+
+    @cached_property
+    def _starts(self) -> IntArray:
+        """First column of each template, (n_templates,)."""
+        return np.cumsum(self.widths) - self.widths
 
     def take(self, members: IntArray) -> Bank:
         """Keep these templates."""
-        starts = np.cumsum(self.widths) - self.widths
-        at = [np.arange(starts[k], starts[k] + self.widths[k]) for k in members]
+        at = [self._starts[k] + np.arange(self.widths[k]) for k in members]
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
         return Bank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
 
@@ -93,8 +98,7 @@ class Bank:
     def _of_width(self, width: int) -> tuple[IntArray, IntArray]:
         """Give the numbers of the templates of one width, (n,), and of their columns, (n, width)."""
         members = np.flatnonzero(self.widths == width)
-        starts = np.cumsum(self.widths) - self.widths
-        return members, starts[members, None] + np.arange(width)
+        return members, self._starts[members, None] + np.arange(width)
 
     def _under(self, law: NoiseLaw) -> _Whitened:
         """Whiten all templates and scale each to unit rms."""

@@ -77,9 +77,7 @@ def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
         return bases
     alone = bases.take(single).columns
     own = Blocks.of(problem, list(alone.T[:, :, None]), [""] * len(single)).u
-    starts = np.cumsum(named.widths) - named.widths
-    templates = [named.columns[:, a : a + w] for a, w in zip(starts, named.widths, strict=True)]
-    blocks = Blocks.of(problem, templates, named.labels)
+    blocks = Blocks.of(problem, [named[k] for k in range(len(named.widths))], named.labels)
     cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
     like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
     return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from probewise.diagnosis.repaired import ModelSamples, sample_model
 from probewise.diagnosis.search import search
-from probewise.effects import UNNAMED, VOCABULARY, Extent
+from probewise.effects import EFFECTS, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
@@ -39,11 +40,13 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     ParameterError
         If a name is not of the vocabulary, or its effect cannot show in this recording.
     """
-    kinds, extent = {**VOCABULARY, **UNNAMED}, Extent.of(recording)
-    wrong = [name for name in names if name not in kinds or kinds[name].for_extent(extent) is None]
-    if wrong:
-        raise ParameterError("names", wrong[0], "effects of the vocabulary that can show in this recording")
-    effects = {name: effect for name in names if (effect := kinds[name].for_extent(extent)) is not None}
+    extent = Extent.of(recording)
+    effects: dict[str, NamedEffect[Any]] = {}
+    for name in names:
+        effect = EFFECTS[name].for_extent(extent) if name in EFFECTS else None
+        if effect is None:
+            raise ParameterError("names", name, "effects of the vocabulary that can show in this recording")
+        effects[name] = effect
     found = search(recording, effects, sensor=None, sd_floor=sd_floor(recording), depth=max(len(names), 1))
     on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
     on_noise = tuple(sorted(set(names) - set(on_mean)))

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -32,7 +32,7 @@ __all__ = [
     "effect_values",
     "known_scene",
 ]
-__all__ += ["sensor_from_posterior"]
+__all__ += ["SensorPrior", "sensor_from_posterior", "sensor_of"]
 
 FARTHEST = 6.0
 """Bound of every coordinate: six standard deviations of its prior."""
@@ -181,6 +181,26 @@ def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArra
     natural_cov = slope @ cov @ slope.T
     floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
     return SensorCoordinates(n_gaussians, center, np.linalg.cholesky(natural_cov + np.diag(floor)), exchangeable=False)
+
+
+class SensorPrior(Protocol):
+    """An earlier posterior of the sensor: a FittedSensor, or anything with its names and samples."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names, one a column."""
+        ...
+
+    @property
+    def samples(self) -> FloatArray:
+        """Posterior samples, (n_samples, n_params)."""
+        ...
+
+
+def sensor_of(sensor: SensorPrior) -> SensorCoordinates:
+    """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`."""
+    samples = np.asarray(sensor.samples, dtype=np.float64)
+    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
 
 
 def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.fit import Model
 from probewise.effects import edge_distance
 from probewise.recordings.plan import Plan
 from probewise.scene import region_of
@@ -35,16 +34,15 @@ class Covariate:
     scan: str | None = None
 
 
-def slope_along_the_move(model: Model, z: FloatArray) -> FloatArray:
-    """Differentiate the prediction along each row's direction of motion, per mm, shape (n_points,)."""
-    plan = model.plan
+def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
+    """Differentiate predictions of a plan's rows along each one's direction of motion, per mm, shape (n_points,)."""
     step = 0.25
     ahead, behind = (
         replace(plan, x_mm=plan.x_mm + s * plan.direction[:, 0], y_mm=plan.y_mm + s * plan.direction[:, 1])
         for s in (step, -step)
     )
     # The moved plans move the whole row, so the directions, and with them backlash, stay as they are.
-    return np.asarray((model.predict(z[None, :], ahead)[0] - model.predict(z[None, :], behind)[0]) / (2 * step))
+    return np.asarray((predict(ahead) - predict(behind)) / (2 * step))
 
 
 def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:

@@ -5,18 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.audit import (
-    Alias,
-    aliases,
-    settle,
-)
+from probewise.diagnosis.audit import Alias, aliases, settle
 from probewise.diagnosis.convergence import require_converged
-from probewise.diagnosis.coordinates import LEAST_READINGS, sensor_from_posterior
+from probewise.diagnosis.coordinates import LEAST_READINGS, SensorPrior, sensor_of
 from probewise.diagnosis.evidence import Blocks, Linearised
 from probewise.diagnosis.fit import Fit, Model
 from probewise.diagnosis.joining import join
@@ -29,14 +25,8 @@ from probewise.diagnosis.rivals import next_readings
 from probewise.diagnosis.search import search
 from probewise.diagnosis.stating import effects_found, noise_found
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.diagnosis.verdict import (
-    Diagnosis,
-    EffectFound,
-    Hypothesis,
-    credible_set,
-    decide,
-)
-from probewise.diagnosis.weighed import Candidate, Search
+from probewise.diagnosis.verdict import Diagnosis, EffectFound, Hypothesis, credible_set, decide
+from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary
 from probewise.diagnosis.weighing import Weighing, with_agreement
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
@@ -44,7 +34,7 @@ from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["SensorPrior", "Thorough", "diagnose"]
+__all__ = ["Thorough", "diagnose"]
 
 Names = tuple[str, ...]
 
@@ -52,26 +42,11 @@ Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
 """Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
 
 N_DRAWS = 999
-_LEAST_PROBABILITY = 1e-3
 _ALARM = 0.01
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
-
-
-class SensorPrior(Protocol):
-    """An earlier posterior of the sensor: a FittedSensor, or anything with its names and samples."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names, one a column."""
-        ...
-
-    @property
-    def samples(self) -> FloatArray:
-        """Posterior samples, (n_samples, n_params)."""
-        ...
 
 
 def diagnose(
@@ -125,8 +100,7 @@ def diagnose(
     floor = sd_floor(recording)
     known = null
     if sensor is not None:
-        samples = np.asarray(sensor.samples, dtype=np.float64)
-        known = sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
+        known = sensor_of(sensor)
     able = {name: effect for name, effect in fitted.items() if effect is not None}
     built = {name: effect for name, effect in able.items() if known is None or known.admits(effect)}
     found = _Diagnoser(recording, built, known, floor, thorough, rng).run()
@@ -162,8 +136,7 @@ class _Diagnoser:
         probabilities = self.search.probabilities
         hypotheses = _hypotheses(probabilities)
         noise = self._most_probable_noise(probabilities)
-        self.order = self.search.order
-        null = self.search.candidates[self.order, ()]
+        null = self.search.candidates[self.search.order, ()]
         problem = Linearised.of(null.found, null.evidence[noise].law)
         if not few:
             require_converged(null.found, Linearised.of(null.found, null.law))
@@ -179,21 +152,21 @@ class _Diagnoser:
             p_value = 1.0  # readings that never change carry no noise to measure a residual by
 
         mean_names = tuple(name for name in combination if name in self.built and name not in self.noise_names)
-        foreseen = self._foreseen(probabilities)
+        foreseen = self._foreseen()
         if verdict == "unknown":
             mean_names = foreseen or self.search.beside(noise)
         noise_of = noise
         if verdict in ("named", "noise", "clean"):
             stated = tuple(name for name in combination if name in self.noise_names)
             noise_of = self._most_probable_noise(
-                {key: p for key, p in probabilities.items() if _in_vocabulary(key[1]) == stated}
+                {key: p for key, p in probabilities.items() if in_vocabulary(key[1]) == stated}
             )
         best = self.search.best(mean_names, noise_of) or null
         samples = self._sample(best, noise_of)
         written = samples
         if verdict == "unknown" and best is not null:
             plain = self._sample_of(self.search.candidates[best.n_gaussians, ()], noise_of)
-            share = max(1 - _by_mean(probabilities)[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
+            share = max(1 - self.search.by_mean[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
             written = doubted(samples, plain, best.found.model.effects, share, rng=self.rng)
         null_samples = samples if best is null else self._sample(null, noise_of)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
@@ -246,7 +219,7 @@ class _Diagnoser:
             predicted_before=predicted_before,
             predicted_after=predicted_after + change,
             order_probabilities=dict(self.search.order_probabilities),
-            unknown_shares=self._unknown_shares(probabilities),
+            unknown_shares=self._unknown_shares(),
             weighings=weighings,
         )
 
@@ -258,17 +231,17 @@ class _Diagnoser:
             marginal[noise] = marginal.get(noise, 0.0) + p
         return max(marginal, key=lambda k: marginal[k])
 
-    def _foreseen(self, probabilities: Mapping[tuple[Names, Names], float]) -> Names:
+    def _foreseen(self) -> Names:
         """Name the leading refitted combination with something outside the vocabulary, if it leads what is unknown."""
-        by_mean = _by_mean(probabilities)
+        by_mean = self.search.by_mean
         own = {names: p for names, p in by_mean.items() if UNNAMED.keys() & set(names)}
         refitted = {names for _, names in self.search.candidates}
         leader = max(own, key=lambda names: own[names], default=())
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
 
-    def _unknown_shares(self, probabilities: Mapping[tuple[Names, Names], float]) -> dict[str, float]:
+    def _unknown_shares(self) -> dict[str, float]:
         """Share what is unknown out over the names of our own, and over covariates for what has none."""
-        by_mean = _by_mean(probabilities)
+        by_mean = self.search.by_mean
         shares = {family: by_mean.get(("unknown",), 0.0) * p for family, p in self.search.unknown_shares.items()}
         for names, p in by_mean.items():
             for name in UNNAMED.keys() & set(names):
@@ -306,7 +279,7 @@ class _Diagnoser:
             scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
             best = int(np.argmax(scores))
             telling[name], chosen[name] = templates.columns[best], templates.variant(best)
-        return settle(aliases(problem, telling, {}), found, chosen, problem.sd)
+        return settle(aliases(problem, telling), found, chosen, problem.sd)
 
     def _where(
         self,
@@ -372,24 +345,12 @@ def _hypotheses(
     joined: dict[tuple[str, ...], float] = {}
     for (mean, noise), p in probabilities.items():
         outside = mean == ("unknown",) or bool(UNNAMED.keys() & set(mean))
-        key = ("unknown",) if outside else tuple(sorted((*mean, *_in_vocabulary(noise))))
+        key = ("unknown",) if outside else tuple(sorted((*mean, *in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)
 
 
-def _by_mean(probabilities: Mapping[tuple[Names, Names], float]) -> dict[Names, float]:
-    out: dict[Names, float] = {}
-    for (mean, _), p in probabilities.items():
-        out[mean] = out.get(mean, 0.0) + p
-    return out
-
-
 def _moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(values.mean(axis=0)), np.asarray(values.std(axis=0))
-
-
-def _in_vocabulary(noise: tuple[str, ...]) -> tuple[str, ...]:
-    """Leave out what is no name of the vocabulary's."""
-    return tuple(name for name in noise if name not in NUISANCES)

@@ -21,6 +21,7 @@ __all__ = [
     "NoiseEvidence",
     "block_log_bayes_factors",
     "mix_scales",
+    "orthonormal",
     "project_scaled",
     "weigh",
 ]
@@ -229,7 +230,7 @@ class Blocks:
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])
         for width in set(widths):  # all templates of one width at a time
             columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
-            u[:, columns], gain[columns] = _orthonormal(projected[:, columns], width)
+            u[:, columns], gain[columns] = orthonormal(projected[:, columns], width)
         shares = np.sqrt(np.add.reduceat(gain, starts) / problem.n_points)
         return cls(u, gain, starts, tuple(labels), shares)
 
@@ -244,14 +245,18 @@ def project_scaled(problem: Linearised, templates: Sequence[FloatArray]) -> Floa
     return problem.without_fit(whitened)
 
 
-def _orthonormal(columns: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+def orthonormal(
+    columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Orthonormalise neighbours, `width` at a time: (n_rows, n_columns) and squared lengths (n_columns,).
 
-    By the eigenvectors of their products. What is shorter than a millionth is not there: its column is 0.
+    By the eigenvectors of their products. What is no longer than `least`, or than a `share` of the longest of its
+    block, both squared, is not there: its column is 0.
     """
     blocks = columns.reshape(len(columns), -1, width)
     squares, axes = np.linalg.eigh(np.einsum("ibj,ibk->bjk", blocks, blocks, optimize=True))
-    per_length = np.where(squares > 1e-12, 1 / np.sqrt(np.maximum(squares, 1e-12)), 0.0)
+    there = squares > np.maximum(share * squares[:, -1:], least)
+    per_length = np.where(there, 1 / np.sqrt(np.maximum(squares, least)), 0.0)
     u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
     return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
 

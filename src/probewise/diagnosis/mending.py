@@ -48,13 +48,12 @@ def improvement_of(
         Source of randomness, for the null law of the test of what is left.
     """
     rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
+    log_evidence = best.evidence[noise].log_z - null.evidence[search.certain].log_z
     if best is null:
-        gain = best.evidence[noise].log_z - null.evidence[search.certain].log_z
-        return Improvement(gain, 0.0, 0.0, (), rms[0], rms[1], p_value)
+        return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value)
     law = best.evidence[noise].law
     held = held_out_gain(null.found, best.found, search.recording, law, sd_floor=search.sd_floor)
     p_after = global_p_value(after, search.looks(best.found), after.draws(_N_DRAWS, rng=rng))
-    log_evidence = best.evidence[noise].log_z - null.evidence[search.certain].log_z
     return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self
 
 from probewise.effects import UNNAMED, NamedEffect
@@ -34,10 +34,10 @@ class PriorOdds:
     clean_mean: float = 0.60
     unknown: float = 0.06
     foreseen: float = 0.5
-    by_size: tuple[float, ...] = field(default=(0.33, 0.0095, 0.0005))
+    by_size: tuple[float, ...] = (0.33, 0.0095, 0.0005)
     unknown_beside: float = 0.01
     white: float = 0.94
-    noise_by_size: tuple[float, ...] = field(default=(0.057, 0.003))
+    noise_by_size: tuple[float, ...] = (0.057, 0.003)
     coincidence: float = 8.0
     unknown_coincidence: float = 24.0
 

@@ -16,9 +16,8 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
 from probewise.diagnosis.commands import behind, minutes_of
-from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, default_sensor, sensor_from_posterior
+from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, SensorPrior, default_sensor, sensor_of
 from probewise.diagnosis.cures import cures_of
-from probewise.diagnosis.engine import SensorPrior
 from probewise.diagnosis.sights import ALIAS, LEAST_SHARE, Expected, LaidOut, Survivors
 from probewise.diagnosis.verdict import Diagnosis
 from probewise.effects import VOCABULARY, Extent, NamedEffect
@@ -239,11 +238,8 @@ def audit_recorded(
     names, mean = list(known.chain.names), known.theta.mean(axis=0)
     low, high = (float(mean[names.index(name)]) for name in ("I_min", "I_max"))
     low, high = min(low, high), max(low, high, low + 1e-9)
-    if sensor is None:
-        null = default_sensor(Extent.of(diagnosis.recording), known.n_gaussians)
-    else:
-        samples = np.asarray(sensor.samples, dtype=np.float64)
-        null = sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
+    extent = Extent.of(diagnosis.recording)
+    null = default_sensor(extent, known.n_gaussians) if sensor is None else sensor_of(sensor)
     z = np.clip(null.z(mean[None, : 6 * known.n_gaussians + 2])[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
     judged, cosines = _judged(LaidOut.of(expected, plan, effects, most=_SETTINGS), effects)
@@ -253,9 +249,8 @@ def audit_recorded(
 def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:
     """Say what is expected of the sensor, and in words."""
     if sensor is not None:
-        samples = np.asarray(sensor.samples, dtype=np.float64)
-        mean = samples.mean(axis=0)
-        null = sensor_from_posterior(sensor.names, mean, np.cov(samples.T))
+        mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
+        null = sensor_of(sensor)
         z = np.zeros(null.n_params)
         low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
         said = "the sensor as calibrated"

@@ -116,7 +116,7 @@ def sample_model(
         Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
     """
     law, floor, n_samples = noise.law, sd_floor(recording), N_SAMPLES
-    z = np.clip(_posterior_draws(found, noise, recording, annealed, rng=rng), -FARTHEST, FARTHEST)
+    z = np.clip(_posterior_draws(found, noise, recording, floor, annealed, rng=rng), -FARTHEST, FARTHEST)
     residuals = recording.readings - found.model.predict(z)
     sigma = law.scale(law(residuals[:, recording.usable].T), floor=floor)
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
@@ -217,7 +217,7 @@ def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
 
 
 def _posterior_draws(
-    found: Fit, noise: NoiseEvidence, recording: Recording, annealed: bool, *, rng: np.random.Generator
+    found: Fit, noise: NoiseEvidence, recording: Recording, floor: float, annealed: bool, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then annealed."""
     law = noise.law
@@ -230,7 +230,7 @@ def _posterior_draws(
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / variance - found.z)
     if not annealed:
         return np.asarray(center + rng.standard_normal((N_SAMPLES, len(center))) @ factor)
-    problem = JointProblem(found.model, recording, noise.at_best, sd_floor(recording))
+    problem = JointProblem(found.model, recording, noise.at_best, floor)
 
     def log_p(z: FloatArray) -> FloatArray:
         inside = (np.abs(z) < FARTHEST).all(axis=1)

@@ -31,7 +31,7 @@ from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
 from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
 from probewise.diagnosis.weighed import STEERING, Candidate, Search, weighed
-from probewise.effects import UNNAMED, VOCABULARY, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
+from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
@@ -103,6 +103,7 @@ class _Searcher:
         self.extent = Extent.of(self.recording)
         self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
         self.noise_effects = {n: cast(NoiseEffect, e) for n, e in self.effects.items() if e.stage is Stage.NOISE}
+        self.step = lattice_step(self.recording.readings[self.usable])
         self.certain = self._certain()
         open_names = [n for n in self.noise_effects if n != Quantisation.name]
         single = [self._with_certain(names) for names in subsets(open_names, 1)]
@@ -120,7 +121,8 @@ class _Searcher:
         self._pair_noises()
         null = max(self._nulls(), key=lambda c: c.log_z)
         level = null.found.predicted
-        slope = slope_along_the_move(null.found.model, null.found.z)[self.usable]
+        model, z = null.found.model, null.found.z[None, :]
+        slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[self.usable]
         self.covariates = tuple(covariates_of(self.recording.plan, self.usable, level, slope))
         starts = np.flatnonzero(steps_within_scans(self.recording) == 0)
         bases = unknown_templates(self.covariates, level - level.min(), slope, starts)
@@ -178,8 +180,7 @@ class _Searcher:
 
     def _certain(self) -> Names:
         """Name what needs no weighing: that all readings are multiples of a coarse step is no chance."""
-        readings = self.recording.readings[self.usable]
-        coarse = lattice_step(readings) > Quantisation.seen_above * rough_sd(self.recording)
+        coarse = self.step > Quantisation.seen_above * rough_sd(self.recording)
         return (Quantisation.name,) if Quantisation.name in self.noise_effects and coarse else ()
 
     def _with_certain(self, names: Names) -> Names:
@@ -187,8 +188,7 @@ class _Searcher:
 
     def _noise_model(self, names: Names, likely: Mapping[str, tuple[FloatArray, float]] | None = None) -> NoiseModel:
         # What is certain is not asked again about each fit, whose own residual may be larger.
-        step = np.array([[lattice_step(self.recording.readings[self.usable])]])
-        known = {name: (step, 0.0) for name in self.certain}
+        known = {name: (np.array([[self.step]]), 0.0) for name in self.certain}
         return NoiseModel(tuple(self.noise_effects[n] for n in names), self.recording, {**known, **(likely or {})})
 
     def _log_noise(self, names: Names) -> float:
@@ -328,7 +328,7 @@ class _Searcher:
             best_so_far = max(c.log_z + self._log_prior(c.names) for c in grown)
             grown = []
             # A user's own effect was named to be tried, however far it leads from where screening is linear.
-            own = [names for names in ranked if size == 1 and names[0] not in {**VOCABULARY, **UNNAMED}]
+            own = [names for names in ranked if size == 1 and names[0] not in EFFECTS]
             for rank, names in enumerate(dict.fromkeys([*ranked[: self.beam], *own])):
                 # A combination that screening puts this far behind cannot come to matter.
                 if odds[names] < best_so_far - STEERING and (size > 1 or rank > 0) and names not in own:

@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence import orthonormal
 from probewise.diagnosis.fit import Fit, Model
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.templates import effect_templates
@@ -192,7 +193,7 @@ def _starts(codes: IntArray) -> IntArray:
 
 
 def _orthonormal(columns: FloatArray, entry: IntArray) -> FloatArray:
-    """Make each entry's columns orthonormal, by the eigenvectors of their products.
+    """Make each entry's columns orthonormal.
 
     What is shorter than a thousandth of the longest is not there: its column is 0.
     """
@@ -200,10 +201,5 @@ def _orthonormal(columns: FloatArray, entry: IntArray) -> FloatArray:
     widths = np.bincount(entry)
     for width in np.unique(widths):  # all entries of one width at a time
         mine = np.flatnonzero(widths[entry] == width)
-        blocks = columns[:, mine].reshape(len(columns), -1, width)
-        squares, axes = np.linalg.eigh(np.einsum("ibj,ibk->bjk", blocks, blocks, optimize=True))
-        least = np.maximum(1e-6 * squares[:, -1:], 1e-18)
-        per_length = np.where(squares > least, 1 / np.sqrt(np.maximum(squares, 1e-18)), 0.0)
-        turned = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
-        out[:, mine] = turned.reshape(len(columns), -1)
+        out[:, mine], _ = orthonormal(columns[:, mine], int(width), least=1e-18, share=1e-6)
     return out

@@ -13,7 +13,7 @@ from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise import noise_statistics, steps_within_scans
 from probewise.diagnosis.repaired import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.verdict import EffectFound, Hypothesis, NoiseFound, ParameterFound
-from probewise.diagnosis.weighed import Candidate, Search
+from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary
 from probewise.effects import NUISANCES, UNNAMED, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -154,7 +154,7 @@ def noise_found(
     p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + _N_DRAWS)
     unit = search.recording.plan.instrumentation.unit
     parameters = [_parameter("sd", unit, samples.noise_sd)]
-    for name in (name for name in noise if name not in NUISANCES):
+    for name in in_vocabulary(noise):
         parameters += _parameters(search.effects[name], samples.columns(name), unit)
     return NoiseFound("+".join(noise) or "white", p_value, tuple(parameters))
 

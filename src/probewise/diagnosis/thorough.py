@@ -14,9 +14,8 @@ import numpy as np
 
 from probewise import nested
 from probewise.diagnosis.joint import JointProblem
-from probewise.diagnosis.weighed import Candidate, Search, weighed
+from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary, weighed
 from probewise.diagnosis.weighing import Weighing
-from probewise.effects import NUISANCES
 
 __all__ = ["weigh_thoroughly"]
 
@@ -73,9 +72,7 @@ def _leaders(search: Search) -> list[tuple[Candidate, Names]]:
 
     All under the SSF order that has the most evidence for each, the null under that of the first.
     """
-    merged: dict[Names, float] = {}
-    for (mean, _), p in search.probabilities.items():
-        merged[mean] = merged.get(mean, 0.0) + p
+    merged = search.by_mean
     out: list[tuple[Candidate, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
         if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
@@ -106,7 +103,7 @@ def _weigh(
     progress: Progress | None,
 ) -> Weighing:
     evidence = candidate.evidence[noise]
-    effects = tuple(sorted((*candidate.names, *(name for name in noise if name not in NUISANCES))))
+    effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = JointProblem(candidate.found.model, search.recording, evidence, search.sd_floor)
     show = None if progress is None else lambda state: progress(weighing.label, state)

@@ -10,8 +10,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, known_scene, sensor_from_posterior
-from probewise.diagnosis.engine import SensorPrior
+from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, SensorPrior, known_scene, sensor_of
 from probewise.diagnosis.verdict import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
@@ -57,8 +56,7 @@ class SensorAndShape:
         rng
             Source of randomness, for the search.
         """
-        samples = np.asarray(sensor.samples, dtype=np.float64)
-        known = sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
+        known = sensor_of(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
         found = [_likely(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
         best = min(range(len(members)), key=lambda k: found[k][0])

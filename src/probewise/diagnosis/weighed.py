@@ -20,11 +20,11 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.templates import TemplateMemory
-from probewise.effects import NamedEffect
+from probewise.effects import NUISANCES, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["STEERING", "Candidate", "Search", "weighed"]
+__all__ = ["STEERING", "Candidate", "Search", "in_vocabulary", "weighed"]
 
 Names = tuple[str, ...]
 
@@ -95,6 +95,14 @@ class Search:
         options = [c for (_, key), c in self.candidates.items() if key == names]
         return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
 
+    @property
+    def by_mean(self) -> dict[Names, float]:
+        """Probability of each hypothesis about the mean, under any noise."""
+        out: dict[Names, float] = {}
+        for (mean, _), p in self.probabilities.items():
+            out[mean] = out.get(mean, 0.0) + p
+        return out
+
     def beside(self, noise: Names) -> Names:
         """Name the effects on the mean beside which something unknown most probably is; () for none."""
         scores = {
@@ -120,6 +128,11 @@ class Search:
         for n, value in terms:
             by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
         return max(by_order, key=lambda n: by_order[n])
+
+
+def in_vocabulary(noise: Names) -> Names:
+    """Leave out of a noise model what is no name of the vocabulary's."""
+    return tuple(name for name in noise if name not in NUISANCES)
 
 
 def weighed(search: Search) -> Search:

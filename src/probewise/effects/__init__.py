@@ -82,10 +82,14 @@ UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 )
 """Physics outside the vocabulary, by names of our own: what a diagnosis says is unknown, and what it may be."""
 
+EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **UNNAMED})
+"""All physics that has a formula here, by name, whether the vocabulary has it or not."""
+
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
 """What may be wrong with the noise and has no name in the vocabulary, by a name of our own."""
 
 __all__ = [
+    "EFFECTS",
     "NUISANCES",
     "UNNAMED",
     "VOCABULARY",

@@ -31,6 +31,7 @@ class Quantisation(NoiseEffect):
     units: ClassVar[tuple[str, ...]] = ("reading",)
     covariates: ClassVar[tuple[str, ...]] = ("lattice",)
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    n_nodes: ClassVar[int] = 16
     seen_above: ClassVar[float] = 0.3
     """Noise sd: a finer lattice, as of printing, is no effect."""
 
@@ -49,11 +50,6 @@ class Quantisation(NoiseEffect):
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
         """Set the step."""
         return replace(value, step=theta[:, :1])
-
-    def bank(self) -> FloatArray:
-        """Equally weighted nodes of the prior."""
-        n_nodes = 16
-        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
     def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Take the step of the lattice that the readings are on; none where it is too fine to matter."""

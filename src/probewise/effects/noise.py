@@ -31,6 +31,7 @@ class CorrelatedNoise(NoiseEffect):
     units: ClassVar[tuple[str, ...]] = ("1",)
     covariates: ClassVar[tuple[str, ...]] = ("scan",)
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    n_nodes: ClassVar[int] = 28  # close enough to integrate over a posterior of a thousand readings
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -45,11 +46,6 @@ class CorrelatedNoise(NoiseEffect):
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
         """Set the correlation; the sd of one reading stays."""
         return replace(value, rho=theta[:, :1])
-
-    def bank(self) -> FloatArray:
-        """Equally weighted nodes of the prior, close enough to integrate over a posterior of a thousand readings."""
-        n_nodes = 28
-        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Correlation of neighbours, of either sign: residuals (n_points, n_draws) -> (n_draws,)."""
@@ -95,11 +91,6 @@ class SignalDependentNoise(NoiseEffect):
         """Widen the noise of each reading by what it sees."""
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
-    def bank(self) -> FloatArray:
-        """Equally weighted nodes of the prior."""
-        n_nodes = 10
-        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
-
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Correlation of the squares with what is seen: residuals (n_points, n_draws) -> (n_draws,)."""
         tilt = rows.seen - rows.seen.mean()
@@ -143,11 +134,6 @@ class DriftingNoise(NoiseEffect):
         """Scale the noise of each reading by its time."""
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
         return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
-
-    def bank(self) -> FloatArray:
-        """Equally weighted nodes of the prior."""
-        n_nodes = 10
-        return self.prior.from_unit_cube((np.arange(n_nodes)[:, None] + 0.5) / n_nodes)[:, None, :]
 
     def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Correlation of the squares with the order of taking: residuals (n_points, n_draws) -> (n_draws,)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar
+from typing import ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -112,6 +112,13 @@ class NamedEffect(Effect[V], Protocol[V]):
 
 class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
     """An effect on the noise: nothing of it is seen in the mean of the readings."""
+
+    n_nodes: ClassVar[int] = 10
+    """Nodes of its prior, for an effect of one parameter."""
+
+    def bank(self) -> FloatArray:
+        """Lay out equally weighted nodes of the prior of its one parameter, (n_nodes, 1, 1)."""
+        return self.prior.from_unit_cube((np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes)[:, None, :]
 
     def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
         """Lay out equally weighted nodes of the prior about a fit, (n_nodes, n_params); none where it cannot be.

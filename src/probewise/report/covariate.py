@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.covariates import covariates_of
+from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
 from probewise.report.words import unit_name
 
 __all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words"]
@@ -22,7 +20,6 @@ WORDS = {
     "orientation": "orientation of the sensor",
     "edge_distance": "distance from the edge",
 }
-_STEP_MM = 0.25
 
 
 def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
@@ -80,10 +77,5 @@ def category_names(diagnosis: Diagnosis, place: Place) -> dict[float, str] | Non
 
 def _slope(diagnosis: Diagnosis) -> FloatArray:
     """Differentiate the calibrated model's prediction along each row's move, per mm."""
-    plan, known = diagnosis.recording.plan, diagnosis.null
-    ahead, behind = (
-        replace(plan, x_mm=plan.x_mm + s * plan.direction[:, 0], y_mm=plan.y_mm + s * plan.direction[:, 1])
-        for s in (_STEP_MM, -_STEP_MM)
-    )
-    theta = known.theta.mean(axis=0, keepdims=True)
-    return np.asarray((known.chain.predict(theta, ahead)[0] - known.chain.predict(theta, behind)[0]) / (2 * _STEP_MM))
+    known, theta = diagnosis.null.chain, diagnosis.null.theta.mean(axis=0, keepdims=True)
+    return slope_along_the_move(lambda moved: known.predict(theta, moved)[0], diagnosis.recording.plan)

@@ -316,7 +316,7 @@ def _result(
     origin = Origin.join(*(d.origin for d in dead), live.origin.take(order))
     parent = np.where(origin.parent >= 0, np.argsort(origin.ident)[origin.parent], -1)
     born = birth_rows(log_likelihood, label, origin.log_birth, origin.birth_label)
-    remembered = chain_memory(parent, born, n_at_death)
+    remembered = chain_memory(parent, born, n_at_death, evidence.log_weight)
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
     n_ranked = np.concatenate([empty, *(d.n_ranked for d in dead)])

@@ -45,6 +45,16 @@ def test_every_draw_is_positive_definite_and_inside_the_support() -> None:
     assert prior.log_prob(theta + 1e6).max() == -np.inf
 
 
+@pytest.mark.parametrize(("column", "value"), [(3, 0.0), (3, -0.1), (4, 0.0), (5, 1e3)])
+def test_a_gaussian_that_is_not_positive_definite_has_no_density_and_warns_of_nothing(
+    column: int, value: float
+) -> None:
+    prior = default_prior(_edge_recording(), 2)
+    theta = prior.from_unit_cube(np.random.default_rng(5).random((50, 14)))
+    theta[:, column] = value
+    assert (prior.log_prob(theta) == -np.inf).all()
+
+
 def test_swapping_two_gaussians_leaves_the_prior_density_unchanged() -> None:
     prior = default_prior(_edge_recording(), 2)
     theta = prior.from_unit_cube(np.random.default_rng(3).random((50, 14)))

@@ -71,6 +71,27 @@ def test_a_recording_without_effects_is_clean():
     assert found.noise.parameters[0].interval95[0] < NOISE_SD < found.noise.parameters[0].interval95[1]
 
 
+@pytest.mark.parametrize(
+    ("seen", "p_value", "n_asked"),
+    [((0.3, 0.9, 0.9), 0.3, 1), ((0.001, 0.2, 0.9), 0.2, 2), ((0.003, 0.002, 0.001), 0.003, 3)],
+)
+def test_an_alarm_must_stand_at_every_order_of_the_ssf(monkeypatch, seen, p_value, n_asked):
+    """Up to three Gaussians are fitted; more are asked where fewer raise an alarm, and the greatest p-value counts."""
+    left = list(seen)
+    monkeypatch.setattr("probewise.diagnosis.engine.global_p_value", lambda *_: left.pop(0))
+    found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
+    assert sorted(found.order_probabilities) == [1, 2, 3]
+    assert found.p_value == p_value
+    assert len(seen) - len(left) == n_asked
+
+
+def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
+    """A lamp that fades and a sensor that sinks look the same here: the one in the vocabulary speaks for both."""
+    found = diagnose(recording("two_way", hidden.GainDrift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
+    assert "gain_drift" in found.combination
+    assert found.unknown_probability < 0.05
+
+
 def test_backlash_is_named_measured_located_and_repaired():
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     document = strict(found)

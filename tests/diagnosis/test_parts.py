@@ -110,7 +110,7 @@ def test_templates_of_a_variant_are_what_its_scans_change():
     predicted = model.predict(z[None, :])[0]
     usable = np.flatnonzero(np.arange(len(plan)) % 7)
     found = Fit(model, z, predicted[usable], np.zeros(len(usable)), np.zeros((len(usable), 7)), 1.0, 0.0)
-    for name in ("scan_misplacement", "height_offset", "ambient_step", "lag"):
+    for name in ("scan_misplacement", "height_offset", "ambient_step", "lag", "edge_shadow"):
         effect = VOCABULARY[name].for_extent(EXTENT)
         templates = effect_templates(found, effect, usable)
         assert len(templates.columns) == len(templates.settings) == len(templates.choice)
@@ -336,6 +336,16 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
 def test_verdicts_follow_the_probabilities(probability, verdict, combination):
     aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
     assert decide(hypotheses(**probability), NOISE, aliases) == (verdict, combination)
+
+
+@pytest.mark.parametrize(
+    ("lag", "verdict"), [(0.3, "cannot_tell"), (0.1, "named")], ids=["a rival", "out of the question"]
+)
+def test_what_readings_cannot_tell_apart_is_not_named(lag, verdict):
+    """Half of the probability is not enough where priors alone may have parted two that predict the same."""
+    found = hypotheses(clean=0.3 - lag, backlash=0.6, lag=lag, glint=0.1)
+    same = {("backlash",): frozenset({("lag",)})}
+    assert decide(found, NOISE, (), lambda names: same.get(names, frozenset())) == (verdict, ("backlash",))
 
 
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():

@@ -18,6 +18,7 @@ from probewise.effects import (
     Backlash,
     CorrelatedNoise,
     EdgeMisplacement,
+    EdgeShadow,
     Extent,
     Flicker,
     GainDrift,
@@ -38,7 +39,7 @@ from probewise.effects import (
 )
 from probewise.effects.spots import scanned_lines
 from probewise.errors import ParameterError
-from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, two_way_plan
+from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import jittered
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel, Stage
@@ -210,6 +211,29 @@ def test_effects_of_one_scan_leave_the_others_alone():
         found = base().with_effects(effect).predict(np.array([[size]]), PLAN)
         np.testing.assert_allclose(found[:, ~inside], plain[:, ~inside], atol=1e-9)
         assert np.abs(found[:, inside] - plain[:, inside]).max() > 0.5
+
+
+def test_a_shadow_falls_on_the_patterns_with_raised_edges_alone():
+    """Two-way scans of half planes, quadrants and a disc: all of the kinds, one of them, or all but one."""
+    effect = EdgeShadow.for_extent(EXTENT)
+    kinds = {v.patterns: {type(PLAN.patterns[name]) for name in v.patterns} for v in effect.variants()}
+    every = {HalfPlane, Quadrant, Disc}
+    assert kinds.pop(()) == set()
+    assert sorted(map(len, kinds.values())) == [1, 1, 1, 2, 2, 2]
+    assert all(kind <= every for kind in kinds.values())
+    plain = base().predict(np.zeros((1, 0)), PLAN)
+    theta = np.array([[0.05, 4.0]])
+
+    def shadow(names: tuple[str, ...]) -> np.ndarray:
+        return base().with_effects(replace(effect, patterns=names)).predict(theta, PLAN) - plain
+
+    everywhere = shadow(())
+    for names in kinds:
+        inside = np.isin(PLAN.pattern, [k for k, name in enumerate(PLAN.pattern_names) if name in names])
+        np.testing.assert_array_equal(shadow(names)[:, ~inside], 0.0)
+        np.testing.assert_array_equal(shadow(names)[:, inside], everywhere[:, inside])
+        assert np.abs(shadow(names)).max() > 0.5
+    assert EdgeShadow.for_extent(Extent(10.0, 60.0, there_and_back())).choices == ((),)
 
 
 def test_effects_stack_alike_whatever_the_order_given():

@@ -57,14 +57,14 @@ class MomentCoordinates:
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters, (n_samples, 6 N + 2); also the prior's log density over them, (n_samples,)."""
         n = self.prior.n_gaussians
-        # A row for each kind of coordinate, (6, N, n_samples): every operation then runs along memory.
-        g = np.ascontiguousarray(x[:, : 6 * n].reshape(len(x), n, 6).transpose(2, 1, 0))
+        # A row for each kind of coordinate: every operation then runs along memory.
+        g = np.ascontiguousarray(kinds_of(x))
         # A sampler asks far outside too; nothing there may overflow.
         log_variance = g[3:5].clip(-100.0, 100.0)
         log_first, log_ratio = g[0, 0].clip(-100.0, 50.0), g[0, 1:].clip(-100.0, 0.0)
         r = np.tanh(g[5])
         rest = np.maximum(1.0 - r * r, 1e-12)
-        log_rest, both = np.log(rest), log_variance.sum(axis=0)
+        log_rest, both = np.log(rest), log_variance[0] + log_variance[1]
         out = np.empty_like(g)
         np.divide(0.5 * np.exp(-log_variance), rest, out=out[3:5])
         product = out[3] * out[4]
@@ -78,16 +78,22 @@ class MomentCoordinates:
         whole = 1.0 + ratio.sum(axis=0)
         out[1:3] = g[1:3]
         out[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
-        theta = np.empty_like(x)
-        theta[:, : 6 * n] = out.transpose(2, 1, 0).reshape(len(x), 6 * n)
-        theta[:, 6 * n :] = x[:, 6 * n :]
+        theta = x.copy()
+        kinds_of(theta)[...] = out
         # d(A, B, C) / d(log variances, area tangent), d a / d log a, and the first centre from the whole's.
         jacobian = log_a - 1.5 * both - 2.0 * log_rest
-        log_density = self.prior.log_prob(theta) + jacobian.sum(axis=0) + 2.0 * np.log(whole)
+        log_density = self.prior.log_prob_by_kind(out, theta[:, -2], theta[:, -1])
+        log_density += jacobian.sum(axis=0)
+        log_density += 2.0 * np.log(whole)
         log_density += math.lgamma(n + 1) - 3.0 * n * math.log(2.0)
         falling = (g[0, 1:2] <= 0.0).all(axis=0) & (g[0, 2:] <= g[0, 1:-1]).all(axis=0)
-        usable = falling & (np.abs(g[3:5]) < 100.0).all(axis=(0, 1)) & np.isfinite(theta).all(axis=1)
+        usable = falling & (np.abs(g[3:5]) < 100.0).all(axis=(0, 1)) & np.isfinite(log_density)
         return theta, np.where(usable, log_density, -np.inf)
+
+
+def kinds_of(columns: FloatArray) -> FloatArray:
+    """View the Gaussians among parameters or coordinates, (n_samples, 6 N + 2), by kind, (6, N, n_samples)."""
+    return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
 
 
 def _shares(g: FloatArray) -> FloatArray:

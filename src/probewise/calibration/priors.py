@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.coordinates import MomentCoordinates
+from probewise.calibration.coordinates import MomentCoordinates, kinds_of
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
@@ -30,6 +30,7 @@ __all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "blind_axis_rad", "default_pr
 
 _MAX_CORRELATION = 0.98
 _SAME_AXIS = 0.01  # chord of the doubled angle: 0.3 degrees
+_TINY = float(np.finfo(float).tiny)
 _AMPLITUDE = Uniform(0.0, 1.0)
 _PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
 
@@ -133,17 +134,23 @@ class SSFPrior:
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
         self._require_columns(theta)
-        # A row for each kind of parameter, (6, N, n_samples): every operation then runs along memory.
-        g = np.ascontiguousarray(theta[:, :-2].reshape(len(theta), self.n_gaussians, 6).transpose(2, 1, 0))
+        # A row for each kind of parameter: every operation then runs along memory.
+        return self.log_prob_by_kind(np.ascontiguousarray(kinds_of(theta)), theta[:, -2], theta[:, -1])
+
+    def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
+        """Give `log_prob` of Gaussians laid out by `kinds_of`, (6, N, n_samples), with their levels, (n_samples,)."""
         precisions = np.maximum(g[3:5], 0.0)
         product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)
-        inside = (scale > 0) & (np.abs(c) <= self.max_correlation * scale * (1 + 1e-12))
-        a_scale = self.amplitude_scale(np.where(inside, product - c * c, 1.0))
-        each = self.amplitude.log_prob(g[0] / a_scale) - np.log(a_scale * np.where(inside, scale, 1.0))
-        each += self.offset_mm.log_prob(g[1:3]).sum(axis=0) + self.precision.log_prob(g[3:5]).sum(axis=0)
-        total = np.where(inside, each - math.log(2 * self.max_correlation), -np.inf).sum(axis=0)
-        total += self.i_min.log_prob(theta[:, -2]) + self.i_max.log_prob(theta[:, -1])
+        inside = (scale > 0) & (np.abs(c) <= self.max_correlation * (1 + 1e-12) * scale)
+        a_scale = self.amplitude_scale(product - c * c)
+        each = self.amplitude.log_prob(g[0] / a_scale) - np.log(np.maximum(a_scale * scale, _TINY))
+        offset, precision = self.offset_mm.log_prob(g[1:3]), self.precision.log_prob(g[3:5])
+        each += (offset[0] + offset[1]) + (precision[0] + precision[1])
+        each -= math.log(2 * self.max_correlation)
+        each[~inside] = -np.inf
+        total = each.sum(axis=0)
+        total += self.i_min.log_prob(i_min) + self.i_max.log_prob(i_max)
         return np.asarray(total)
 
     @property
@@ -179,7 +186,7 @@ class SSFPrior:
         """Amplitude of a Gaussian of unit mass, for A B - C^2 of shape (n_samples,)."""
         if self.unit_mass_mm2 is None:
             return np.ones_like(determinant)
-        return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, np.finfo(float).tiny))
+        return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, _TINY))
 
     def _require_columns(self, values: FloatArray) -> None:
         if values.ndim != 2 or values.shape[1] != len(self.names):

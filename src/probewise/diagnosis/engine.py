@@ -43,6 +43,7 @@ Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
 
 N_DRAWS = 999
 _ALARM = 0.01
+_NO_ALARM = 0.05  # by any rule, so that no other order of the SSF need be asked
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
@@ -142,9 +143,9 @@ class _Diagnoser:
             require_converged(null.found, Linearised.of(null.found, null.law))
         draws = problem.draws(N_DRAWS, rng=self.rng)
 
-        p_value = global_p_value(problem, self.search.looks(null.found), draws)
+        p_value = self._p_value(null, noise, problem, draws)
         pairs = self._aliases(problem, null.found)
-        verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs))
+        verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs), self._alike)
         # Physics is named only where the test that counts every look has raised an alarm too.
         if few or (verdict == "named" and p_value > _ALARM):
             verdict, combination = "cannot_tell", ()
@@ -223,6 +224,22 @@ class _Diagnoser:
             weighings=weighings,
         )
 
+    def _p_value(self, null: Candidate, noise: Names, problem: Linearised, draws: FloatArray) -> float:
+        """Test that nothing is missing from the mean, be the SSF of the null's order or of a greater one.
+
+        The evidence grants a Gaussian only where it gains the ten nats and more that it costs; what an SSF that is no
+        mixture leaves below that is no physics. So an alarm must stand at every order, and the greatest p-value counts.
+        """
+        p_value = global_p_value(problem, self.search.looks(null.found), draws)
+        for n in sorted(n for n, names in self.search.candidates if not names and n > null.n_gaussians):
+            if p_value > _NO_ALARM:
+                break
+            rival = self.search.candidates[n, ()]
+            problem = Linearised.of(rival.found, rival.evidence[noise].law)
+            own = problem.draws(N_DRAWS, rng=self.rng)
+            p_value = max(p_value, global_p_value(problem, self.search.looks(rival.found), own))
+        return p_value
+
     def _most_probable_noise(
         self, probabilities: Mapping[tuple[tuple[str, ...], tuple[str, ...]], float]
     ) -> tuple[str, ...]:
@@ -280,6 +297,12 @@ class _Diagnoser:
             best = int(np.argmax(scores))
             telling[name], chosen[name] = templates.columns[best], templates.variant(best)
         return settle(aliases(problem, telling), found, chosen, problem.sd)
+
+    def _alike(self, combination: Names) -> frozenset[Names]:
+        """Give the combinations whose effects on the mean the readings cannot tell from these, the noise the same."""
+        noise = {name for name in combination if name in self.noise_names}
+        others = self.search.alike(tuple(name for name in combination if name not in noise))
+        return frozenset(tuple(sorted({*names, *noise})) for names in others)
 
     def _where(
         self,

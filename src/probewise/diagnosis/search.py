@@ -30,7 +30,7 @@ from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
 from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
-from probewise.diagnosis.weighed import STEERING, Candidate, Search, weighed
+from probewise.diagnosis.weighed import STEERING, TOO_ALIKE, Candidate, Search, nats_apart, weighed
 from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -45,6 +45,7 @@ _RIVAL_ORDER = 100.0  # nats behind the best: an SSF order so far back is not se
 _WORTH_GROWING = 20.0  # nats behind the best of its size: no combination grows from there
 _WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
 _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
+_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _PAIRED = 12  # effects that pairs are screened of, the best alone
 
 
@@ -115,6 +116,7 @@ class _Searcher:
         self.unknown: dict[tuple[int, Names, Names], float] = {}
         self.unknown_shares: dict[str, float] = {}
         self.not_felt: set[Names] = set()
+        self.spoken_for: set[Names] = set()  # without a name, and not to be told from what has one
 
     def run(self) -> Search:
         self._null_fits()
@@ -135,6 +137,7 @@ class _Searcher:
         self._weigh_unknown(self._nulls())
         self._refit_what_matters()
         self._other_orders()
+        self._speak_for_the_unnamed()
         refitted = [c for c in self.candidates.values() if c.names]
         self._weigh_unknown(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
         return self._weighed_up()
@@ -176,7 +179,7 @@ class _Searcher:
             ]
             out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
         out |= self.about_parts
-        return {key: value for key, value in out.items() if key[0] not in refitted}
+        return {key: value for key, value in out.items() if key[0] not in refitted | self.spoken_for}
 
     def _certain(self) -> Names:
         """Name what needs no weighing: that all readings are multiples of a coarse step is no chance."""
@@ -316,7 +319,11 @@ class _Searcher:
     def _grow_beam(self) -> None:
         """Refit the best combinations of each size, each grown from the best of the size before."""
         best = max(self._nulls(), key=lambda c: c.log_z)
-        grown = [c for c in self._nulls() if c.n_gaussians <= best.n_gaussians and c.log_z > best.log_z - _RIVAL_ORDER]
+        grown = [
+            c
+            for c in self._nulls()
+            if c.log_z > best.log_z - (_RIVAL_ORDER if c.n_gaussians <= best.n_gaussians else STEERING)
+        ]
         for size in range(1, min(self.depth, len(self.mean_effects)) + 1):
             wishes: dict[Names, tuple[float, Candidate, str]] = {}
             for parent in grown:
@@ -445,12 +452,12 @@ class _Searcher:
             return
         first = self._weighed_up()
         ranked = sorted(first.probabilities, key=lambda key: -first.probabilities[key])
-        leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:2]
+        leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:_AT_OTHER_ORDERS]
         for names in leaders:
             source = max(
                 (c for (_, key), c in self.candidates.items() if key == names), key=lambda c: c.log_z, default=None
             )
-            if source is None or sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-3:
+            if source is None or sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-4:
                 continue
             for n, sensor in self.sensors.items():
                 if (n, names) in self.candidates or n > source.n_gaussians + 1:
@@ -469,6 +476,17 @@ class _Searcher:
                 )
                 if _acts(candidate, null, self.sd_floor):
                     self._keep(candidate)
+
+    def _speak_for_the_unnamed(self) -> None:
+        """Leave out what is outside the vocabulary where the readings cannot tell it from what is inside."""
+        by_name = sorted(self.candidates.values(), key=lambda c: c.log_z)
+        leading = {c.names: c for c in by_name if c.names}
+        named = [c for names, c in leading.items() if not UNNAMED.keys() & set(names)]
+        for names, candidate in leading.items():
+            rivals = (c for c in named if len(c.names) <= len(names))
+            if UNNAMED.keys() & set(names) and any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
+                self.spoken_for.add(names)
+        self.candidates = {key: c for key, c in self.candidates.items() if key[1] not in self.spoken_for}
 
     def _weigh_unknown(self, candidates: Sequence[Candidate]) -> None:
         """Weigh something unknown beside each candidate."""

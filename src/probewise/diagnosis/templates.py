@@ -84,10 +84,10 @@ def effect_templates(found: Fit, effect: NamedEffect[Any], usable: IntArray) -> 
         (everywhere,) = _columns(found, effect, gates.always[None, :, :], usable)
         columns = tuple(everywhere * opened[usable, None] for opened in gates.opened)
         return EffectTemplates(columns, tuple(itertools.chain(*banks)), variants, np.arange(len(variants)))
-    # Variants bound to the same scans, or to none, differ in their priors alone: one prediction does for them.
+    # Variants bound to the same scans and patterns differ in their priors alone: one prediction does for them.
     by_entry: list[FloatArray] = []
     first = 0
-    for _, group in itertools.groupby(variants, key=lambda variant: variant.scans):
+    for _, group in itertools.groupby(variants, key=lambda variant: (variant.scans, variant.patterns)):
         last = first + len(list(group))
         by_entry += _columns(found, variants[first], np.concatenate(banks[first:last]), usable)
         first = last

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -25,6 +25,8 @@ __all__ = [
     "credible_set",
     "decide",
 ]
+
+_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
@@ -182,13 +184,17 @@ def credible_set(hypotheses: tuple[Hypothesis, ...], mass: float = 0.95) -> tupl
 
 
 def decide(
-    hypotheses: tuple[Hypothesis, ...], noise_names: frozenset[str], aliases: tuple[Alias, ...]
+    hypotheses: tuple[Hypothesis, ...],
+    noise_names: frozenset[str],
+    aliases: tuple[Alias, ...],
+    alike: Callable[[tuple[str, ...]], frozenset[tuple[str, ...]]] = lambda _: frozenset(),
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Turn probabilities into a verdict and the combination it names.
 
     A class of aliases is the combinations that differ only by swapping aliased effects; where it holds
     half the probability and none of its members does, the answer is `cannot_tell`. The same where
-    clean leads without holding half.
+    clean leads without holding half, and where the readings cannot tell the leader from another that is
+    not out of the question (`alike`): what tells those apart is what was believed before, not what was read.
     """
     probability = {h.effects: h.probability for h in hypotheses}
     if probability.get(("unknown",), 0.0) >= 0.5:
@@ -200,6 +206,8 @@ def decide(
         return "cannot_tell", ()
     top = max(named, key=lambda effects: named[effects])
     if named[top] >= 0.5:
+        if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in alike(top)):
+            return "cannot_tell", top
         return ("noise" if set(top) <= noise_names else "named"), top
     both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
     of_class = {top} | {tuple(sorted({*top} - {name} | {other})) for name, other in both_ways if name in top}

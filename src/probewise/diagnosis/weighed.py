@@ -24,12 +24,15 @@ from probewise.effects import NUISANCES, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["STEERING", "Candidate", "Search", "in_vocabulary", "weighed"]
+__all__ = ["STEERING", "TOO_ALIKE", "Candidate", "Search", "in_vocabulary", "nats_apart", "weighed"]
 
 Names = tuple[str, ...]
 
 STEERING = 3.0
 """Nats behind the best: a noise model further back does not say what to look for next."""
+
+TOO_ALIKE = 3.0
+"""Nats that readings are expected to tell between two hypotheses; with fewer they cannot tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,15 @@ class Search:
         options = [c for (_, key), c in self.candidates.items() if key == names]
         return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
 
+    def alike(self, names: Names) -> frozenset[Names]:
+        """Give the other combinations that these readings cannot tell from this one, at any SSF order."""
+        return frozenset(
+            key
+            for (n, key), other in self.candidates.items()
+            if key and key != names and (n, names) in self.candidates
+            if nats_apart(self.candidates[n, names], other) < TOO_ALIKE
+        )
+
     @property
     def by_mean(self) -> dict[Names, float]:
         """Probability of each hypothesis about the mean, under any noise."""
@@ -128,6 +140,15 @@ class Search:
         for n, value in terms:
             by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
         return max(by_order, key=lambda n: by_order[n])
+
+
+def nats_apart(first: Candidate, second: Candidate) -> float:
+    """Log Bayes factor to be expected between two refitted models if the first is true.
+
+    Half of the squared distance between their predictions, in sds of the noise as the first has it.
+    """
+    apart = first.law((first.found.residuals - second.found.residuals)[:, None])
+    return 0.5 * float(np.sum(apart**2)) / first.found.sd**2
 
 
 def in_vocabulary(noise: Names) -> Names:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -15,6 +16,7 @@ from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.spots import bell
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
+from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint, Stage, View
 
@@ -130,11 +132,17 @@ class Halo(NamedEffect[Footprint]):
 
 @dataclass(frozen=True)
 class EdgeShadow(NamedEffect[View]):
-    """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge."""
+    """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge.
+
+    Patterns may be made in different ways, one glued on, another printed. `patterns` names those with raised edges,
+    () all; `choices` are all that they might be.
+    """
 
     typical: float = 0.01
     narrowest_mm: float = 1.0
     widest_mm: float = 30.0
+    patterns: tuple[str, ...] = ()
+    choices: tuple[tuple[str, ...], ...] = ((),)
 
     name: ClassVar[str] = "edge_shadow"
     stage: ClassVar[Stage] = Stage.SEEN
@@ -144,8 +152,14 @@ class EdgeShadow(NamedEffect[View]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look for widths from a hundredth to a third of the longest scan."""
-        return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3)
+        """Look for widths from a hundredth to a third of the longest scan.
+
+        Of the patterns' kinds all may have raised edges, or one, or all but one.
+        """
+        kinds = _by_kind(extent.plan)
+        but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
+        choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
+        return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3, choices=choices)
 
     @cached_property
     def prior(self) -> Product:
@@ -162,11 +176,16 @@ class EdgeShadow(NamedEffect[View]):
         parts = [
             (rows, edge_distance(value.regions[name], x_mm[:, rows], y_mm[:, rows]))
             for name, rows in plan.rows_by_pattern()
+            if not self.patterns or name in self.patterns
         ]
-        distance = np.empty((max(len(part) for _, part in parts), len(plan)))
+        distance = np.full((max((len(part) for _, part in parts), default=1), len(plan)), np.inf)
         for rows, part in parts:
             distance[:, rows] = part
         return replace(value, seen=value.seen - theta[:, :1] * bell(distance**2, theta[:, 1:2]))
+
+    def variants(self) -> tuple[Self, ...]:
+        """Choose the patterns."""
+        return tuple(replace(self, patterns=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
         """One column each for six widths."""
@@ -176,8 +195,18 @@ class EdgeShadow(NamedEffect[View]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how deep and how wide."""
         kind = "darker" if mean[0] > 0 else "brighter"
+        where = f" of {', '.join(self.patterns)}" if self.patterns else ""
         return (
-            f"within about {give_or_take(mean[1], sd[1])} mm of an edge it is "
+            f"within about {give_or_take(mean[1], sd[1])} mm of an edge{where} it is "
             f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: "
             "the edge casts a shadow"
         )
+
+
+def _by_kind(plan: Plan) -> tuple[tuple[str, ...], ...]:
+    """Names of the patterns with edges that a plan reads over, those of one kind together."""
+    kinds: dict[type, list[str]] = {}
+    for name, _ in plan.rows_by_pattern():
+        if isinstance(pattern := plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):
+            kinds.setdefault(type(pattern), []).append(name)
+    return tuple(tuple(names) for names in kinds.values())

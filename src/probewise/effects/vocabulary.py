@@ -76,11 +76,16 @@ class NamedEffect(Effect[V], Protocol[V]):
         """Names of the scans that it is bound to; () where it acts in all."""
         return ()
 
+    @property
+    def patterns(self) -> tuple[str, ...]:
+        """Names of the patterns that it is bound to; () where it acts on all."""
+        return ()
+
     def variants(self) -> tuple[Self, ...]:
         """List the discrete choices that it leaves open, all as probable: itself with each of them made.
 
         Which scan, which mounting, between which two readings: what no fit finds by small steps.
-        Variants differ in their `scans`, or in their priors alone.
+        Variants differ in their `scans` or `patterns`, or in their priors alone.
         """
         return (self,)
 

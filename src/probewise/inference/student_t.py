@@ -47,12 +47,15 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
     -------
     Of the arguments' broadcast shape.
     """
-    s, a = np.broadcast_arrays(np.asarray(square, dtype=np.float64), np.asarray(n, dtype=np.float64) / 2.0)
+    s, a = np.asarray(square, dtype=np.float64), np.asarray(n, dtype=np.float64) / 2.0
     with np.errstate(over="ignore"):
         t_low, t_high = s / (2.0 * low**2), s / (2.0 * high**2)
-    out = np.empty(s.shape)
     fits = t_low < a  # residuals below the floor: both ends in the lower tail
     huge = t_high > a  # residuals beyond the ceiling: both ends in the upper tail
+    if not (fits.any() or huge.any()):
+        return _log_usual(s, a, t_low, t_high) - math.log(2.0)
+    s, a, t_low, t_high = np.broadcast_arrays(s, a, t_low, t_high)
+    out = np.empty(s.shape)
     if fits.any():
         b = a[fits]
         out[fits] = _log_difference(
@@ -65,10 +68,14 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
         out[huge] = difference + b * (math.log(2.0) - np.log(s[huge]))
     usual = ~(fits | huge)
     if usual.any():
-        b = a[usual]
-        share = gammainc(b, t_low[usual]) - gammainc(b, t_high[usual])
-        out[usual] = gammaln(b) + np.log(share) + b * (math.log(2.0) - np.log(s[usual]))
+        out[usual] = _log_usual(s[usual], a[usual], t_low[usual], t_high[usual])
     return out - math.log(2.0)
+
+
+def _log_usual(s: FloatArray, a: FloatArray, t_low: FloatArray, t_high: FloatArray) -> FloatArray:
+    """Log of twice the integral, for t_low above a and t_high below."""
+    share = gammainc(a, t_low) - gammainc(a, t_high)
+    return np.asarray(gammaln(a) + np.log(share) + a * (math.log(2.0) - np.log(s)))
 
 
 def _log_difference(large: FloatArray, small: FloatArray) -> FloatArray:
@@ -148,7 +155,7 @@ class StudentT:
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
             raise ShapeError(f"{residual.shape[1]} readings against {self.groups.size} groups; allowed: one each")
-        square = (residual * residual) @ self._membership
+        square = np.square(residual, out=residual) @ self._membership
         integral = log_sigma_integral(square, self._sizes, self.sd_floor, self.sd_ceiling)
         constant = 0.5 * self.groups.size * _LOG_2PI + self._sizes.size * math.log(
             math.log(self.sd_ceiling / self.sd_floor)

@@ -66,10 +66,11 @@ class Points:
             self.label.copy(),
         )
 
-    def put(self, rows: IntArray | BoolArray, points: Points) -> None:
-        """Overwrite these rows."""
-        self.u[rows], self.theta[rows], self.log_density[rows] = points.u, points.theta, points.log_density
-        self.log_likelihood[rows], self.label[rows] = points.log_likelihood, points.label
+    def put(self, rows: IntArray | BoolArray, points: Points, which: IntArray) -> None:
+        """Overwrite these rows by the rows `which` of `points`."""
+        self.u[rows], self.theta[rows] = points.u.take(which, axis=0), points.theta.take(which, axis=0)
+        self.log_density[rows], self.label[rows] = points.log_density[which], points.label[which]
+        self.log_likelihood[rows] = points.log_likelihood[which]
 
     def order(self) -> IntArray:
         """Row numbers from worst to best, ties by label."""
@@ -155,9 +156,9 @@ class Evaluator:
             raise NotConvergedError(self._why(error, parts[len(answers)])) from error
         # A copy, since a likelihood may hand out the same array every time.
         values = np.concatenate([self._numbers(a, part) for a, part in zip(answers, parts, strict=True)])
-        bad = np.isnan(values) | (values == np.inf)
-        if bad.any():
-            at = int(np.flatnonzero(bad)[0])
+        fine = values < np.inf
+        if not fine.all():
+            at = int(np.argmin(fine))
             raise NotConvergedError(
                 f"the log likelihood is {values[at]} at {self._show(theta[at])}; "
                 "allowed: a finite number, or -inf where the hypothesis is impossible"

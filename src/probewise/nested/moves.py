@@ -162,7 +162,7 @@ class SliceMove:
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
         kind = self._kinds(n_chains, n_steps, n_hops, rng)
-        frames = _frames(n_chains, n_steps, n_params, rng)
+        frames = _frames(kind == _FRAME, n_params, rng)
         axis = _axes(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
@@ -175,15 +175,15 @@ class SliceMove:
 
         def begin(rows: IntArray) -> None:
             """Lay the next step's line, bracket and level."""
-            kinds, measure = kind[rows, step[rows]], view.measure(rows, home[rows])
+            at = step[rows]
+            kinds, measure = kind[rows, at], view.measure(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
-            along, follow = np.flatnonzero(kinds == _AXIS), np.flatnonzero(kinds == _DIFFERENCE)
-            turned = np.flatnonzero((kinds != _AXIS) & (kinds != _DIFFERENCE))
+            turned, along, follow = ((kinds == one).nonzero()[0] for one in (_FRAME, _AXIS, _DIFFERENCE))
             if turned.size:
-                frame = frames[rows[turned], step[rows[turned]]]
+                frame = frames[rows[turned], at[turned]]
                 toward[turned] = self.width * np.matmul(view.root[measure[turned]], frame[:, :, None])[:, :, 0]
             if along.size:
-                which = axis[rows[along], step[rows[along]]]
+                which = axis[rows[along], at[along]]
                 least, widening = view.conditional[measure[along], which], view.widening[measure[along], which]
                 toward[along, which] = self.width * least * widening ** rng.random(along.size)
             if follow.size:
@@ -194,17 +194,17 @@ class SliceMove:
                 behind = view.own_row[rows[follow]] + 1
                 toward[follow] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
             line[rows] = toward
-            low[rows], high[rows] = _bracket(now.u[rows], toward, walls, rng)
+            low[rows], high[rows] = _bracket(now.u, rows, toward, walls, rng)
             level[rows] = now.log_density[rows] - rng.standard_exponential(rows.size)
 
         active = np.arange(n_chains)
         begin(active)
         while active.size:
             rows, n_ahead = active, min(_MOST_AHEAD, max(1, n_chains // (2 * active.size)))
-            t, low[rows], high[rows] = _candidates(low[rows], high[rows], n_ahead, rng)
-            of = np.repeat(np.arange(rows.size), n_ahead)
-            chain = rows[of]
-            ahead = now.u[rows][:, None, :] + t[:, :, None] * line[rows][:, None, :]
+            t, below, above = _candidates(low[rows], high[rows], n_ahead, rng)
+            low[rows], high[rows] = below, above
+            chain = rows.repeat(n_ahead)
+            ahead = now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * line.take(rows, axis=0)[:, None, :]
             candidate = ahead.reshape(-1, n_params)
             if walls is not None:
                 np.clip(candidate, *walls, out=candidate)
@@ -220,7 +220,7 @@ class SliceMove:
                 if hop.any():
                     # A hop has one place to go to: the first candidate takes it, the others are void.
                     ok[hopping] = np.arange(chain.size)[hopping] % n_ahead == 0
-                    first = np.flatnonzero(hopping & ok)
+                    first = (hopping & ok).nonzero()[0]
                     who = chain[first]
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
                     candidate[first], log_growth = view.hop(who, now.u[who], home[who], goal[first])
@@ -229,31 +229,29 @@ class SliceMove:
                         ok[first] = ((candidate[first] >= walls[0]) & (candidate[first] <= walls[1])).all(axis=1)
                 place = clusters.assign(candidate)
                 ok &= (kinds == _DIFFERENCE) | (place == goal)
-            asked = np.flatnonzero(ok)
+            asked = ok.nonzero()[0]
             if asked.size:
-                theta, log_density = space.leave(candidate[asked])
-                above = log_density >= least[asked]
-                ok[asked] = above
-                asked = asked[above]
+                theta, log_density = space.leave(candidate.take(asked, axis=0))
+                above_level = (log_density >= least[asked]).nonzero()[0]
+                theta, log_density = theta.take(above_level, axis=0), log_density[above_level]
+                asked = asked[above_level]
+                ok[:] = False
             if asked.size:
-                tried = evaluate.weigh(candidate[asked], theta[above], log_density[above], rng)
-                inside = bound.admits(tried.log_likelihood, tried.label)
-                ok[asked] = inside
-                # Of a chain's candidates the first that is admitted counts: written backwards, it comes last.
-                good = np.flatnonzero(inside)[::-1]
-                first_of = np.full(rows.size, -1)
-                first_of[of[asked[good]]] = good
-                won = np.flatnonzero(first_of >= 0)
-                taken, which = rows[won], first_of[won]
-                now.put(taken, tried.take(which))
-                home[taken] = place[asked[which]]
-                moved[taken] = True
+                tried = evaluate.weigh(candidate.take(asked, axis=0), theta, log_density, rng)
+                ok[asked] = bound.admits(tried.log_likelihood, tried.label)
                 n_evaluated += asked.size
             n_needed, delivered = _needed(ok.reshape(-1, n_ahead))
+            won = delivered.nonzero()[0]
+            if won.size:
+                # Of a chain's candidates the first that is admitted counts.
+                taken, which = rows[won], won * n_ahead + n_needed[won] - 1
+                now.put(taken, tried, np.searchsorted(asked, which))
+                home[taken] = place[which]
+                moved[taken] = True
             n_tried += int(n_needed[~hop].sum())
-            n_taken += int((delivered & ~hop).sum())
+            n_taken += int(np.count_nonzero(delivered & ~hop))
             # A bracket that has shrunk to nothing (a point alone on its line) ends the step where it began.
-            done = rows[delivered | hop | (high[rows] - low[rows] < 1e-13)]
+            done = rows[delivered | hop | (above - below < 1e-13)]
             step[done] += 1
             more = done[step[done] < n_steps]
             if more.size < done.size:
@@ -285,8 +283,9 @@ def _candidates(
     """
     t = np.empty((len(low), n_ahead))
     for k in range(n_ahead):
-        t[:, k] = low + (high - low) * rng.random(len(low))
-        low, high = np.where(t[:, k] > 0, low, t[:, k]), np.where(t[:, k] > 0, t[:, k], high)
+        t[:, k] = here = low + (high - low) * rng.random(len(low))
+        ahead = here > 0
+        low, high = np.where(ahead, low, here), np.where(ahead, here, high)
     return t, low, high
 
 
@@ -296,11 +295,18 @@ def _needed(ok: BoolArray) -> tuple[IntArray, BoolArray]:
     return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
 
-def _frames(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> FloatArray:
-    """Draw rows of random orthogonal matrices, (n_chains, n_steps, n_params)."""
-    n_frames = -(-n_steps // n_params)
-    frames = np.linalg.qr(rng.standard_normal((n_chains * n_frames, n_params, n_params)))[0]
-    return np.asarray(frames.reshape(n_chains, n_frames * n_params, n_params)[:, :n_steps])
+def _frames(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
+    """Draw rows of random orthogonal matrices where `needed`, (n_chains, n_steps), is true.
+
+    Returns (n_chains, n_steps rounded up to whole matrices, n_params). Matrices of which no row is needed are left as
+    drawn: making one orthogonal is what costs.
+    """
+    n_chains, n_steps = needed.shape
+    first = np.arange(0, n_steps, n_params)
+    frames = rng.standard_normal((n_chains, first.size, n_params, n_params))
+    used = np.logical_or.reduceat(needed, first, axis=1)
+    frames[used] = np.linalg.qr(frames[used])[0]
+    return frames.reshape(n_chains, first.size * n_params, n_params)
 
 
 def _axes(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
@@ -332,7 +338,9 @@ class _View:
 
     @classmethod
     def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _View:
-        same = (live[None, :, :] == u[:, None, :]).all(axis=2)
+        same = np.logical_and.reduce(
+            [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
+        )
         # A start that is no live point is in no cluster's measure either.
         own_home = np.where(same.any(axis=1), home, -1)
         own = clusters.without(u, home)
@@ -375,12 +383,13 @@ def _walls(space: Space) -> Walls | None:
 
 
 def _bracket(
-    u: FloatArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
+    u: FloatArray, rows: IntArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Place a bracket of length one at random about each point, cut where the line leaves the space."""
-    low = -rng.random(len(u))
+    """Place a bracket of length one at random about each point `u[rows]`, cut where the line leaves the space."""
+    low = -rng.random(rows.size)
     if walls is None:
         return low, low + 1.0
+    u = u.take(rows, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         to_low, to_high = (walls[0] - u) / line, (walls[1] - u) / line
     still = line == 0

@@ -165,7 +165,7 @@ class _EdgeViews:
                 cells += here[..., n_angles + self.which]
             replace_by_cumulative(cells)
             cells *= weight[:, start : start + step]
-            seen = cells.sum(axis=0)[:, self.view]
+            seen = cells.sum(axis=0).take(self.view, axis=1, mode="clip")  # "clip" spares the check of bounds
             seen *= self.gain
             np.add(seen, self.low, out=out[start : start + step] if n_samples > 1 else out)
 

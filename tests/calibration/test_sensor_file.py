@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from probewise.calibration import FittedSensor, OrderEvidence, PriorRow, ScanNoise, read_sensor, write_sensor
+from probewise.effects import EdgeShadow
 from probewise.errors import FileError, ParameterError, ShapeError
 
 
@@ -36,6 +37,34 @@ def test_a_sensor_survives_its_file(sensor: FittedSensor, tmp_path: Path) -> Non
     for name in ("names", "orders", "priors", "scan_noise", "notes", "fingerprint", "source", "instrumentation"):
         assert getattr(back, name) == getattr(full, name)
     assert list(tmp_path.iterdir()) == [tmp_path / "sensor.json"]
+
+
+def test_an_effect_of_some_patterns_is_so_after_the_file_too(sensor: FittedSensor, tmp_path: Path) -> None:
+    shadow = np.tile([0.02, 3.0], (len(sensor.samples), 1))
+    shaded = replace(
+        sensor,
+        names=(*sensor.names, "edge_shadow.amp", "edge_shadow.w"),
+        samples=np.concatenate([sensor.samples, shadow], axis=1),
+        effects=("edge_shadow",),
+        patterns={"edge_shadow": ("boundary",)},
+    )
+    write_sensor(shaded, tmp_path / "sensor.json")
+    back = read_sensor(tmp_path / "sensor.json")
+    assert back.patterns == shaded.patterns
+    (effect,) = back.carried_effects
+    assert isinstance(effect, EdgeShadow)
+    assert effect.patterns == ("boundary",)
+    (everywhere,) = replace(shaded, patterns={}).carried_effects
+    assert everywhere == EdgeShadow()
+    for stray in ({"edge_blur": ("boundary",)}, {"lag": ("boundary",)}):
+        with pytest.raises(ParameterError, match="effects of the model among"):
+            replace(shaded, patterns=stray)
+    document = json.loads(shaded.to_json())
+    document["patterns"]["edge_shadow"] = 3
+    with pytest.raises(FileError, match=r"patterns\.edge_shadow is 3"):
+        FittedSensor.from_json(json.dumps(document))
+    document.pop("patterns")  # a file of before
+    assert FittedSensor.from_json(json.dumps(document)).patterns == {}
 
 
 def test_the_file_is_strict_json_with_the_promised_content(sensor: FittedSensor) -> None:

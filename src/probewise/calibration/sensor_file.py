@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -17,7 +18,7 @@ from probewise._display import ShowsItself
 from probewise._version import __version__
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
-from probewise.effects import EFFECTS
+from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.scene import KnownScene, Scene
@@ -31,6 +32,8 @@ FORMAT = "sensor/1"
 MIN_SAMPLES = 500
 # Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
+# Effects that may act on some patterns alone.
+BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ class FittedSensor(ShowsItself):
         Unit, range and step of the readings, and what took them.
     effects
         Names of the effects in the model, in the order of their columns.
+    patterns
+        Names of the patterns that an effect is bound to, by the effect; one that is not here acts on all.
     scan_noise
         Noise of each scan of the recording.
     fingerprint, source
@@ -93,6 +98,7 @@ class FittedSensor(ShowsItself):
     field: SSFField
     instrumentation: Instrumentation
     effects: tuple[str, ...] = ()
+    patterns: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     scan_noise: tuple[ScanNoise, ...] = ()
     fingerprint: str = ""
     source: str = ""
@@ -116,6 +122,9 @@ class FittedSensor(ShowsItself):
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
+        stray = [name for name in self.patterns if name not in self.effects or name not in BOUND_TO_PATTERNS]
+        if stray:
+            raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(BOUND_TO_PATTERNS)}")
         wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
@@ -134,7 +143,11 @@ class FittedSensor(ShowsItself):
     @property
     def carried_effects(self) -> tuple[AnyEffect, ...]:
         """The effects that act on new scans too."""
-        return tuple(EFFECTS[name]() for name in self.effects if name not in BOUND_TO_SCANS)
+        return tuple(
+            BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
+            for name in self.effects
+            if name not in BOUND_TO_SCANS
+        )
 
     @property
     def carried_samples(self) -> FloatArray:
@@ -203,6 +216,7 @@ class FittedSensor(ShowsItself):
             ],
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
+            "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
             "noise": {
                 "model": "independent Gaussian, one sd pooled over scans; one value a sample",
                 "mean": float(self.noise_sd.mean()),
@@ -257,6 +271,7 @@ class FittedSensor(ShowsItself):
                 ),
                 instrumentation=_instrumentation(read),
                 effects=tuple(read.texts("effects")),
+                patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
                 scan_noise=tuple(_record(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")),
                 fingerprint=read.text("recording", "fingerprint"),
                 source=read.text("recording", "source"),

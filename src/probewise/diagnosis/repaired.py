@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -81,6 +81,7 @@ class ModelSamples:
             field=field,
             instrumentation=recording.plan.instrumentation,
             effects=self.effects,
+            patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
             scan_noise=scan_noise,
             fingerprint=fingerprint(recording),
             source=PurePath(recording.source).name,

@@ -45,6 +45,8 @@ _RIVAL_ORDER = 100.0  # nats behind the best: an SSF order so far back is not se
 _WORTH_GROWING = 20.0  # nats behind the best of its size: no combination grows from there
 _WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
 _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
+_SINGLES = 6  # effects that are refitted alone
+_WORTH_REFITTING = 6.0  # nats behind the best so far: screening about a fit that one effect has bent is so far off
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _PAIRED = 12  # effects that pairs are screened of, the best alone
 
@@ -336,9 +338,10 @@ class _Searcher:
             grown = []
             # A user's own effect was named to be tried, however far it leads from where screening is linear.
             own = [names for names in ranked if size == 1 and names[0] not in EFFECTS]
-            for rank, names in enumerate(dict.fromkeys([*ranked[: self.beam], *own])):
+            width, behind = (_SINGLES, _WORTH_REFITTING) if size == 1 else (self.beam, STEERING)
+            for rank, names in enumerate(dict.fromkeys([*ranked[:width], *own])):
                 # A combination that screening puts this far behind cannot come to matter.
-                if odds[names] < best_so_far - STEERING and (size > 1 or rank > 0) and names not in own:
+                if odds[names] < best_so_far - behind and (size > 1 or rank > 0) and names not in own:
                     continue
                 _, parent, added = wishes[names]
                 candidate = self._refit(parent, added)

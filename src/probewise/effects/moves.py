@@ -7,7 +7,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 
-__all__ = ["in_scans", "mountings", "sign_of_move", "turns_back"]
+__all__ = ["in_scans", "mountings", "moves_in_more_than_one_way", "sign_of_move"]
 
 
 def sign_of_move(plan: Plan) -> FloatArray:
@@ -16,9 +16,9 @@ def sign_of_move(plan: Plan) -> FloatArray:
     return np.asarray(np.where(along_x != 0, along_x, along_y))
 
 
-def turns_back(plan: Plan) -> bool:
-    """Tell whether there are moves of both signs."""
-    return bool(np.ptp(sign_of_move(plan)) == 2)
+def moves_in_more_than_one_way(plan: Plan) -> bool:
+    """Tell whether moves differ in their sign: forth and back, or forth and not at all."""
+    return bool(np.ptp(sign_of_move(plan)) > 0)
 
 
 def in_scans(plan: Plan, names: tuple[str, ...]) -> FloatArray:

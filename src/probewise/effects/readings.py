@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moves import sign_of_move, turns_back
+from probewise.effects.moves import moves_in_more_than_one_way, sign_of_move
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -34,8 +34,8 @@ class Hysteresis(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the readings' range as typical, where scans go both ways."""
-        return cls(typical=0.01 * extent.span) if turns_back(extent.plan) else None
+        """Take a hundredth of the readings' range as typical, where moves differ, be it some from none."""
+        return cls(typical=0.01 * extent.span) if moves_in_more_than_one_way(extent.plan) else None
 
     @cached_property
     def prior(self) -> Product:

@@ -99,11 +99,11 @@ class Search:
         return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
 
     def alike(self, names: Names) -> frozenset[Names]:
-        """Give the other combinations that these readings cannot tell from this one, at any SSF order."""
+        """Give the other combinations that these readings cannot tell from this one, at any SSF order; () has none."""
         return frozenset(
             key
             for (n, key), other in self.candidates.items()
-            if key and key != names and (n, names) in self.candidates
+            if names and key and key != names and (n, names) in self.candidates
             if nats_apart(self.candidates[n, names], other) < TOO_ALIKE
         )
 

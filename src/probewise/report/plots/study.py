@@ -85,5 +85,5 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
         ax.set_yticks(y, names)
         tidy(ax, x="readings", y="", title=title)
     axes[0, 0].invert_yaxis()
-    axes[0, 0].legend(frameon=False, fontsize="small")
+    axes[0, 0].legend(frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.04))
     return axes

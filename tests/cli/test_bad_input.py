@@ -2,9 +2,12 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from probewise.cli import VERBS, main
+from probewise.cli._geometry import parse_truth
+from probewise.scene import Field
 
 
 def refused(capsys, out, *arguments):
@@ -132,6 +135,39 @@ def test_a_sensor_model_with_a_field_missing_says_which(sensor_file, recording_f
 def test_an_option_out_of_range_is_refused(option, sensor_file, tmp_path, capsys):
     out = tmp_path / "out"
     refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, *option)
+
+
+@pytest.mark.parametrize(
+    ("truth", "parameter", "value", "allowed"),
+    [
+        ("500,250,0", "radius_mm", "0.0", "20 to 150"),
+        ("500,250,-90", "radius_mm", "-90.0", "20 to 150"),
+        ("500,250,5000", "radius_mm", "5000.0", "20 to 150"),
+        ("500,nan,90", "y_mm", "nan", "0 to 520"),
+        ("inf,250,90", "x_mm", "inf", "0 to 1048"),
+        ("500,250,-inf", "radius_mm", "-inf", "20 to 150"),
+        ("1049,250,90", "x_mm", "1049.0", "0 to 1048"),
+        ("500,-1,90", "y_mm", "-1.0", "0 to 520"),
+        ("rectangle:500,250,100,0,0.3", "height_mm", "0.0", "40 to 300"),
+        ("rectangle:500,250,100,60,2", "angle_rad", "2.0", "0 to 1.5708"),
+        ("ellipse:500,250,90,120,0.3", "semi_minor_mm", "120.0", "20 to 90"),
+        ("ellipse:500,250,inf,inf,0.3", "semi_major_mm", "inf", "20 to 150"),
+    ],
+)
+def test_a_truth_that_cannot_lie_there_is_named_with_its_bounds_and_the_way_out(
+    truth, parameter, value, allowed, sensor_file, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    said = refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, "--truth", truth)
+    assert f"{parameter} of --truth {truth} is {value}; allowed: {allowed}," in said
+    assert "without --truth the seed draws one" in said
+
+
+@pytest.mark.parametrize("truth", ["0,0,20", "1048,520,150", "ellipse:500,250,90,90,0", "hexagon:500,250,30,0"])
+def test_a_truth_on_its_bounds_is_taken(truth):
+    name, theta = parse_truth(truth, ["circle"], Field(), rng=np.random.default_rng(0))
+    assert name == (truth.partition(":")[0] if ":" in truth else "circle")
+    assert theta.tolist() == [float(cell) for cell in truth.rpartition(":")[2].split(",")]
 
 
 @pytest.mark.parametrize("verb", [v.name for v in VERBS])

@@ -1,6 +1,7 @@
 """The posterior that is carried from reading to reading, against integrals over a lattice of all hypotheses."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -91,6 +92,23 @@ def test_one_seed_gives_one_posterior(small):
     one, again = carried(small, n_particles=300), carried(small, n_particles=300)
     np.testing.assert_array_equal(one.theta, again.theta)
     assert one.log_z == again.log_z
+
+
+def test_a_reading_that_keeps_the_samples_has_each_predict_once(small):
+    problem, asked = problem_of(small, 1), []
+
+    class Counted:
+        names = problem.model.names
+
+        def predict(self, theta, plan):
+            asked.append(len(theta))
+            return problem.model.predict(theta, plan)
+
+    start = prior_particles(problem.prior, 300, rng=rng())
+    kept = update(start, replace(problem, model=Counted()), rng=rng(), fall_back=never, blocks=whole)
+    np.testing.assert_array_equal(kept.theta, start.theta)
+    assert asked == [300]
+    assert kept.n_calls == 300
 
 
 def test_a_reading_that_surprises_is_taken_in_from_scratch(small):

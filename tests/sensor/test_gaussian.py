@@ -181,6 +181,15 @@ def test_a_rectangle_of_round_footprint_is_a_product(place):
     assert see(box, x, y, cov) == pytest.approx(wanted, abs=1e-12)
 
 
+@pytest.mark.parametrize("sds", [7.99, 8.0, 8.01, 9.0, 15.0])
+@pytest.mark.parametrize("beside", [-1.3, -1e-9, 0.4])
+def test_a_corner_that_comes_into_reach_makes_no_step(sds, beside):
+    """A product of cumulatives, the near corner at these sds along an edge, the far ones out of reach."""
+    box = PolygonRegion.simple(np.array([[[0.0, 0.0], [90.0, 0.0], [90.0, 60.0], [0.0, 60.0]]]))
+    wanted = (ndtr(30 - sds) - ndtr(-sds)) * ndtr(beside / 2)
+    assert see(box, 3 * sds, beside, np.diag([9.0, 4.0])) == pytest.approx(wanted, abs=2e-15)
+
+
 def test_a_polygon_of_many_sides_is_a_disc():
     """Two routes: Owen's function on 720 edges of equal area, quadrature on the circle."""
     n = 720

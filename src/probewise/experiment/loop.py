@@ -35,7 +35,7 @@ from probewise.nested.result import NestedResult
 from probewise.nested.sampler import run as run_nested
 from probewise.nested.stop import RemainingEvidence
 
-__all__ = ["begin", "explore", "run", "step"]
+__all__ = ["begin", "explore", "from_scratch", "run", "step"]
 
 DLOGZ = 0.5  # the last live points are posterior samples too: letting them die one by one would only refine log Z
 
@@ -116,7 +116,7 @@ def step(
             state.posterior,
             problem,
             rng=rng,
-            fall_back=lambda: _from_scratch(problem, experiment, rng),
+            fall_back=lambda: from_scratch(problem, experiment, rng),
             blocks=experiment.blocks,
         )
     mean, sd, shapes = moments(experiment, posterior)
@@ -147,7 +147,7 @@ def step(
     return State(readings, posterior, pose, tuple(planned)), info
 
 
-def _from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.Generator) -> NestedResult:
+def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.Generator) -> NestedResult:
     """Infer from all readings at once by nested sampling: where the samples so far cannot be carried on."""
     return run_nested(
         problem,

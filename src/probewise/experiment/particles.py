@@ -85,11 +85,12 @@ def update(
     """
     n = len(previous.theta)
     bridge = _Bridge(problem)
-    if bridge.missed(previous.theta) > SURPRISED:
+    predicted = problem.model.predict(previous.theta, problem.recording.plan)
+    if bridge.missed(predicted) > SURPRISED:
         return _from_scratch(fall_back(), n, bridge, n, blocks, rng)
-    now = bridge.cloud(previous.theta)
+    now = _Cloud(previous.theta, problem.prior.log_prob(previous.theta), *bridge.weigh(predicted))
     log_weight, base = previous.log_weight, previous.log_likelihood
-    log_z, variance, n_calls, share = previous.log_z, previous.log_z_error**2, 2 * n, 0.0
+    log_z, variance, n_calls, share = previous.log_z, previous.log_z_error**2, n, 0.0
     while True:
         all_at_once = _n_eff(_reweighed(log_weight, now.after, base))
         if all_at_once == 0.0:
@@ -156,16 +157,27 @@ class _Bridge:
 
     problem: SensorProblem
 
-    def missed(self, theta: FloatArray) -> float:
-        """How much less likely the last reading is by the best of the samples than by one that predicts it, nats."""
+    def missed(self, predicted: FloatArray) -> float:
+        """How much less likely the last reading is by the best prediction than by one that expects it, nats."""
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
         reading = recording.readings[-1:]
-        best = self.problem.likelihood.log_prob(
-            reading, self.problem.model.predict(theta, recording.plan)[:, -1:]
-        ).max()
+        best = self.problem.likelihood.log_prob(reading, predicted[:, -1:]).max()
         return float(self.problem.likelihood.log_prob(reading, reading[None])[0] - best)
+
+    def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log likelihood without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
+        usable = self.problem.recording.usable
+        earlier = usable.copy()
+        earlier[-1] = False
+        return self._score(predicted, earlier), self._score(predicted, usable)
+
+    def _score(self, predicted: FloatArray, rows: BoolArray) -> FloatArray:
+        """Log likelihood of these readings alone; of none it is zero."""
+        if not rows.any():
+            return np.zeros(len(predicted))
+        return self.problem.likelihood.log_prob(self.problem.recording.readings[rows], predicted[:, rows])
 
     def cloud(self, theta: FloatArray) -> _Cloud:
         """Evaluate samples; the model is not asked where the prior has none."""
@@ -174,17 +186,8 @@ class _Bridge:
         before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
         possible = np.isfinite(log_prior)
         if possible.any():
-            recording = problem.recording
-            predicted = problem.model.predict(theta[possible], recording.plan)
-            usable = recording.usable
-            earlier = usable.copy()
-            earlier[-1] = False
-            if earlier.any():
-                before[possible] = problem.likelihood.log_prob(recording.readings[earlier], predicted[:, earlier])
-            if usable.any():
-                after[possible] = problem.likelihood.log_prob(recording.readings[usable], predicted[:, usable])
-            else:
-                after[possible] = 0.0
+            predicted = problem.model.predict(theta[possible], problem.recording.plan)
+            before[possible], after[possible] = self.weigh(predicted)
         return _Cloud(theta, log_prior, before, after)
 
 

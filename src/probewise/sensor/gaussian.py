@@ -279,33 +279,38 @@ def _(region: PolygonRegion, spot: Spot, n_nodes: int) -> FloatArray:
         return x / sd_x, (y - slope * x) / sd_free
 
     mean_p, mean_q = whitened(spot.x_mm + spot.dx_mm, spot.y_mm + spot.dy_mm)
-    shape = np.broadcast_shapes(mean_p.shape, mean_q.shape, (region.n_regions, 1))
-    n_edges = region.edges_mm.shape[1]
-    height = np.empty((n_edges, *shape))
-    start, end = np.empty_like(height), np.empty_like(height)
-    for k in range(n_edges):
+    turning = np.zeros(np.broadcast_shapes(mean_p.shape, mean_q.shape, (region.n_regions, 1)))
+    for k in range(region.edges_mm.shape[1]):
         p1, q1 = whitened(region.edges_mm[:, k, 0, :1], region.edges_mm[:, k, 0, 1:])
         p2, q2 = whitened(region.edges_mm[:, k, 1, :1], region.edges_mm[:, k, 1, 1:])
         length = np.hypot(p2 - p1, q2 - q1)
         safe = np.where(length > 0, length, 1.0)
         ep, eq = (p2 - p1) / safe, (q2 - q1) / safe
-        np.subtract(p1 * eq - q1 * ep, mean_p * eq - mean_q * ep, out=height[k])
-        np.subtract(p1 * ep + q1 * eq, mean_p * ep + mean_q * eq, out=start[k])
-        np.add(start[k], length, out=end[k])
-    turning = np.zeros(shape)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for k in range(n_edges):
-            angle = np.arctan(end[k] / height[k]) - np.arctan(start[k] / height[k])
-            turning += np.where(height[k] == 0, 0.0, angle)
-    share = turning / (2 * np.pi)
-    near = (np.abs(height) < _REACH) & (start < _REACH) & (end > -_REACH) & (height != 0)
-    for k in range(n_edges):
-        rows = near[k]
-        if rows.any():
-            h, a, b = height[k][rows], start[k][rows], end[k][rows]
-            with np.errstate(over="ignore"):
-                share[rows] -= owens_t(h, b / h) - owens_t(h, a / h)
-    return _between(region.outside, region.inside, np.clip(share, 0.0, 1.0))
+        height = p1 * eq - q1 * ep - (mean_p * eq - mean_q * ep)
+        start = p1 * ep + q1 * eq - (mean_p * ep + mean_q * eq)
+        end = start + length
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            angle = np.arctan(end / height) - np.arctan(start / height)
+        angle[height == 0] = 0.0
+        near = (np.abs(height) < _REACH) & (start < _REACH) & (end > -_REACH) & (height != 0)
+        angle[near] -= 2 * np.pi * _mass_beyond(height[near], start[near], end[near])
+        turning += angle
+    return _between(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
+
+
+def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Mass of the unit Gaussian behind edges, (n_edges,), within the angle each spans: Owen's T from `start` to `end`.
+
+    An end out of reach is as good as infinitely far, where T is half the mass beyond the edge's line.
+    """
+    half = 0.5 * ndtr(-np.abs(height))
+    with np.errstate(over="ignore"):
+        slopes = [along / height for along in (start, end)]
+    to_start, to_end = (np.copysign(half, slope) for slope in slopes)
+    for beyond, along, slope in zip((to_start, to_end), (start, end), slopes, strict=True):
+        seen = np.abs(along) < _REACH
+        beyond[seen] = owens_t(height[seen], slope[seen])
+    return np.asarray(to_end - to_start)
 
 
 @cache

@@ -33,7 +33,7 @@ MIN_SAMPLES = 500
 # Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
 # Effects that may act on some patterns alone.
-BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
+_BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ class FittedSensor(ShowsItself):
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
-        stray = [name for name in self.patterns if name not in self.effects or name not in BOUND_TO_PATTERNS]
+        stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
-            raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(BOUND_TO_PATTERNS)}")
+            raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
         wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
@@ -144,7 +144,7 @@ class FittedSensor(ShowsItself):
     def carried_effects(self) -> tuple[AnyEffect, ...]:
         """The effects that act on new scans too."""
         return tuple(
-            BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
+            _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
             for name in self.effects
             if name not in BOUND_TO_SCANS
         )

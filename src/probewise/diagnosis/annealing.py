@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["anneal"]
 
@@ -59,7 +60,7 @@ def anneal(
     while beta < 1.0:
         gain = heights[1] - heights[0]
         after = _next_beta(gain, beta)
-        kept = _systematic((after - beta) * gain, rng)
+        kept = resampled(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
         for _ in range(_MOVES if beta < 1.0 else _LAST_MOVES):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
@@ -73,25 +74,14 @@ def anneal(
 
 def _next_beta(gain: FloatArray, beta: float) -> float:
     """Find the largest beta, by halving, at which enough samples still count."""
-
-    def effective(to: float) -> float:
-        weight = np.exp((to - beta) * (gain - gain.max()))
-        return float(weight.sum() ** 2 / np.sum(weight**2)) / len(gain)
-
-    if effective(1.0) >= _EFFECTIVE:
+    enough = _EFFECTIVE * len(gain)
+    if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
     low, high = beta, 1.0
     for _ in range(30):
         middle = (low + high) / 2
-        low, high = (middle, high) if effective(middle) >= _EFFECTIVE else (low, middle)
+        low, high = (middle, high) if n_effective((middle - beta) * gain) >= enough else (low, middle)
     return min(max(low, beta + _LEAST_STEP), 1.0)
-
-
-def _systematic(log_weight: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Resample at even distances, (n,) row numbers."""
-    weight = np.exp(log_weight - log_weight.max())
-    n = len(weight)
-    return np.searchsorted(np.cumsum(weight / weight.sum()), (np.arange(n) + rng.random()) / n).clip(max=n - 1)
 
 
 def _moved(

@@ -26,7 +26,7 @@ from probewise.diagnosis.search import search
 from probewise.diagnosis.stating import effects_found, noise_found
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.verdict import Diagnosis, EffectFound, Hypothesis, credible_set, decide
-from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary
+from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary, outside
 from probewise.diagnosis.weighing import Weighing, with_agreement
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
@@ -251,7 +251,7 @@ class _Diagnoser:
     def _foreseen(self) -> Names:
         """Name the leading refitted combination with something outside the vocabulary, if it leads what is unknown."""
         by_mean = self.search.by_mean
-        own = {names: p for names, p in by_mean.items() if UNNAMED.keys() & set(names)}
+        own = {names: p for names, p in by_mean.items() if outside(names)}
         refitted = {names for _, names in self.search.candidates}
         leader = max(own, key=lambda names: own[names], default=())
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
@@ -261,7 +261,7 @@ class _Diagnoser:
         by_mean = self.search.by_mean
         shares = {family: by_mean.get(("unknown",), 0.0) * p for family, p in self.search.unknown_shares.items()}
         for names, p in by_mean.items():
-            for name in UNNAMED.keys() & set(names):
+            for name in outside(names):
                 shares[name] = shares.get(name, 0.0) + p
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}
@@ -367,8 +367,8 @@ def _hypotheses(
     """Join mean and noise into combinations; unknown is one hypothesis under any noise."""
     joined: dict[tuple[str, ...], float] = {}
     for (mean, noise), p in probabilities.items():
-        outside = mean == ("unknown",) or bool(UNNAMED.keys() & set(mean))
-        key = ("unknown",) if outside else tuple(sorted((*mean, *in_vocabulary(noise))))
+        unknown = mean == ("unknown",) or outside(mean)
+        key = ("unknown",) if unknown else tuple(sorted((*mean, *in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])

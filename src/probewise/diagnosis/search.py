@@ -30,7 +30,7 @@ from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
 from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
-from probewise.diagnosis.weighed import STEERING, TOO_ALIKE, Candidate, Search, nats_apart, weighed
+from probewise.diagnosis.weighed import STEERING, TOO_ALIKE, Candidate, Search, nats_apart, outside, weighed
 from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -48,6 +48,7 @@ _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed besid
 _SINGLES = 6  # effects that are refitted alone
 _WORTH_REFITTING = 6.0  # nats behind the best so far: screening about a fit that one effect has bent is so far off
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
+_LEAST_ELSEWHERE = 1e-4  # probability of such a combination
 _PAIRED = 12  # effects that pairs are screened of, the best alone
 
 
@@ -79,7 +80,7 @@ def search(
     max_order
         Largest SSF order tried without a sensor; one more where the largest wins.
     beam, depth
-        How many combinations of each size are refitted, and the largest size.
+        How many combinations of each size above one are refitted, and the largest size.
     """
     return _Searcher(
         recording, effects, sensor, sd_floor, prior or PriorOdds.over(effects), max_order, beam, depth
@@ -460,7 +461,10 @@ class _Searcher:
             source = max(
                 (c for (_, key), c in self.candidates.items() if key == names), key=lambda c: c.log_z, default=None
             )
-            if source is None or sum(p for (mean, _), p in first.probabilities.items() if mean == names) < 1e-4:
+            if (
+                source is None
+                or sum(p for (mean, _), p in first.probabilities.items() if mean == names) < _LEAST_ELSEWHERE
+            ):
                 continue
             for n, sensor in self.sensors.items():
                 if (n, names) in self.candidates or n > source.n_gaussians + 1:
@@ -484,10 +488,10 @@ class _Searcher:
         """Leave out what is outside the vocabulary where the readings cannot tell it from what is inside."""
         by_name = sorted(self.candidates.values(), key=lambda c: c.log_z)
         leading = {c.names: c for c in by_name if c.names}
-        named = [c for names, c in leading.items() if not UNNAMED.keys() & set(names)]
+        named = [c for names, c in leading.items() if not outside(names)]
         for names, candidate in leading.items():
             rivals = (c for c in named if len(c.names) <= len(names))
-            if UNNAMED.keys() & set(names) and any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
+            if outside(names) and any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
                 self.spoken_for.add(names)
         self.candidates = {key: c for key, c in self.candidates.items() if key[1] not in self.spoken_for}
 

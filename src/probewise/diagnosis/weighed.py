@@ -20,11 +20,11 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.templates import TemplateMemory
-from probewise.effects import NUISANCES, NamedEffect
+from probewise.effects import NUISANCES, UNNAMED, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["STEERING", "TOO_ALIKE", "Candidate", "Search", "in_vocabulary", "nats_apart", "weighed"]
+__all__ = ["STEERING", "TOO_ALIKE", "Candidate", "Search", "in_vocabulary", "nats_apart", "outside", "weighed"]
 
 Names = tuple[str, ...]
 
@@ -154,6 +154,11 @@ def nats_apart(first: Candidate, second: Candidate) -> float:
 def in_vocabulary(noise: Names) -> Names:
     """Leave out of a noise model what is no name of the vocabulary's."""
     return tuple(name for name in noise if name not in NUISANCES)
+
+
+def outside(mean: Names) -> Names:
+    """Keep those of a combination on the mean that have a formula and no name in the vocabulary."""
+    return tuple(name for name in mean if name in UNNAMED)
 
 
 def weighed(search: Search) -> Search:

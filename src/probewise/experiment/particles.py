@@ -22,6 +22,7 @@ from probewise.experiment.kernels import LocalKernels
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
+from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Prior
 
 __all__ = ["Block", "prior_particles", "update"]
@@ -92,18 +93,18 @@ def update(
     log_weight, base = previous.log_weight, previous.log_likelihood
     log_z, variance, n_calls, share = previous.log_z, previous.log_z_error**2, n, 0.0
     while True:
-        all_at_once = _n_eff(_reweighed(log_weight, now.after, base))
+        all_at_once = n_effective(_reweighed(log_weight, now.after, base))
         if all_at_once == 0.0:
             return _from_scratch(fall_back(), n, bridge, n_calls, blocks, rng)
         share = 1.0 if all_at_once >= KEEP * n else _next_share(log_weight, base, now, share)
         weighed = _reweighed(log_weight, now.at(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
-        n_eff = _n_eff(log_weight)
+        n_eff = n_effective(log_weight)
         variance += max(1.0 / n_eff - 1.0 / n, 0.0)
         if share == 1.0 and n_eff >= KEEP * n:
             break
-        rows = _resampled(log_weight, n, rng)
+        rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
         now, moves = _move(now.take(rows), share, bridge, blocks, rng)
         n_calls += moves.n_calls
         if moves.accepted < STIFF:
@@ -119,7 +120,7 @@ def update(
         log_weight,
         log_z,
         math.sqrt(variance),
-        _n_eff(log_weight),
+        n_effective(log_weight),
         previous.n_calls + n_calls,
         tail,
     )
@@ -254,7 +255,9 @@ def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: fl
     low, high, enough = share, 1.0, KEEP * len(base)
     for _ in range(30):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _n_eff(_reweighed(log_weight, now.at(middle), base)) >= enough else (low, middle)
+        low, high = (
+            (middle, high) if n_effective(_reweighed(log_weight, now.at(middle), base)) >= enough else (low, middle)
+        )
     return max(low, share + 1e-6)
 
 
@@ -262,22 +265,6 @@ def _reweighed(log_weight: FloatArray, after: FloatArray, before: FloatArray) ->
     """Weigh by what likelihoods have become; a sample that has been ruled out stays so."""
     alive = np.isfinite(log_weight)
     return np.asarray(np.where(alive, log_weight + after - np.where(alive, before, 0.0), -np.inf))
-
-
-def _n_eff(log_weight: FloatArray) -> float:
-    """Kish's number of effective samples, of weights that need not be normalised."""
-    most = float(np.max(log_weight))
-    if not math.isfinite(most):
-        return 0.0
-    weight = np.exp(log_weight - most)
-    return float(weight.sum() ** 2 / (weight @ weight))
-
-
-def _resampled(log_weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
-    """Rows of equally weighted samples, by systematic resampling."""
-    ladder = np.cumsum(np.exp(log_weight - log_weight.max()))
-    rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-    return np.minimum(rows, len(log_weight) - 1)
 
 
 def _from_scratch(

@@ -23,6 +23,7 @@ from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.proposal import Proposal, find_parts, fit_proposals, joined
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
+from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["Weighted", "pareto_k", "refine", "update"]
 
@@ -114,7 +115,7 @@ class Weighted:
         """Rows of `n` equally weighted samples by systematic resampling, (n,), in random order."""
         if n < 1:
             raise ParameterError("n", n, "1 or more")
-        return np.asarray(rng.permutation(_resampled(self.weight, n, rng)))
+        return np.asarray(rng.permutation(resampled(self.weight, n, rng)))
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
@@ -261,7 +262,7 @@ def update(
     log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
     # Rows of weight above 1 / 1000 were kept once: their weight stands for them.
     log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
-    n_eff, k = _effective(log_weight), math.inf
+    n_eff, k = n_effective(log_weight), math.inf
     if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
         proposal = fit_proposals(_to_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng)[-1]
         found = _weigh(proposal, prior_share, _Held.nothing(), space, evaluate, n_draws, rng)
@@ -318,7 +319,7 @@ def _parted(found: Posterior, lines: float, space: Space, rng: np.random.Generat
     lot = rng.random(len(found.theta)) < _HELD_BACK
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
-    rows = chosen[_resampled(weight, min(_MOST_HELD, chosen.size), rng)]
+    rows = chosen[resampled(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
     held = _Held(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_BACK * lines)
     return _to_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
@@ -331,16 +332,9 @@ def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.ran
     to be weighed by must reach further than the posterior does.
     """
     weight = np.exp(log_weight - log_weight.max())
-    n = int(min(max(_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
-    rows = [_resampled(weight, n, rng), _resampled(np.sqrt(weight), n // 3, rng)]
+    n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
+    rows = [resampled(weight, n, rng), resampled(np.sqrt(weight), n // 3, rng)]
     return space.enter(theta[np.unique(np.concatenate(rows))])
-
-
-def _resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
-    """Draw rows by weight, (n_weights,) -> (n,), systematically: each as often as its share of n, up or down."""
-    ladder = np.cumsum(weight)
-    rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-    return np.asarray(np.minimum(rows, len(ladder) - 1))
 
 
 def _with_lost(found: Weighted, lines: float, space: Space, rng: np.random.Generator) -> Weighted:
@@ -394,7 +388,7 @@ def _weigh(
     log_z, error, missed, log_weight = _bridged(log_ratio, n_draws, held_ratio, held.n_independent)
     # Weights without a variance average out as n^(k - 1), no longer as n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
-    n_eff = _effective(log_weight)
+    n_eff = n_effective(log_weight)
     return Weighted(
         evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, evaluate.n_calls, k, missed=missed
     )
@@ -433,13 +427,8 @@ def _bridged(
         missed = float((held_ratio > limit).mean())
         kept_error = float(share.std()) / math.sqrt(n_held) / kept
     # Draws that led nowhere count as weights of zero.
-    spread = max(1.0 / _effective(cut) - 1.0 / n_draws, 0.0)
+    spread = max(1.0 / n_effective(cut) - 1.0 / n_draws, 0.0)
     return log_z, math.sqrt(spread + kept_error**2), missed, cut - float(logsumexp(cut))
-
-
-def _effective(log_weight: FloatArray) -> float:
-    """Kish's effective number of samples."""
-    return math.exp(2.0 * float(logsumexp(log_weight)) - float(logsumexp(2.0 * log_weight)))
 
 
 def pareto_k(log_weight: FloatArray) -> float:

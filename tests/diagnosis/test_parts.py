@@ -15,12 +15,13 @@ from probewise.diagnosis.coordinates import (
     default_sensor,
     effect_scores,
     effect_values,
-    sensor_from_posterior,
     theta_to_natural,
 )
 from probewise.diagnosis.covariates import Covariate
-from probewise.diagnosis.evidence import SCALES, Blocks, Linearised, block_log_bayes_factors
+from probewise.diagnosis.earlier import sensor_from_posterior
+from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Blocks, Linearised, block_log_bayes_factors, mix_scales
 from probewise.diagnosis.fit import Fit, Model
+from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import places, places_of_effect, windows
 from probewise.diagnosis.noise import NoiseLaw, noise_statistics, steps_within_scans, white
@@ -31,7 +32,7 @@ from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, two_way_plan
 from probewise.recordings.plans import jittered
-from probewise.sensor import footprint_of
+from probewise.sensor import footprint_of, mixture_names
 
 EXTENT = Extent(10.0, 60.0, jittered(two_way_plan(), rng=np.random.default_rng(0)))
 
@@ -91,14 +92,24 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
         sensor_from_posterior(("x",), np.zeros(1), np.eye(1))
 
 
-def test_the_evidence_of_one_variant_becomes_that_of_the_choice():
-    """Route two: the mean of all variants' Bayes factors, by hand."""
+def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
+    free = FreeForm.about(default_sensor(EXTENT, 1))
+    rng = np.random.default_rng(0)
+    z = 0.02 * rng.normal(size=(4000, free.n_params))
+    theta = free.theta(z)
+    np.testing.assert_allclose(free.z(theta), z, atol=1e-8)
+    names = (*mixture_names(free.n_gaussians), "I_min", "I_max")
+    prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
+    assert isinstance(prior, FreeForm)
+    drawn = prior.theta(rng.normal(size=(4000, free.n_params)))
+    spread = theta.std(axis=0)
+    np.testing.assert_allclose(drawn.std(axis=0)[spread > 1e-9], spread[spread > 1e-9], rtol=0.08)
+
+
+def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
     one = (np.zeros((5, 1)),) * 5
     templates = EffectTemplates(one, one, (Backlash(),) * 3, np.array([0, 0, 1, 2, 2]))
-    scores = np.log([1.0, 3.0, 10.0, 5.0, 1.0])
-    np.testing.assert_allclose(templates.weights(scores), [0.2, 0.5, 0.3])
-    alone = math.log(10.0)
-    assert alone + templates.log_share(2, scores) == pytest.approx(math.log((4.0 + 10.0 + 6.0) / 3))
+    np.testing.assert_allclose(templates.weights(np.log([1.0, 3.0, 10.0, 5.0, 1.0])), [0.2, 0.5, 0.3])
 
 
 def test_templates_of_a_variant_are_what_its_scans_change():
@@ -164,10 +175,11 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
 
     unit = problem.project(template / np.sqrt(np.mean(template**2)))[:, 0]
     rss = float(residual @ residual)
-    total = 0.0
-    for scale in SCALES:
+    total, gain = 0.0, float(unit @ unit)
+    visible = SCALES[SCALES * math.sqrt(gain) >= LEAST_VISIBLE]
+    assert 0 < len(visible) < len(SCALES)
+    for scale in visible:
         # Amplitude in units of the noise sd, whose marginal makes the likelihood (1 + ...)^(-n/2) at fixed ratio.
-        gain = float(unit @ unit)
         t = float(unit @ residual) / math.sqrt(gain)
 
         def density(log_s, t=t, gain=gain, scale=scale):
@@ -181,7 +193,13 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
 
         center = 0.5 * math.log(rss / n)
         total += quad(density, center - 3, center + 3)[0] / quad(null, center - 3, center + 3)[0]
-    assert found == pytest.approx(math.log(total / len(SCALES)), abs=1e-6)
+    assert found == pytest.approx(math.log(total / len(visible)), abs=1e-6)
+
+
+def test_a_template_of_which_nothing_survives_is_out_of_the_question():
+    explained, gain = np.full((2, 1, 1), 0.01), np.array([[300.0], [1e-4]])
+    assert mix_scales(explained, gain, 400)[0, 0] > -5
+    assert mix_scales(explained, gain, 400)[1, 0] < -40
 
 
 def test_a_bank_weighs_as_blocks_do():

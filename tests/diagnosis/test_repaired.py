@@ -7,10 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from probewise.calibration import FittedSensor
 from probewise.diagnosis.coordinates import default_sensor
+from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.repaired import ModelSamples, doubted, over_orders
 from probewise.effects import ArmKnock, Extent
-from probewise.recordings import two_way_plan
+from probewise.recordings import Recording, two_way_plan
+from probewise.sensor import total_variation
 
 PLAN = two_way_plan()
 
@@ -37,6 +40,25 @@ def test_orders_are_mixed_by_their_probability():
     # Four sd of a binomial of 500: fails by chance once in 16,000 seeds.
     assert of_one == pytest.approx(150, abs=4 * np.sqrt(500 * 0.3 * 0.7))
     assert dataclasses.replace(mixed).theta.shape == (500, 14)
+
+
+def test_a_sensor_of_free_form_is_written_read_and_driven_by():
+    free = FreeForm.about(default_sensor(Extent(10.0, 60.0, PLAN), 1))
+    rng = np.random.default_rng(5)
+    z = 0.3 * rng.standard_normal(free.n_params) + 0.02 * rng.standard_normal((500, free.n_params))
+    chain = free.chain(PLAN, (), n_nodes=16)
+    samples = ModelSamples(chain, free.theta(z), np.full(500, 0.5), (), free.n_gaussians, exchangeable=False)
+    readings = chain.predict(samples.theta[:1], PLAN)[0]
+    sensor = samples.fitted_sensor(Recording(PLAN, readings + 0.5 * rng.standard_normal(len(PLAN))), rng=rng)
+    assert sensor.free_form
+    assert "an SSF of free form" in sensor.summary()
+    assert "a_2" not in sensor.summary()
+    again = FittedSensor.from_json(sensor.to_json())
+    np.testing.assert_allclose(again.samples, samples.theta, rtol=1e-12)
+    # Four Gaussians of positive mass stand for it: mean and covariance to a pixel, no response off by a tenth.
+    mixture = sensor.mixture()
+    np.testing.assert_allclose(mixture.mean_mm, sensor.field.mean_mm, atol=sensor.field.pixel_mm)
+    assert total_variation(mixture, sensor.field) < 0.1
 
 
 def test_one_order_alone_stays_as_it_is():

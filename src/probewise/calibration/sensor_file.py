@@ -22,7 +22,19 @@ from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.scene import KnownScene, Scene
-from probewise.sensor import AnyEffect, Chain, FreeLevels, FreeMixture, SSFField, mixture_names
+from probewise.sensor import (
+    AnyEffect,
+    Chain,
+    FixedMixture,
+    FreeLevels,
+    FreeMixture,
+    SSFField,
+    footprint_of,
+    is_free_form,
+    mean_mixture,
+    mixture_names,
+    mixture_of_field,
+)
 
 __all__ = ["BOUND_TO_SCANS", "FORMAT", "MIN_SAMPLES", "FittedSensor", "OrderEvidence", "read_sensor", "write_sensor"]
 
@@ -32,6 +44,7 @@ FORMAT = "sensor/1"
 MIN_SAMPLES = 500
 # Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
+_FOR_A_FREE_FORM = 4  # Gaussians that stand for it where only a mixture will do
 # Effects that may act on some patterns alone.
 _BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
 
@@ -161,6 +174,18 @@ class FittedSensor(ShowsItself):
         """
         return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.carried_effects)
 
+    @property
+    def free_form(self) -> bool:
+        """Whether its SSF is one Gaussian bent to any form, and no mixture of a few."""
+        return is_free_form(self.samples[:, : 6 * self.n_gaussians])
+
+    def mixture(self) -> FixedMixture:
+        """Give the mean SSF as a mixture of Gaussians of positive mass: as many as it has, a few for a free form."""
+        if self.free_form:
+            return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
+        n = self.n_gaussians
+        return mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
+
     def mean(self) -> dict[str, float]:
         """Posterior mean by parameter."""
         return dict(zip(self.names, self.samples.mean(axis=0).tolist(), strict=True))
@@ -178,9 +203,10 @@ class FittedSensor(ShowsItself):
 
     def summary(self) -> str:
         """Describe the sensor in plain text."""
-        unit = self.instrumentation.unit
+        unit, n = self.instrumentation.unit, self.n_gaussians
+        form = "an SSF of free form" if self.free_form else f"{n} Gaussian{'s' if n > 1 else ''}"
         lines = [
-            f"{self.n_gaussians} Gaussian{'s' if self.n_gaussians > 1 else ''}, {len(self.samples)} posterior samples"
+            f"{form}, {len(self.samples)} posterior samples"
             + (f", with {', '.join(self.effects)}" if self.effects else ""),
             f"noise of a new reading  {self.noise_sd.mean():.4g} ± {self.noise_sd.std():.2g} {unit}",
         ]
@@ -192,12 +218,14 @@ class FittedSensor(ShowsItself):
                 f"{o.log_z:>10.2f} ± {o.log_z_error:.2f}{'  most probable' if o is best else ''}"
                 for o in self.orders
             ]
-        width = max(9, *(len(name) for name in self.names))
+        told = [name for name in self.names if not (self.free_form and name in mixture_names(n)[6:])]
+        width = max(9, *(len(name) for name in told))
         lines.append(f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval")
         mean, sd, interval = self.mean(), self.sd(), self.interval()
         lines += [
             f"{name:<{width}}  {mean[name]:>11.5g}  {sd[name]:>11.3g}  {low:.5g} to {high:.5g}"
             for name, (low, high) in interval.items()
+            if name in told
         ]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 

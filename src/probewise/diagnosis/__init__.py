@@ -8,8 +8,8 @@ the gain is shown on readings kept back.
 from probewise.diagnosis.audit import Alias, NextMeasurement
 from probewise.diagnosis.audit_document import CURE_PLAN, audit_json
 from probewise.diagnosis.chosen import model_with
-from probewise.diagnosis.coordinates import SensorPrior
 from probewise.diagnosis.document import diagnosis_json, diagnosis_schema
+from probewise.diagnosis.earlier import SensorPrior
 from probewise.diagnosis.engine import Thorough, diagnose
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place

@@ -16,6 +16,7 @@ from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["anneal"]
 
+_NEAR = 0.7  # share of the first samples that count, from which weights do and no move is needed
 _EFFECTIVE = 0.5  # share of the samples that still count after a step of beta
 _MOVES = 6  # of each sample after a step
 _LAST_MOVES = 12
@@ -56,6 +57,12 @@ def anneal(
 
     z = center + rng.standard_normal((n_walkers, len(center))) @ factor
     heights = log_q(z), log_p(z)
+    wanted = n_walkers * n_harvests
+    if n_effective(heights[1] - heights[0]) >= _NEAR * n_walkers:
+        # The approximation is the posterior but for weights.
+        more = center + rng.standard_normal((2 * wanted - n_walkers, len(center))) @ factor
+        gain = np.concatenate([heights[1] - heights[0], log_p(more) - log_q(more)])
+        return np.asarray(np.concatenate([z, more])[resampled(np.exp(gain - gain.max()), wanted, rng)])
     beta, scale = 0.0, 1.0
     while beta < 1.0:
         gain = heights[1] - heights[0]

@@ -11,14 +11,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, frozen
 from probewise.effects import Extent, NamedEffect
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ShapeError
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
@@ -31,8 +31,9 @@ __all__ = [
     "effect_scores",
     "effect_values",
     "known_scene",
+    "natural_to_theta",
+    "theta_to_natural",
 ]
-__all__ += ["SensorPrior", "sensor_from_posterior", "sensor_of"]
 
 FARTHEST = 6.0
 """Bound of every coordinate: six standard deviations of its prior."""
@@ -64,6 +65,16 @@ class SensorCoordinates:
                 f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n_params},) and "
                 f"({n_params}, {n_params}) for {self.n_gaussians} Gaussians"
             )
+
+    @property
+    def worth(self) -> int:
+        """As many Gaussians as it has."""
+        return self.n_gaussians
+
+    @property
+    def form(self) -> str:
+        """So many Gaussians."""
+        return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 
     @property
     def n_params(self) -> int:
@@ -152,55 +163,6 @@ def default_sensor(extent: Extent, n_gaussians: int) -> SensorCoordinates:
     center = np.array([0.0] * (n_gaussians - 1) + one_center * n_gaussians + [extent.low, extent.high])
     sd = np.array([1.5] * (n_gaussians - 1) + one_sd * n_gaussians + [extent.span / 2] * 2)
     return SensorCoordinates(n_gaussians, center, np.diag(sd))
-
-
-def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> SensorCoordinates:
-    """Take an earlier sensor's posterior, by its mean and covariance, as the prior.
-
-    Only the SSF's and the levels' columns are used; effects of the earlier model are not carried over.
-
-    Raises
-    ------
-    ParameterError
-        If the names are not those of a mixture of Gaussians with two free levels.
-    """
-    names = list(names)
-    n_gaussians = sum(name.startswith("a_") for name in names)
-    wanted = [f"{p}_{n}" for n in range(1, n_gaussians + 1) for p in ("a", "u", "v", "A", "B", "C")]
-    wanted += ["I_min", "I_max"]
-    if n_gaussians == 0 or any(name not in names for name in wanted):
-        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
-    at = [names.index(name) for name in wanted]
-    mean = np.asarray(mean, dtype=np.float64)[at]
-    cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
-    center = theta_to_natural(mean[None, :], n_gaussians)[0]
-    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
-    up = theta_to_natural(mean + np.diag(steps), n_gaussians)
-    down = theta_to_natural(mean - np.diag(steps), n_gaussians)
-    slope = ((up - down) / (2 * steps[:, None])).T
-    natural_cov = slope @ cov @ slope.T
-    floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
-    return SensorCoordinates(n_gaussians, center, np.linalg.cholesky(natural_cov + np.diag(floor)), exchangeable=False)
-
-
-class SensorPrior(Protocol):
-    """An earlier posterior of the sensor: a FittedSensor, or anything with its names and samples."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names, one a column."""
-        ...
-
-    @property
-    def samples(self) -> FloatArray:
-        """Posterior samples, (n_samples, n_params)."""
-        ...
-
-
-def sensor_of(sensor: SensorPrior) -> SensorCoordinates:
-    """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`."""
-    samples = np.asarray(sensor.samples, dtype=np.float64)
-    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
 
 
 def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:

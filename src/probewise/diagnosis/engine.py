@@ -12,9 +12,10 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.audit import Alias, aliases, settle
 from probewise.diagnosis.convergence import require_converged
-from probewise.diagnosis.coordinates import LEAST_READINGS, SensorPrior, sensor_of
+from probewise.diagnosis.coordinates import LEAST_READINGS
+from probewise.diagnosis.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.evidence import Blocks, Linearised
-from probewise.diagnosis.fit import Fit, Model
+from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.mending import corrected, improvement_of
@@ -268,7 +269,12 @@ class _Diagnoser:
 
     def _sample(self, candidate: Candidate, noise: Names) -> ModelSamples:
         """Draw from the posterior of a candidate's hypothesis, over all SSF orders that matter."""
-        alike = [c for (_, names), c in self.search.candidates.items() if names == candidate.names]
+        sensor = candidate.found.model.sensor
+        alike = [
+            c
+            for (_, names), c in self.search.candidates.items()
+            if names == candidate.names and c.found.model.sensor.exchangeable == sensor.exchangeable
+        ]
         log_z = np.array([c.evidence[noise].log_z for c in alike])
         weights = np.exp(log_z - log_z.max())
         kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
@@ -318,7 +324,7 @@ class _Diagnoser:
         sizes = {effect.name: effect.size_lambda for effect in effects}
         named: list[Place] = []
         for effect in sorted(best.found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
-            change = self._change(best.found, effect)
+            change = best.found.change_by(effect.name, self.usable)
             named += places_of_effect(
                 effect,
                 change,
@@ -333,14 +339,6 @@ class _Diagnoser:
         for place in [*named, *scanned]:
             first.setdefault(place.witness, place)
         return list(first.values())
-
-    def _change(self, found: Fit, effect: NamedEffect[Any]) -> FloatArray:
-        """Tell what one of a fit's effects does to the usable readings, (n_usable,)."""
-        model = found.model
-        keep = np.ones(len(found.z), dtype=np.bool_)
-        keep[model.columns_of(effect.name)] = False
-        without = Model(model.sensor, tuple(e for e in model.effects if e is not effect), model.plan)
-        return np.asarray(found.predicted - without.predict(found.z[None, keep])[0, self.usable])
 
 
 def _of_everything(found: Diagnosis, everything: Recording) -> Diagnosis:

@@ -15,6 +15,7 @@ from probewise.diagnosis.noise import NoiseLaw, Tail
 from probewise.diagnosis.noise_models import LaidOut, NoiseModel
 
 __all__ = [
+    "LEAST_VISIBLE",
     "SCALES",
     "Blocks",
     "Linearised",
@@ -28,6 +29,11 @@ __all__ = [
 
 SCALES = np.geomspace(0.05, 25.0, 8)
 """Prior scales of an effect's rms, in noise sd: a mixture with a heavy tail."""
+
+LEAST_VISIBLE = 3.0
+"""Least size (lambda) of what counts as an effect: a smaller one no reading here could tell from nothing."""
+
+_INVISIBLE = -50.0  # log Bayes factor of a template of which nothing survives
 
 
 _MOST_NUMBERS = 4_000_000  # held at once, of the slopes under several laws
@@ -264,8 +270,8 @@ def orthonormal(
 def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int) -> FloatArray:
     """Weigh each block against the null, its amplitude and the noise sd integrated out.
 
-    An amplitude whose template has unit rms is normal with sd kappa noise sd, kappa mixed over
-    `SCALES`; the noise sd marginalised makes it a Student-t.
+    An amplitude whose template has unit rms is normal with sd kappa noise sd, kappa mixed over those of
+    `SCALES` at which it can be seen; the noise sd marginalised makes it a Student-t.
 
     Parameters
     ----------
@@ -292,7 +298,10 @@ def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int
 
 
 def mix_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatArray:
-    """Average over `SCALES` the Bayes factors of templates of one width.
+    """Average the Bayes factors of templates of one width over the `SCALES` at which each can be seen.
+
+    At a smaller one what survives of a template has an rms lambda below `LEAST_VISIBLE`. There the Bayes factor is
+    near one whatever is read: it would keep alive what makes no difference.
 
     Parameters
     ----------
@@ -308,11 +317,14 @@ def mix_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatA
     Log Bayes factors, (n_templates, n_draws).
     """
     terms = np.empty((len(SCALES), explained.shape[0], explained.shape[2]))
+    visible = SCALES[:, None] ** 2 * gain.sum(axis=1) >= LEAST_VISIBLE**2
     for k, scale in enumerate(SCALES):
         ratio = scale**2 * gain
         of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
         np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
         terms[k] *= -0.5 * n_points
         terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
+    terms[~visible] = _INVISIBLE
     top = terms.max(axis=0)
-    return np.asarray(top + np.log(np.exp(terms - top).mean(axis=0)))
+    n_visible = np.maximum(np.count_nonzero(visible, axis=0), 1)[:, None]
+    return np.asarray(top + np.log(np.exp(terms - top).sum(axis=0) / n_visible))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, effect_scores, effect_values
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.null import Null, Predictor
@@ -83,6 +83,12 @@ class Model:
         """Add an effect behind the others."""
         return Model(self.sensor, (*self.effects, effect), self.plan)
 
+    def without(self, name: str) -> tuple[Model, BoolArray]:
+        """Leave an effect out; also which coordinates stay, (n_params,)."""
+        stay = np.ones(self.n_params, dtype=np.bool_)
+        stay[self.columns_of(name)] = False
+        return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
+
     def scores_of(self, values: FloatArray) -> FloatArray:
         """Return the last effect's coordinates for its own parameters (n_samples, n_params)."""
         return effect_scores(self.effects[-1], values)
@@ -102,6 +108,11 @@ class Fit:
     slopes: FloatArray
     sd: float
     objective: float
+
+    def change_by(self, name: str, usable: IntArray) -> FloatArray:
+        """Tell what one of its effects does to the usable readings, all else as it is, (n_usable,)."""
+        without, stay = self.model.without(name)
+        return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
 
 
 def fit(

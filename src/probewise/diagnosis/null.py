@@ -45,8 +45,8 @@ class Predictor(Protocol):
 class Null(Protocol):
     """A model to be diagnosed, in coordinates in which its prior is a standard normal.
 
-    The sensor of the paper (`SensorCoordinates`), a sensor over a shape that is not known
-    (`SensorAndShape`), or any simulator (`OwnModel`).
+    The sensor of the paper (`SensorCoordinates`), one whose SSF has any form (`FreeForm`), a sensor
+    over a shape that is not known (`SensorAndShape`), or any simulator (`OwnModel`).
     """
 
     @property
@@ -57,6 +57,21 @@ class Null(Protocol):
     @property
     def n_gaussians(self) -> int:
         """Number of Gaussians of its SSF; 0 where it has none."""
+        ...
+
+    @property
+    def worth(self) -> int:
+        """How many Gaussians its SSF is as free as."""
+        ...
+
+    @property
+    def form(self) -> str:
+        """What its SSF is, in words; empty where it has none."""
+        ...
+
+    @property
+    def exchangeable(self) -> bool:
+        """Whether the Gaussians of its SSF can trade names."""
         ...
 
     @property

@@ -60,6 +60,21 @@ class OwnModel:
         return 0
 
     @property
+    def worth(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def form(self) -> str:
+        """Nothing."""
+        return ""
+
+    @property
+    def exchangeable(self) -> bool:
+        """There are none."""
+        return False
+
+    @property
     def log_multiplicity(self) -> float:
         """One peak is expected."""
         return 0.0

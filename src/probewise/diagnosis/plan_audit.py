@@ -16,14 +16,16 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
 from probewise.diagnosis.commands import behind, minutes_of
-from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, SensorPrior, default_sensor, sensor_of
+from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, SensorCoordinates, default_sensor
 from probewise.diagnosis.cures import cures_of
+from probewise.diagnosis.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.sights import ALIAS, LEAST_SHARE, Expected, LaidOut, Survivors
 from probewise.diagnosis.verdict import Diagnosis
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.sensor import Stage
+from probewise.sensor import Stage, is_free_form
 
 __all__ = ["Cure", "EffectAudit", "PlanAudit", "Sight", "Smallest", "audit_plan", "audit_recorded"]
 
@@ -239,8 +241,15 @@ def audit_recorded(
     low, high = (float(mean[names.index(name)]) for name in ("I_min", "I_max"))
     low, high = min(low, high), max(low, high, low + 1e-9)
     extent = Extent.of(diagnosis.recording)
-    null = default_sensor(extent, known.n_gaussians) if sensor is None else sensor_of(sensor)
-    z = np.clip(null.z(mean[None, : 6 * known.n_gaussians + 2])[0], -FARTHEST, FARTHEST)
+    own = mean[None, : 6 * known.n_gaussians + 2]
+    null: SensorCoordinates | FreeForm
+    if sensor is not None:
+        null = sensor_of(sensor)
+    elif is_free_form(own[:, :-2]):
+        null = FreeForm.about(default_sensor(extent, 1))
+    else:
+        null = default_sensor(extent, known.n_gaussians)
+    z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
     judged, cosines = _judged(LaidOut.of(expected, plan, effects, most=_SETTINGS), effects)
     return PlanAudit(plan, "the sensor as calibrated from these readings", judged, cosines, (), judged)

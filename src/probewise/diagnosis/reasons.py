@@ -56,7 +56,8 @@ def reason_of(
     by_name = {effect.name: effect for effect in effects}
     if verdict == "clean":
         order = max(search.order_probabilities, key=lambda k: search.order_probabilities[k])
-        ssf = "" if order == 0 else ", an SSF of one Gaussian," if order == 1 else f", an SSF of {order} Gaussians,"
+        form = search.sensors[order].form
+        ssf = f", {form}," if form else ""
         return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
     if verdict == "unknown":
         if candidates:

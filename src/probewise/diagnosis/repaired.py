@@ -38,7 +38,7 @@ class ModelSamples:
 
     `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
     `effects` names all effects, those on the noise too, in the order of their columns; `nuisance` the
-    parameters that belong to this recording alone.
+    parameters that belong to this recording alone; `exchangeable` Gaussians are told by their mass.
     """
 
     chain: Predictor
@@ -47,6 +47,7 @@ class ModelSamples:
     effects: tuple[str, ...]
     n_gaussians: int
     nuisance: tuple[str, ...] = ()
+    exchangeable: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", frozen(self.theta))
@@ -60,7 +61,7 @@ class ModelSamples:
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Make the sensor of it that predicts, drives the robot, and is written to sensor.json."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
-        from_chain = by_mass(self.theta, self.n_gaussians)
+        from_chain = by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_step_mm(recording))
         field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
@@ -118,8 +119,10 @@ def sample_model(
     """
     law, floor, n_samples = noise.law, sd_floor(recording), N_SAMPLES
     z = np.clip(_posterior_draws(found, noise, recording, floor, annealed, rng=rng), -FARTHEST, FARTHEST)
-    residuals = recording.readings - found.model.predict(z)
-    sigma = law.scale(law(residuals[:, recording.usable].T), floor=floor)
+    # What is not annealed is drawn for the effects' sake alone: the noise is then that of the fit.
+    predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
+    residuals = recording.readings[recording.usable] - predicted
+    sigma = law.scale(law(residuals.T), floor=floor)
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
@@ -138,7 +141,7 @@ def sample_model(
     names = tuple(effect.name for effect in chain.effects)
     rounding = theta[:, [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]].sum(axis=1)
     noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
-    return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance)
+    return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)
 
 
 def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -24,12 +24,14 @@ from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
 from probewise.diagnosis.evidence import Linearised, NoiseEvidence, weigh
 from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.noise import NoiseLaw, steps_within_scans, white
 from probewise.diagnosis.noise_models import NoiseModel, rough_sd
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
 from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
+from probewise.diagnosis.visible import log_visible
 from probewise.diagnosis.weighed import STEERING, TOO_ALIKE, Candidate, Search, nats_apart, outside, weighed
 from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
@@ -49,6 +51,7 @@ _SINGLES = 6  # effects that are refitted alone
 _WORTH_REFITTING = 6.0  # nats behind the best so far: screening about a fit that one effect has bent is so far off
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _LEAST_ELSEWHERE = 1e-4  # probability of such a combination
+_WORTH_TRYING = 0.05  # of the leading variant's weight
 _PAIRED = 12  # effects that pairs are screened of, the best alone
 
 
@@ -211,39 +214,35 @@ class _Searcher:
             starts = min(tried, key=lambda f: f.objective).z[None, :]
         return require_finite(fit(model, self.recording, starts[0], law, sd_floor=self.sd_floor, max_steps=max_steps))
 
-    def _weigh_all(self, found: Fit, log_share: float) -> dict[Names, NoiseEvidence]:
-        plain = {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
-        return {k: replace(evidence, log_z=evidence.log_z + log_share) for k, evidence in plain.items()}
+    def _weigh_all(self, found: Fit) -> dict[Names, NoiseEvidence]:
+        return {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
 
     def _weighed(
         self,
         model: Model,
         starts: FloatArray,
         law: NoiseLaw,
-        *,
-        log_share: float = 0.0,
-        weights: Mapping[str, FloatArray] | None = None,
         max_steps: int = 30,
     ) -> Candidate:
         """Fit under a law of the noise, weigh under every noise model, refit where another one is more probable."""
         found = self._fit(model, starts, law, max_steps)
         for _ in range(2):
-            evidence = self._weigh_all(found, log_share)
+            evidence = self._weigh_all(found)
             best = max(evidence, key=lambda k: evidence[k].log_z + self._log_noise(k))
             if evidence[best].law.alike(law):
                 break
             law = evidence[best].law
             found = self._fit(model, found.z[None, :], law, max_steps)
         else:
-            evidence = self._weigh_all(found, log_share)
-        return Candidate(found, law, evidence, log_share, weights or {})
+            evidence = self._weigh_all(found)
+        return Candidate.of(found, law, evidence, log_visible(found, law, self.usable))
 
     def _keep(self, candidate: Candidate) -> Candidate:
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
     def _null_fits(self) -> None:
-        """Fit the null at each SSF order; one more is always a rival."""
+        """Fit the null with SSFs of one Gaussian, of free form, and of more Gaussians; one more is always a rival."""
         plan, law = self.recording.plan, white(self.n_points)
         if self.sensor is not None:
             self.sensors[self.sensor.n_gaussians] = self.sensor
@@ -252,16 +251,22 @@ class _Searcher:
         first = default_sensor(self.extent, 1)
         self.sensors[1] = first
         last = self._keep(self._weighed(Model(first, (), plan), starts_of_one_gaussian(first), law))
-        log_z = {1: last.log_z}
-        for n in range(2, self.max_order + 2 if self.max_order > 1 else 2):
+        if self.max_order == 1:
+            return
+        free = FreeForm.about(first)
+        self.sensors[free.n_gaussians] = free
+        start = free.starts + np.pad(last.found.z, (0, free.n_params - first.n_params))
+        bent = self._keep(self._weighed(Model(free, (), plan), start, self._law_of(last)))
+        best = max(bent.log_z, last.log_z)
+        for n in range(2, self.max_order + 2):
             # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
-            if log_z[n - 1] < max(log_z.values()) - 3:
+            if n > 2 and last.log_z < best - STEERING:
                 break
             wanted = default_sensor(self.extent, n)
             self.sensors[n] = wanted
             starts = start_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
             last = self._keep(self._weighed(Model(wanted, (), plan), starts, self._law_of(last)))
-            log_z[n] = last.log_z
+            best = max(best, last.log_z)
 
     def _law_of(self, candidate: Candidate) -> NoiseLaw:
         """Give the most probable law of the noise about a fit."""
@@ -288,19 +293,19 @@ class _Searcher:
             if value + self._log_noise(both) > best - _WORTH_A_PAIR:
                 self.noise_models[both] = model
         for candidate in self._nulls():
-            self._keep(replace(candidate, evidence=self._weigh_all(candidate.found, candidate.log_share)))
+            self._keep(candidate.with_evidence(self._weigh_all(candidate.found)))
 
     def _log_prior(self, names: Names) -> float:
         return self.prior.log_mean(names)
 
-    def _coincidence(self, n_gaussians: int, each: float | None = None) -> float:
-        """Give the nats against effects beside so few Gaussians, where the null alone has more.
+    def _coincidence(self, worth: int, each: float | None = None) -> float:
+        """Give the nats against effects beside an SSF worth so few Gaussians, where the null alone takes more.
 
         Averaged over the null's orders: what an order wins by chance, by a fraction of a nat, must not count whole.
         """
         nulls = self._nulls()
         log_z = np.array([c.log_z for c in nulls])
-        spared = np.array([max(c.n_gaussians - n_gaussians, 0) for c in nulls])
+        spared = np.array([max(c.worth - worth, 0) for c in nulls])
         return float(logsumexp(log_z) - logsumexp(log_z - (self.prior.coincidence if each is None else each) * spared))
 
     def _templates(self, found: Fit, names: Sequence[str]) -> dict[str, EffectTemplates]:
@@ -323,9 +328,7 @@ class _Searcher:
         """Refit the best combinations of each size, each grown from the best of the size before."""
         best = max(self._nulls(), key=lambda c: c.log_z)
         grown = [
-            c
-            for c in self._nulls()
-            if c.log_z > best.log_z - (_RIVAL_ORDER if c.n_gaussians <= best.n_gaussians else STEERING)
+            c for c in self._nulls() if c.log_z > best.log_z - (_RIVAL_ORDER if c.worth <= best.worth else STEERING)
         ]
         for size in range(1, min(self.depth, len(self.mean_effects)) + 1):
             wishes: dict[Names, tuple[float, Candidate, str]] = {}
@@ -357,7 +360,7 @@ class _Searcher:
         """Screen every effect that a fit does not hold yet, by its templates about the null."""
         null = self.candidates[parent.n_gaussians, ()]
         bank = self.templates.bank(null.found, list(self.mean_effects.values()))
-        against = 0.0 if parent.names else self._coincidence(parent.n_gaussians)
+        against = 0.0 if parent.names else self._coincidence(parent.worth)
         for noise, evidence in parent.steering():
             scores = score_effects(Linearised.of(parent.found, evidence.law), bank)
             for name, own in scores.items():
@@ -389,7 +392,7 @@ class _Searcher:
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
         names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():
-            against = 0.0 if parent.names else self._coincidence(parent.n_gaussians)
+            against = 0.0 if parent.names else self._coincidence(parent.worth)
             self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
         self.not_felt.add(names)
         return None
@@ -419,7 +422,7 @@ class _Searcher:
                 held = grown
 
     def _extend(self, parent: Candidate, name: str) -> tuple[Candidate, dict[Names, float]]:
-        """Refit with one more effect, from the best entries of its bank; give the closed-form scores too."""
+        """Refit with one more effect, in the likely ones of its variants; give the closed-form scores too."""
         effect = self.mean_effects[name]
         templates = self.templates.of(parent.found, effect)
         own = Bank.of(templates.columns, [name] * len(templates.columns), self.n_points)
@@ -427,18 +430,46 @@ class _Searcher:
             noise: log_mean(score_effects(Linearised.of(parent.found, evidence.law), own)[name])
             for noise, evidence in parent.steering()
         }
-        law = self._law_of(parent)
-        problem = Linearised.of(parent.found, law)
+        problem = Linearised.of(parent.found, self._law_of(parent))
         scores = score_effects(problem, own)[name]
-        leader = int(np.argmax(scores))
-        log_share = parent.log_share + templates.log_share(leader, scores)
+        weights = templates.weights(scores)
+        tried = self._worth_trying(templates, weights)
+        refitted = [self._refit_variant(parent, name, templates, scores, variant, problem) for variant in tried]
+        # What refits have shown of variants counts for more than what screening promised.
+        log_z = np.array([candidate.log_z for candidate in refitted])
+        best = int(np.argmax(log_z))
+        weights = weights / weights[tried[best]]
+        weights[tried] = np.exp(log_z - log_z[best])
+        weights /= weights.sum()
+        log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights))
         if not parent.names:
-            log_share -= self._coincidence(parent.n_gaussians)
-        model = parent.found.model.with_effect(templates.variant(leader))
+            log_share -= self._coincidence(parent.worth)
+        return refitted[best].as_share(log_share, {**parent.weights, name: weights}), by_noise
+
+    def _worth_trying(self, templates: EffectTemplates, weights: FloatArray) -> list[int]:
+        """Choose which of an effect's variants are refitted: the leader, and the next where they are bound to scans.
+
+        Two scans of opposite ways look the same to first order; which was turned by 30 degrees shows in a refit.
+        """
+        first, *others = np.argsort(-weights)[:2].tolist()
+        bound = templates.variants[first].scans or templates.variants[first].patterns
+        return [first, *(k for k in others if bound and weights[k] > _WORTH_TRYING * weights[first])]
+
+    def _refit_variant(
+        self,
+        parent: Candidate,
+        name: str,
+        templates: EffectTemplates,
+        scores: FloatArray,
+        variant: int,
+        problem: Linearised,
+    ) -> Candidate:
+        """Refit with one variant of one more effect, from the best entries of its bank."""
+        effect, own = self.mean_effects[name], np.flatnonzero(templates.choice == variant)
+        model = parent.found.model.with_effect(templates.variants[variant])
+        ranked = own[np.argsort(-scores[own])]
         starts = []
-        rivals = np.flatnonzero(templates.choice == templates.choice[leader])
-        ranked = rivals[np.argsort(-scores[rivals])]
-        for at in ranked[: 2 if scores[leader] > 5 else 1]:
+        for at in ranked[: 2 if scores[ranked[0]] > 5 else 1]:
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(problem.project(columns), problem.residual)[0], dtype=np.float64)
             setting = effect.start(templates.settings[at], amount)
@@ -447,8 +478,7 @@ class _Searcher:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # A null with several basins: with the effect the best may be another one than without.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        weights = {**parent.weights, name: templates.weights(scores)}
-        return self._weighed(model, np.stack(starts), law, log_share=log_share, weights=weights), by_noise
+        return self._weighed(model, np.stack(starts), problem.law)
 
     def _other_orders(self) -> None:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
@@ -458,31 +488,39 @@ class _Searcher:
         ranked = sorted(first.probabilities, key=lambda key: -first.probabilities[key])
         leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:_AT_OTHER_ORDERS]
         for names in leaders:
-            source = max(
-                (c for (_, key), c in self.candidates.items() if key == names), key=lambda c: c.log_z, default=None
-            )
-            if (
-                source is None
-                or sum(p for (mean, _), p in first.probabilities.items() if mean == names) < _LEAST_ELSEWHERE
-            ):
-                continue
-            for n, sensor in self.sensors.items():
-                if (n, names) in self.candidates or n > source.n_gaussians + 1:
-                    continue
-                null = self.candidates[n, ()]
-                model = Model(sensor, source.found.model.effects, self.recording.plan)
-                own = source.found.z[source.found.model.sensor.n_params :]
-                start = np.concatenate([null.found.z, own])[None, :]
-                candidate = self._weighed(
-                    model,
-                    start,
-                    self._law_of(source),
-                    log_share=source.log_share + self._coincidence(source.n_gaussians) - self._coincidence(n),
-                    weights=source.weights,
-                    max_steps=15,
-                )
-                if _acts(candidate, null, self.sd_floor):
-                    self._keep(candidate)
+            held = [c for (_, key), c in self.candidates.items() if key == names]
+            p = sum(p for (mean, _), p in first.probabilities.items() if mean == names)
+            if held and p >= _LEAST_ELSEWHERE:
+                source = max(held, key=lambda c: c.log_z)
+                for n in self._rival_orders(source):
+                    self._carry_over(source, n)
+
+    def _rival_orders(self, source: Candidate) -> list[int]:
+        """List the SSF orders at which what is refitted at one is worth another refit."""
+        behind = self.candidates[source.n_gaussians, ()].log_z - _WORTH_REFITTING
+        return [
+            n
+            for n, sensor in self.sensors.items()
+            if (n, source.names) not in self.candidates
+            and sensor.worth <= source.worth + 1
+            # A freer SSF that does not pay by itself does not pay beside an effect.
+            and (sensor.worth < source.worth or self.candidates[n, ()].log_z > behind)
+        ]
+
+    def _carry_over(self, source: Candidate, n: int) -> None:
+        """Refit a candidate's effects at another SSF order; keep it where they are felt."""
+        null, sensor = self.candidates[n, ()], self.sensors[n]
+        own = source.found.z[source.found.model.sensor.n_params :]
+        candidate = self._weighed(
+            Model(sensor, source.found.model.effects, self.recording.plan),
+            np.concatenate([null.found.z, own])[None, :],
+            self._law_of(source),
+            max_steps=15,
+        )
+        log_share = source.log_share + self._coincidence(source.worth) - self._coincidence(sensor.worth)
+        candidate = candidate.as_share(log_share, source.weights)
+        if _acts(candidate, null, self.sd_floor):
+            self._keep(candidate)
 
     def _speak_for_the_unnamed(self) -> None:
         """Leave out what is outside the vocabulary where the readings cannot tell it from what is inside."""
@@ -505,7 +543,7 @@ class _Searcher:
                     continue
                 value = evidence.log_z + log_mean(np.array(list(by_family.values())))
                 if not candidate.names:
-                    value -= self._coincidence(candidate.n_gaussians, self.prior.unknown_coincidence)
+                    value -= self._coincidence(candidate.worth, self.prior.unknown_coincidence)
                 self.unknown[candidate.n_gaussians, candidate.names, noise] = value
                 if value > best and not candidate.names:
                     best = value

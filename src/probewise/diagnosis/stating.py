@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.fit import fit
 from probewise.diagnosis.noise import noise_statistics, steps_within_scans
 from probewise.diagnosis.repaired import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.verdict import EffectFound, Hypothesis, NoiseFound, ParameterFound
@@ -131,13 +131,10 @@ def _size(search: Search, holder: Candidate, name: str, noise: Names) -> float:
         return math.sqrt(2 * max(gain, 0.0))
     clean = np.full(len(search.recording), np.nan)
     clean[search.recording.usable] = found.predicted
-    others = tuple(e for e in found.model.effects if e.name != name)
-    model = Model(found.model.sensor, others, found.model.plan)
-    keep = np.ones(len(found.z), dtype=np.bool_)
-    keep[found.model.columns_of(name)] = False
+    model, stay = found.model.without(name)
     noise_free = Recording(search.recording.plan, clean).unlimited()
     # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
-    refit = fit(model, noise_free, found.z[keep], law, sd_floor=found.sd, max_steps=12, tolerance=0.02)
+    refit = fit(model, noise_free, found.z[stay], law, sd_floor=found.sd, max_steps=12, tolerance=0.02)
     return float(np.linalg.norm(law(refit.residuals))) / found.sd * math.sqrt(law.information)
 
 

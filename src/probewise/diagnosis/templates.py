@@ -6,7 +6,6 @@ A template is a set of columns (n_usable, k), the change of the readings that an
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,14 +35,6 @@ class EffectTemplates:
         """Give the variant of one entry."""
         variant: NamedEffect[Any] = self.variants[self.choice[at]]
         return variant
-
-    def log_share(self, at: int, scores: FloatArray) -> float:
-        """Weigh the variant of entry `at`: log of its prior probability over its posterior one.
-
-        `scores` are the entries' log Bayes factors, (n_entries,). Added to the log evidence of that
-        variant alone it gives that of the effect, the choice among its variants summed out.
-        """
-        return -float(np.log(self.weights(scores)[self.choice[at]])) - math.log(len(self.variants))
 
     def weights(self, scores: FloatArray) -> FloatArray:
         """Posterior probability of each variant, (n_variants,), by the log Bayes factors of the entries."""

@@ -110,10 +110,10 @@ def _weigh(
     result = nested.run(problem, rng=rng, n_live=n_live, progress=show, return_interrupted=False)
     sharper = nested.refine(result, problem, rng=rng)
     if sharper.sound:
-        return replace(weighing, nested=sharper.log_z + candidate.log_share, error=sharper.log_z_error)
+        return replace(weighing, nested=sharper.log_z + candidate.log_factor, error=sharper.log_z_error)
     again = nested.run(problem, rng=rng, n_live=_MORE * n_live, progress=show, return_interrupted=False)
     both = nested.merge([result, again], rng=rng)
-    log_z = both.log_z + candidate.log_share
+    log_z = both.log_z + candidate.log_factor
     return replace(weighing, nested=log_z, error=both.log_z_error, doubts=tuple(both.warnings))
 
 

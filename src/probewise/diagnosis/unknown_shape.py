@@ -10,7 +10,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, SensorPrior, known_scene, sensor_of
+from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, known_scene
+from probewise.diagnosis.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.verdict import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
@@ -32,7 +34,7 @@ class SensorAndShape:
     `starts` (n_starts, n_params) are coordinates near the readings' best explanations; see `of`.
     """
 
-    sensor: SensorCoordinates
+    sensor: SensorCoordinates | FreeForm
     shape: Shape
     starts: FloatArray
 
@@ -71,6 +73,21 @@ class SensorAndShape:
     def n_gaussians(self) -> int:
         """The sensor's."""
         return self.sensor.n_gaussians
+
+    @property
+    def worth(self) -> int:
+        """The sensor's."""
+        return self.sensor.worth
+
+    @property
+    def form(self) -> str:
+        """The sensor's."""
+        return self.sensor.form
+
+    @property
+    def exchangeable(self) -> bool:
+        """Whether the sensor's can."""
+        return self.sensor.exchangeable
 
     @property
     def log_multiplicity(self) -> float:

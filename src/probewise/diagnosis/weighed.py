@@ -43,6 +43,7 @@ class Candidate:
     law: NoiseLaw  # of the noise, under which it was fitted
     evidence: Mapping[Names, NoiseEvidence]
     log_share: float  # in the evidence, for the discrete choices that its effects have made
+    log_visible: float  # in the evidence: what of it is not the hypothesis with an effect less
     weights: Mapping[str, FloatArray]  # of the variants among which each effect chose
 
     @property
@@ -50,10 +51,34 @@ class Candidate:
         """Its effects on the mean, sorted."""
         return tuple(sorted(self.found.model.names))
 
+    @classmethod
+    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_visible: float) -> Candidate:
+        """Take a fit with the evidence of its parameters, as if nothing else had been chosen."""
+        return cls(found, law, {}, 0.0, log_visible, {}).with_evidence(plain)
+
+    @property
+    def log_factor(self) -> float:
+        """Log of what the evidence of its parameters alone is multiplied by."""
+        return self.log_share + self.log_visible
+
+    def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> Candidate:
+        """Take the evidence of its parameters under each noise model."""
+        return replace(self, evidence=_moved(plain, self.log_factor))
+
+    def as_share(self, log_share: float, weights: Mapping[str, FloatArray]) -> Candidate:
+        """Let it stand for all the variants of its effects."""
+        evidence = _moved(self.evidence, log_share - self.log_share)
+        return replace(self, evidence=evidence, log_share=log_share, weights=weights)
+
     @property
     def n_gaussians(self) -> int:
         """Its SSF order."""
         return self.found.model.sensor.n_gaussians
+
+    @property
+    def worth(self) -> int:
+        """How many Gaussians its SSF is as free as."""
+        return self.found.model.sensor.worth
 
     @property
     def log_z(self) -> float:
@@ -67,6 +92,10 @@ class Candidate:
         """
         best, plain = self.log_z, min(self.evidence, key=len)
         return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
+
+
+def _moved(evidence: Mapping[Names, NoiseEvidence], by: float) -> dict[Names, NoiseEvidence]:
+    return {noise: replace(e, log_z=e.log_z + by) for noise, e in evidence.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,8 +95,8 @@ class ScanAngleError(NamedEffect[Poses]):
         return tuple(replace(self, scans=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        """Lay out a small angle and large ones to either side."""
-        return self.typical_deg * np.array([1.0, -8.0, 8.0])[:, None, None]
+        """Lay out a small angle, and two large ones to either side."""
+        return self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0])[:, None, None]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many degrees, and in which scans."""

@@ -33,7 +33,7 @@ from probewise.scene import (
     Shape,
     outlines,
 )
-from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage, footprint_of, mean_mixture
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage
 from probewise.world import Oval, Spot, Surface, World
 
 __all__ = ["SHAPES", "Model", "arm_over", "experiment_for", "shape_named", "surface_of", "world_like"]
@@ -124,8 +124,7 @@ def experiment_for(
         sd = math.hypot(noise_sd, 1 / math.sqrt(12))
         # A reading on the edge never fits two levels, and the naive model knows no edge.
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
-    n = sensor.n_gaussians
-    mixture = mean_mixture(footprint_of(sensor.samples[:, : 6 * n], n), n_gaussians=n)
+    mixture = sensor.mixture()
     effects = tuple(
         Known(effect, tuple(means[f"{effect.name}.{name}"] for name in effect.prior.names))
         for effect in sensor.carried_effects
@@ -153,7 +152,8 @@ def world_like(sensor: FittedSensor) -> World:
     """Build the world that a sensor.json describes: its mean field as the spot, its levels, noise and height."""
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
-    spot = Spot(np.asarray(field.values), field.pixel_mm, corner)
+    # A fitted field of free form may dip below zero; what light there is never does.
+    spot = Spot(np.maximum(field.values, 0.0), field.pixel_mm, corner)
     height_mm = sensor.instrumentation.height_mm or _USUAL_HEIGHT_MM
     noise_sd = float(sensor.noise_sd.mean())
     return World(spot, black=means["I_min"], white=means["I_max"], noise_sd=noise_sd, height_mm=height_mm)

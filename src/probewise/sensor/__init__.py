@@ -4,6 +4,7 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 (RwithSSF) and (discreteR) for R, (Ssf) for the mixture of Gaussians, and the naive sensor.
 """
 
+from probewise.sensor.bent import N_BENDS, N_FREE_FORM, bends_of, free_form, is_free_form
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
 from probewise.sensor.commanded import COMMANDED, raised
 from probewise.sensor.discrete import seen_discrete
@@ -38,6 +39,8 @@ __all__ = [
     "ACCURATE_NODES",
     "COMMANDED",
     "FAST_NODES",
+    "N_BENDS",
+    "N_FREE_FORM",
     "AnyEffect",
     "Chain",
     "Effect",
@@ -57,8 +60,11 @@ __all__ = [
     "SensorModel",
     "Stage",
     "View",
+    "bends_of",
     "field_of",
     "footprint_of",
+    "free_form",
+    "is_free_form",
     "mean_mixture",
     "mixture_names",
     "mixture_of_field",

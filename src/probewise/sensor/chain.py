@@ -242,6 +242,9 @@ class Chain:
         return pairs
 
 
+_MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """Which region lies under which reading: what the response needs that no footprint changes.
@@ -317,6 +320,13 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     -------
     R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
     """
+    shared = _by_geometry(layout, footprint)
+    if shared is not None:
+        alone, which = shared
+        n_gaussians = footprint.weight.shape[2]
+        each = response(*alone, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
+        weight = np.broadcast_to(footprint.weight[:, 0], (len(which), n_gaussians))
+        return np.stack([row @ each[at] for row, at in zip(weight, which, strict=True)])
     arrays = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
     out = np.zeros((max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *arrays))), len(layout.plan)))
     poses = layout.poses
@@ -331,6 +341,44 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
             seen = seen_by_one(region, Spot(x, y, *turned(turn, *one)), n_nodes)
             out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * seen
     return out
+
+
+def _by_geometry(layout: Layout, footprint: Footprint) -> tuple[tuple[Layout, Footprint], IntArray] | None:
+    """Find hypotheses that differ in the weights of many Gaussians alone: a response is linear in those.
+
+    Returns
+    -------
+    A layout and a footprint with one Gaussian a hypothesis, all Gaussians of each geometry in turn, and which geometry
+    is each hypothesis', (n_samples,); None where that is no gain.
+    """
+    n_gaussians, poses = footprint.weight.shape[2], layout.poses
+    if n_gaussians < _MANY or footprint.weight.shape[1] > 1 or any(r.n_regions > 1 for _, r in layout.parts):
+        return None
+    moments = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
+    places = (poses.x_mm, poses.y_mm, poses.orientation_rad)
+    n_samples = max(len(a) for a in (footprint.weight, *moments, *places))
+    varying = [a.reshape(n_samples, -1) for a in (*moments, *places) if len(a) == n_samples > 1]
+    if n_samples == 1 or not varying:
+        return None
+    numbers: dict[bytes, int] = {}  # of the geometries, in order of their first hypothesis
+    rows = np.concatenate(varying, axis=1)
+    which = np.array([numbers.setdefault(row.tobytes(), len(numbers)) for row in rows])
+    if 2 * len(numbers) > n_samples:
+        return None
+    first = np.unique(which, return_index=True)[1]
+
+    def each(array: FloatArray) -> FloatArray:
+        """One Gaussian a hypothesis: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
+        own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[first]
+        return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
+
+    def placed(array: FloatArray) -> FloatArray:
+        return array if len(array) == 1 else array[first].repeat(n_gaussians, axis=0)
+
+    footprints = Footprint(np.ones((len(first) * n_gaussians, 1, 1)), *map(each, moments))
+    still = all(len(a) == 1 for a in places)
+    there = layout if still else Layout(layout.regions, Poses(*map(placed, places)), layout.plan)
+    return (there, footprints), which
 
 
 def _discrete_response(layout: Layout, ssf: FieldSSF) -> FloatArray:

@@ -54,7 +54,7 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     Raises
     ------
     ParameterError
-        If AB - C^2 is not positive, or no Gaussian has a positive amplitude.
+        If AB - C^2 is not positive, or the whole mass is not. An amplitude may be negative: it takes from the others.
     """
     if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:
         raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (n_samples, {6 * n_gaussians})")
@@ -66,8 +66,8 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
         raise ParameterError("A B - C^2", float(determinant.min()), "greater than 0, with A > 0 and B > 0")
     mass = a / np.sqrt(determinant)
     total = mass.sum(axis=0)
-    if not (total > 0).all() or not (a >= 0).all():
-        raise ParameterError("a", float(a.min()), "0 or more, one of them greater")
+    if not (total > 0).all():
+        raise ParameterError("mass of the SSF", float(total.min()), "greater than 0")
     half = 0.5 / determinant
     return Footprint(*(part.T[:, None] for part in (mass / total, u, v, half * bb, half * aa, -half * cc)))
 
@@ -264,7 +264,7 @@ def field_of(
     w, mu, mv, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
     w = w * np.repeat(shares, arrays[0].shape[2])
     total = np.zeros((len(v_mm), len(u_mm)))
-    for n in np.flatnonzero(w > 0):
+    for n in np.flatnonzero(w):
         # v given u, so that each Gaussian costs one exponential over the grid.
         slope = cov[n] / var_u[n]
         var_free = var_v[n] - slope * cov[n]

@@ -1,0 +1,98 @@
+"""SSFs of any form: one Gaussian, bent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probewise.recordings import paper_plan
+from probewise.scene import KnownScene
+from probewise.sensor import (
+    N_BENDS,
+    N_FREE_FORM,
+    Chain,
+    FieldSSF,
+    FreeLevels,
+    FreeMixture,
+    bends_of,
+    field_of,
+    footprint_of,
+    free_form,
+    is_free_form,
+)
+from probewise.sensor.chain import Layout, response
+from probewise.sensor.stages import Poses
+
+PLAN = paper_plan()
+ONE = np.array([[0.02, 0.4, -0.3, 0.05, 0.03, 0.01]])
+RNG = np.random.default_rng(11)
+BENDS = 0.1 * RNG.standard_normal((6, N_BENDS))
+
+
+def moments(theta: np.ndarray) -> np.ndarray:
+    """Mean and covariance of whole mixtures by the law of total covariance, (n_samples, 5)."""
+    f = footprint_of(theta, theta.shape[1] // 6)
+    w = f.weight[:, 0]
+    u, v = (np.sum(w * m[:, 0], axis=1) for m in (f.u_mm, f.v_mm))
+    du, dv = f.u_mm[:, 0] - u[:, None], f.v_mm[:, 0] - v[:, None]
+    second = (f.var_u[:, 0] + du * du, f.var_v[:, 0] + dv * dv, f.cov_uv[:, 0] + du * dv)
+    return np.stack([u, v, *(np.sum(w * s, axis=1) for s in second)], axis=1)
+
+
+def predicted(theta: np.ndarray) -> np.ndarray:
+    levels = np.tile([10.0, 60.0], (len(theta), 1))
+    chain = Chain(FreeMixture(theta.shape[1] // 6), FreeLevels(), KnownScene(PLAN.patterns))
+    return chain.predict(np.concatenate([theta, levels], axis=1), PLAN)
+
+
+def test_without_bends_it_is_the_one_gaussian():
+    np.testing.assert_allclose(predicted(free_form(ONE, np.zeros((1, N_BENDS)))), predicted(ONE), atol=1e-10)
+
+
+def test_bends_leave_mean_and_covariance_alone():
+    bent = free_form(np.repeat(ONE, 6, axis=0), BENDS)
+    np.testing.assert_allclose(moments(bent), np.repeat(moments(ONE), 6, axis=0), atol=1e-10)
+
+
+def test_readings_are_linear_in_the_bends():
+    plain, *bent = (predicted(free_form(ONE, b[None])) for b in (np.zeros(N_BENDS), BENDS[0], BENDS[1]))
+    both = predicted(free_form(ONE, (2.0 * BENDS[0] - 3.0 * BENDS[1])[None]))
+    np.testing.assert_allclose(both - plain, 2.0 * (bent[0] - plain) - 3.0 * (bent[1] - plain), atol=1e-9)
+    assert np.ptp(bent[0] - plain) > 0.5
+
+
+def test_bends_are_found_again_and_free_forms_are_known():
+    bent = free_form(np.repeat(ONE, 6, axis=0), BENDS)
+    bent[:, ::6] *= 7.0  # only ratios of amplitudes matter
+    np.testing.assert_allclose(bends_of(bent), BENDS, atol=1e-12)
+    assert is_free_form(bent)
+    others = bent.copy()
+    others[:, 9] *= 1.01
+    assert not is_free_form(others)
+    assert not is_free_form(ONE)
+
+
+def test_a_bent_form_sees_what_the_sum_over_its_pixels_sees():
+    """Route one: closed forms of each Gaussian; route two: the field, pixel by pixel (paper, eq. discreteR)."""
+    bent = free_form(ONE, BENDS[:1])
+    grid = np.arange(-25.0, 25.01, 0.25)
+    field = field_of(footprint_of(bent, N_FREE_FORM), u_mm=grid, v_mm=grid)
+    chain = Chain(FieldSSF(field), FreeLevels(), KnownScene(PLAN.patterns))
+    by_pixels = chain.predict(np.array([[10.0, 60.0]]), PLAN)
+    np.testing.assert_allclose(predicted(bent), by_pixels, atol=0.02)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(moving):
+    """Route one: once a geometry and summed; route two: each hypothesis by itself."""
+    shapes = free_form(np.repeat(ONE, 12, axis=0), 0.1 * RNG.standard_normal((12, N_BENDS)))
+    shapes[6:, 1::6] += 0.3
+    footprint = footprint_of(shapes, N_FREE_FORM)
+    shift = np.where(np.arange(12) % 6 < 3, 0.0, 0.2)[:, None] if moving else np.zeros((1, 1))
+    poses = Poses(PLAN.x_mm[None] + shift, PLAN.y_mm[None], PLAN.orientation_rad[None])
+    regions = KnownScene(PLAN.patterns).regions(np.zeros((1, 0)))
+    together = response(Layout(regions, poses, PLAN), footprint)
+    for k in range(12):
+        own = Poses(PLAN.x_mm[None] + shift[k if moving else 0], PLAN.y_mm[None], PLAN.orientation_rad[None])
+        alone = response(Layout(regions, own, PLAN), footprint_of(shapes[k : k + 1], N_FREE_FORM))
+        np.testing.assert_allclose(together[k], alone[0], atol=1e-12)

@@ -20,7 +20,7 @@ from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joint import JointProblem
 from probewise.diagnosis.null import Predictor
-from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation
+from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
@@ -139,7 +139,11 @@ def sample_model(
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
     theta = np.concatenate([theta, *(_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
     names = tuple(effect.name for effect in chain.effects)
-    rounding = theta[:, [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]].sum(axis=1)
+    of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
+    for i in of_lattice:
+        sd = lattice_step_sd(recording.readings[recording.usable], float(theta[0, i]))
+        theta[:, i] += sd * rng.standard_normal(n_samples)
+    rounding = theta[:, of_lattice].sum(axis=1)
     noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
     return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)
 

@@ -20,7 +20,7 @@ from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
 from probewise.effects.height import HeightGradient, HeightOffset
 from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Known
-from probewise.effects.lattice import Quantisation, lattice_step
+from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.moves import in_scans
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, SignalDependentNoise
@@ -143,6 +143,7 @@ __all__ = [
     "edge_distance",
     "in_scans",
     "lattice_step",
+    "lattice_step_sd",
     "log_density",
     "variance",
 ]

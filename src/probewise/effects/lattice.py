@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -16,7 +17,10 @@ from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["Quantisation", "lattice_step"]
+__all__ = ["Quantisation", "lattice_step", "lattice_step_sd"]
+
+_TELLING = 15.0  # printed digits that a coarser step is, at least
+_DIGITS = 1e-6  # of a step: what is not told from rounding
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,55 @@ class Quantisation(NoiseEffect):
 def lattice_step(readings: FloatArray) -> float:
     """Find the step of a lattice that holds all readings, 0 where there is none coarser than a millionth of the range.
 
-    Euclid's algorithm on their differences, each remainder below the tolerance taken for rounding.
+    Readings are printed to some digits, which is a lattice too; a coarser one shows through it, each of its values
+    off by half a printed digit at most.
     """
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 3:
         return 0.0
-    tolerance = 1e-6 * float(values[-1] - values[0])
+    exact, rounding = _printed(values)
+    return _through(values, rounding) or exact
+
+
+def lattice_step_sd(readings: FloatArray, step: float) -> float:
+    """Say how well a lattice's step is known: the rounding of what is printed over the lattice's reach."""
+    values = np.unique(readings[np.isfinite(readings)])
+    digits = (10.0**-n for n in range(10) if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n))
+    reach = float(np.linalg.norm(values - values.mean())) / step
+    return max(next(digits, 0.0) / math.sqrt(12) / reach, _DIGITS * step)
+
+
+def _printed(values: FloatArray) -> tuple[float, float]:
+    """Give the exact common step of sorted values, 0 for none, and how far printing may have moved each, both ways."""
+    least = 1e-6 * float(values[-1] - values[0])
+    exact = _common_step(values, least)
+    return exact, exact or 10 * least
+
+
+def _through(values: FloatArray, rounding: float) -> float:
+    """Find the step of a lattice that shows through rounding, from two neighbours outwards; 0 where there is none."""
+    gaps = np.diff(values)
+    step, start = float(gaps.min()), float(values[np.argmin(gaps)])
+    if step <= _TELLING * rounding:
+        return 0.0
+    reach, known = 0.0, 1.0  # how far the lattice is told, and over how many steps the step is known to the rounding
+    while reach < values[-1] - values[0]:
+        further = 0.2 * step / rounding * known * step  # so far no number can be missed
+        near = values[np.abs(values - start) <= further]
+        if further <= reach or len(near) < 2:
+            return 0.0
+        number = np.round((near - start) / step)
+        reach, known = further, max(float(np.ptp(number)), 1.0)
+        step, start = np.polyfit(number, near, 1).tolist()
+    off = np.abs(values - start - step * np.round((values - start) / step))
+    return step if float(off.max()) <= 0.75 * rounding else 0.0
+
+
+def _common_step(values: FloatArray, tolerance: float) -> float:
+    """Find the greatest common step of sorted values; 0 where it is below ten times the tolerance.
+
+    Euclid's algorithm on their differences, each remainder below the tolerance taken for rounding.
+    """
     step = 0.0
     for gap in np.diff(values):
         larger, smaller = max(step, float(gap)), min(step, float(gap))

@@ -174,6 +174,16 @@ def test_an_inferred_sd_is_one_more_column() -> None:
     assert problem.prior.from_unit_cube(np.full((1, 3), 0.5))[0] == pytest.approx([1.0, 0.0, math.sqrt(0.1)])
 
 
+def test_a_few_hypotheses_at_a_time_are_weighed_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = recording([0.1, 1.2, float("nan"), 2.9])
+    sensor = Product({"slope": Uniform(0, 2), "start": Uniform(-1, 1)})
+    problem = SensorProblem(sensor, Line(), GaussianKnown(0.5), rec)
+    theta = sensor.from_unit_cube(np.random.default_rng(0).random((7, 2)))
+    together = problem.log_likelihood(theta)
+    monkeypatch.setattr("probewise.inference.problem._MOST_NUMBERS", 9)  # two hypotheses of four readings each
+    assert problem.log_likelihood(theta) == pytest.approx(together)
+
+
 def test_the_naive_likelihood_knows_two_levels() -> None:
     """Paper, naive likelihood, with the exponent's sign and the square of sigma put right."""
     naive = Naive(mu_black=10, sd_black=1, mu_white=60, sd_white=3)

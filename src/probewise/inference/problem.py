@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.priors import Prior
@@ -12,6 +14,8 @@ from probewise.recordings.plan import Recording
 from probewise.sensor.stages import SensorModel
 
 __all__ = ["Likelihood", "Problem", "SensorProblem"]
+
+_MOST_NUMBERS = 1_000_000  # predicted at once
 
 
 class Likelihood(Protocol):
@@ -49,7 +53,16 @@ class SensorProblem:
             raise ParameterError("prior.names", self.prior.names, f"the model's names {self.model.names}")
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Predict the whole plan (lag and backlash need every row), weigh the usable readings."""
+        """Predict the whole plan (lag and backlash need every row), weigh the usable readings.
+
+        Of very many readings a few hypotheses at a time, so that memory does not grow with their product.
+        """
+        at_once = max(_MOST_NUMBERS // max(len(self.recording), 1), 1)
+        if len(theta) > at_once:
+            return np.concatenate([self._of_block(theta[at : at + at_once]) for at in range(0, len(theta), at_once)])
+        return self._of_block(theta)
+
+    def _of_block(self, theta: FloatArray) -> FloatArray:
         usable = self.recording.usable
         predicted = self.model.predict(theta, self.recording.plan)
         if usable.all():

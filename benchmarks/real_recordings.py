@@ -1,6 +1,6 @@
 """What real recordings gain from what a diagnosis finds in them, on edges that were kept back.
 
-    python benchmarks/real_recordings.py FOLDER/chart/chart_edges.csv
+    python benchmarks/real_recordings.py FOLDER/chart/chart_edges.csv [--free-form] [EFFECT+EFFECT ...]
 
 Each group of scans over one pattern is kept back in turn; the sensor, plain and with effects, is fitted to the
 others and predicts it. The gain is in nats a reading, the noise Gaussian, with the standard error over the scans
@@ -17,6 +17,7 @@ import numpy as np
 
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.fit import Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.noise import white
 from probewise.effects import VOCABULARY, Extent
 from probewise.inference import sd_floor
@@ -33,8 +34,11 @@ class Gain:
     gain_error: float
 
 
-def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, n_gaussians: int = 2) -> list[Gain]:
-    """Keep the scans over each pattern back in turn, and compare sets of effects on them; () comes first."""
+def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, free_form: bool = False) -> list[Gain]:
+    """Keep the scans over each pattern back in turn, and compare sets of effects on them; () comes first.
+
+    The sensor's SSF is of two Gaussians, or of free form.
+    """
     plan, usable = recording.plan, recording.usable
     misses: dict[tuple[str, ...], np.ndarray] = {}
     scores: dict[tuple[str, ...], np.ndarray] = {}
@@ -43,7 +47,7 @@ def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, n_ga
         for code in np.unique(plan.pattern):
             out = plan.pattern == code
             readings = np.where(out, np.nan, recording.readings)
-            found = _fitted(Recording(plan, readings), names, n_gaussians)
+            found = _fitted(Recording(plan, readings), names, free_form)
             rows = np.flatnonzero(out & usable)
             miss[rows] = recording.readings[rows] - found.model.predict(found.z[None, :])[0, rows]
             score[rows] = -0.5 * (miss[rows] / found.sd) ** 2 - np.log(found.sd)
@@ -58,15 +62,16 @@ def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, n_ga
     return out_gains
 
 
-def _fitted(recording: Recording, names: tuple[str, ...], n_gaussians: int):
+def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
     extent, law, floor = Extent.of(recording), white(int(recording.usable.sum())), sd_floor(recording)
-    sensor = default_sensor(extent, 1)
-    starts = starts_of_one_gaussian(sensor)
-    found = _best(Model(sensor, (), recording.plan), recording, starts, law, floor)
-    for n in range(2, n_gaussians + 1):
-        wanted = default_sensor(extent, n)
+    one = default_sensor(extent, 1)
+    found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law, floor)
+    wanted = FreeForm.about(one) if free_form else default_sensor(extent, 2)
+    if free_form:
+        starts = np.pad(found.z, (0, wanted.n_params - one.n_params))[None, :]
+    else:
         starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
-        found = _best(Model(wanted, (), recording.plan), recording, starts, law, floor)
+    found = _best(Model(wanted, (), recording.plan), recording, starts, law, floor)
     for name in names:
         model = found.model.with_effect(VOCABULARY[name].for_extent(extent))
         own = np.zeros(model.n_params - found.model.n_params)
@@ -82,7 +87,8 @@ def _best(model, recording, starts, law, floor):
 
 if __name__ == "__main__":
     made = read_recording(Path(sys.argv[1]))
-    asked = [tuple(text.split("+")) for text in sys.argv[2:]]
-    for found in kept_back(made, asked or [("nonlinearity",), ("nonlinearity", "ambient_gradient")]):
+    asked = [tuple(text.split("+")) for text in sys.argv[2:] if text != "--free-form"]
+    usual = [("nonlinearity",), ("nonlinearity", "ambient_gradient")]
+    for found in kept_back(made, asked or usual, free_form="--free-form" in sys.argv):
         label = "+".join(found.effects) or "plain sensor"
         print(f"{label:40s} rms {found.rms:.3f}  gain {found.gain:+.3f} ± {found.gain_error:.3f} nats a reading")

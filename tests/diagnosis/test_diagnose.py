@@ -11,7 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from probewise.diagnosis import Diagnosis, diagnose, diagnosis_json, diagnosis_schema
+from probewise.diagnosis import Diagnosis, Improvement, diagnose, diagnosis_json, diagnosis_schema
 from probewise.effects import VOCABULARY
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
@@ -112,6 +112,19 @@ def test_backlash_is_named_measured_located_and_repaired():
     sensor = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
     assert sensor.effects == ("backlash",)
     assert sensor.names[-1] == "backlash.width_mm"
+
+
+def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
+    found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
+    plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)
+    answers = [found_out, plain]
+    monkeypatch.setattr("probewise.diagnosis.engine.improvement_of", lambda *_, **__: answers.pop(0))
+    found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    assert found.verdict == "cannot_tell"
+    assert found.combination == ()
+    assert "backlash explains these readings best" in found.reason
+    assert found.repaired.effects == ()
+    assert found.hypotheses[0].probability == pytest.approx(1.0, abs=0.3)
 
 
 def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():

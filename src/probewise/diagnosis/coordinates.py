@@ -8,6 +8,7 @@ order one. An effect's coordinates are the normal scores of its own prior.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -26,6 +27,7 @@ from probewise.sensor import Chain, FreeLevels, FreeMixture
 __all__ = [
     "FARTHEST",
     "LEAST_READINGS",
+    "CalibratedSensor",
     "SensorCoordinates",
     "default_sensor",
     "effect_scores",
@@ -43,12 +45,86 @@ LEAST_READINGS = 24
 """Fewest usable readings that a verdict on a sensor is given on."""
 
 
-@dataclass(frozen=True, eq=False)
-class SensorCoordinates:
-    """A normal prior of the SSF's and the levels' natural coordinates.
+class CalibratedSensor(ABC):
+    """A sensor over known patterns as a `Null`: a normal prior of natural coordinates of SSF and levels.
 
-    `center` has shape (6 n_gaussians + 1,), `factor` is a square root of the covariance.
-    `exchangeable` Gaussians can trade names, which the evidence counts.
+    `center` (n_params,) is the prior's mean, `factor` a square root of its covariance.
+    """
+
+    n_gaussians: int
+    center: FloatArray
+    factor: FloatArray
+
+    @property
+    @abstractmethod
+    def worth(self) -> int:
+        """How many Gaussians its SSF is as free as."""
+
+    @property
+    @abstractmethod
+    def form(self) -> str:
+        """What its SSF is, in words."""
+
+    @property
+    def exchangeable(self) -> bool:
+        """Whether its Gaussians can trade names."""
+        return False
+
+    @property
+    def log_multiplicity(self) -> float:
+        """Log of the number of equal peaks of the posterior."""
+        return math.lgamma(self.n_gaussians + 1) if self.exchangeable else 0.0
+
+    @abstractmethod
+    def from_natural(self, natural: FloatArray) -> FloatArray:
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
+
+    @abstractmethod
+    def to_natural(self, theta: FloatArray) -> FloatArray:
+        """Invert `from_natural`."""
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return len(self.center)
+
+    @property
+    def starts(self) -> FloatArray:
+        """Start from the centre, (1, n_params)."""
+        return np.zeros((1, self.n_params))
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """Nothing: all its parameters are the sensor's own."""
+        return ()
+
+    @property
+    def least_readings(self) -> int:
+        """As many as tell its parameters from the noise."""
+        return LEAST_READINGS
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """All of them."""
+        return True
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
+        return self.from_natural(self.center + z @ self.factor.T)
+
+    def z(self, theta: FloatArray) -> FloatArray:
+        """Invert `theta`."""
+        return np.asarray(np.linalg.solve(self.factor, (self.to_natural(theta) - self.center).T).T)
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        """Build the chain over the plan's patterns."""
+        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), known_scene(plan), tuple(effects), n_nodes=n_nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorCoordinates(CalibratedSensor):
+    """A sensor whose SSF is a mixture: 6 n_gaussians + 1 coordinates, one less than the paper's parameters.
+
+    Amplitudes have a common factor. `exchangeable` Gaussians can trade names, which the evidence counts.
     """
 
     n_gaussians: int
@@ -76,46 +152,13 @@ class SensorCoordinates:
         """So many Gaussians."""
         return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 
-    @property
-    def n_params(self) -> int:
-        """Number of coordinates: one less than the paper's, whose amplitudes have a common factor."""
-        return len(self.center)
+    def from_natural(self, natural: FloatArray) -> FloatArray:
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max: one column more."""
+        return natural_to_theta(natural, self.n_gaussians)
 
-    @property
-    def starts(self) -> FloatArray:
-        """Start from the centre, (1, n_params)."""
-        return np.zeros((1, self.n_params))
-
-    @property
-    def nuisance(self) -> tuple[str, ...]:
-        """Nothing: all its parameters are the sensor's own."""
-        return ()
-
-    @property
-    def least_readings(self) -> int:
-        """As many as tell its parameters from the noise."""
-        return LEAST_READINGS
-
-    @property
-    def log_multiplicity(self) -> float:
-        """Log of the number of equal peaks of the posterior."""
-        return math.lgamma(self.n_gaussians + 1) if self.exchangeable else 0.0
-
-    def admits(self, effect: NamedEffect[Any]) -> bool:
-        """All of them."""
-        return True
-
-    def theta(self, z: FloatArray) -> FloatArray:
-        """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max: one column more."""
-        return natural_to_theta(self.center + z @ self.factor.T, self.n_gaussians)
-
-    def z(self, theta: FloatArray) -> FloatArray:
-        """Invert `theta`."""
-        return np.asarray(np.linalg.solve(self.factor, (theta_to_natural(theta, self.n_gaussians) - self.center).T).T)
-
-    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
-        """Build the chain over the plan's patterns."""
-        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), known_scene(plan), tuple(effects), n_nodes=n_nodes)
+    def to_natural(self, theta: FloatArray) -> FloatArray:
+        """Invert `from_natural`."""
+        return theta_to_natural(theta, self.n_gaussians)
 
 
 @lru_cache(maxsize=32)

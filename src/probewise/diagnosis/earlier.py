@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.coordinates import SensorCoordinates, theta_to_natural
+from probewise.diagnosis.coordinates import CalibratedSensor, SensorCoordinates, theta_to_natural
 from probewise.diagnosis.free_form import FreeForm, free_form_to_natural
 from probewise.errors import ParameterError
 from probewise.sensor import is_free_form
@@ -16,7 +16,7 @@ from probewise.sensor import is_free_form
 __all__ = ["SensorPrior", "sensor_from_posterior", "sensor_of"]
 
 
-def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> SensorCoordinates | FreeForm:
+def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
     """Take an earlier sensor's posterior, by its mean and covariance, as the prior.
 
     Only the SSF's and the levels' columns are used; effects of the earlier model are not carried over.
@@ -65,7 +65,7 @@ class SensorPrior(Protocol):
         ...
 
 
-def sensor_of(sensor: SensorPrior) -> SensorCoordinates | FreeForm:
+def sensor_of(sensor: SensorPrior) -> CalibratedSensor:
     """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`."""
     samples = np.asarray(sensor.samples, dtype=np.float64)
     return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))

@@ -46,6 +46,7 @@ N_DRAWS = 999
 _ALARM = 0.01
 _NO_ALARM = 0.05  # by any rule, so that no other order of the SSF need be asked
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
+_RUIN = -1.0  # nats a reading kept back, below which what was named repairs nothing
 _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
@@ -164,6 +165,13 @@ class _Diagnoser:
                 {key: p for key, p in probabilities.items() if in_vocabulary(key[1]) == stated}
             )
         best = self.search.best(mean_names, noise_of) or null
+        after = Linearised.of(best.found, best.evidence[noise_of].law)
+        improvement = improvement_of(self.search, null, best, noise_of, after, p_value, rng=self.rng)
+        fails = verdict == "named" and improvement.heldout_log_density_per_reading < _RUIN
+        if fails:  # what explains these readings alone is no repair
+            verdict, combination, best = "cannot_tell", (), null
+            after = Linearised.of(best.found, best.evidence[noise_of].law)
+            improvement = improvement_of(self.search, null, best, noise_of, after, p_value, rng=self.rng)
         samples = self._sample(best, noise_of)
         written = samples
         if verdict == "unknown" and best is not null:
@@ -172,9 +180,7 @@ class _Diagnoser:
             written = doubted(samples, plain, best.found.model.effects, share, rng=self.rng)
         null_samples = samples if best is null else self._sample(null, noise_of)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
-        after = Linearised.of(best.found, best.evidence[noise_of].law)
         where = self._where(null, problem, draws, best, effects, p_value)
-        improvement = improvement_of(self.search, null, best, noise_of, after, p_value, rng=self.rng)
         residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
         if verdict == "unknown" and not foreseen:
             improvement, correction = corrected(self.search, null, best, after, noise, improvement, rng=self.rng)
@@ -190,6 +196,8 @@ class _Diagnoser:
             hypotheses,
             effects,
             p_value,
+            improvement.p_value_after,
+            fails,
             few,
             pairs,
             where,

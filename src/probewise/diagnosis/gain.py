@@ -1,4 +1,7 @@
-"""Does the repaired model predict readings kept back? Leave one scan out; rows left out at random would leak."""
+"""Does the repaired model predict readings kept back? Leave one scan out; rows left out at random would leak.
+
+So would one of many scans that lie side by side: of those all over one pattern the same way are left out together.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from probewise.diagnosis.fit import Fit, degrees_of_freedom, fit
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["HeldOut", "compare_scans", "held_out_gain"]
+__all__ = ["HeldOut", "compare_scans", "held_out_gain", "parts_kept_back"]
 
 _LEAST_ROWS = 8
 _MOST_SCANS = 10
@@ -33,9 +36,10 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
     """Refit both models without one scan at a time and compare how they predict it, reading by reading.
 
     Each reading counts by itself, as the law of the noise has it. Scans of fewer than eight readings stay
-    in; of more than ten longer ones, ten spread over the recording are kept back in turn.
+    in; of more than ten longer ones see `parts_kept_back`.
     """
     plan, usable = recording.plan, recording.usable
+    parts, names = parts_kept_back(recording)
 
     def gain(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
@@ -43,7 +47,25 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
         repaired_one, null_one = (_log_density(f, recording, rows, law, out, sd_floor) for f in (repaired, null))
         return repaired_one - null_one
 
-    return compare_scans(plan.scan[usable], gain, plan.scan_names)
+    return compare_scans(parts, gain, names)
+
+
+def parts_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
+    """Divide usable readings into the parts that are kept back in turn: their numbers (n_usable,), and their names.
+
+    Its scans; where more than ten are long enough, all those over one pattern in one orientation together, if there are
+    several such parts.
+    """
+    plan, usable = recording.plan, recording.usable
+    scan = plan.scan[usable]
+    if np.sum(np.bincount(scan) >= _LEAST_ROWS) > _MOST_SCANS:
+        views = np.stack([plan.pattern[usable].astype(np.float64), np.round(plan.orientation_rad[usable], 6)])
+        kinds, part = np.unique(views, axis=1, return_inverse=True)
+        if kinds.shape[1] > 1:
+            return part.reshape(-1), tuple(
+                f"{plan.pattern_names[int(code)]}, {np.degrees(turn):.0f} degrees" for code, turn in kinds.T
+            )
+    return scan, plan.scan_names
 
 
 def compare_scans(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.gain import held_out_gain
+from probewise.diagnosis.gain import held_out_gain, parts_kept_back
 from probewise.diagnosis.locate import global_p_value
 from probewise.diagnosis.unknown import correct
 from probewise.diagnosis.verdict import Improvement
@@ -75,8 +75,8 @@ def corrected(
         `plain` with what the correction adds, and the correction of the usable readings, (n_usable,).
     """
     bases = search.unknown_bases
-    scan = search.recording.plan.scan[search.recording.usable]
-    fixed = correct(best.found, problem, bases, scan)
+    parts, part_names = parts_kept_back(search.recording)
+    fixed = correct(best.found, problem, bases, parts)
     if fixed.held_out.by_scan and fixed.held_out.per_reading <= 0:
         return plain, np.zeros(len(fixed.change))
     wider = replace(
@@ -89,7 +89,7 @@ def corrected(
     p_after = global_p_value(after, search.looks(best.found), after.draws(_N_DRAWS, rng=rng))
     plain_z = null.evidence[noise].log_z
     named = dict(plain.heldout_by_scan)
-    by_scan = ((search.recording.plan.scan_names[int(k)], gained) for k, gained in fixed.held_out.by_scan)
+    by_scan = ((part_names[int(k)], gained) for k, gained in fixed.held_out.by_scan)
     gain = replace(
         plain,
         log_evidence=search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,

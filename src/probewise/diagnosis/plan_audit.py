@@ -16,7 +16,7 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
 from probewise.diagnosis.commands import behind, minutes_of
-from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, SensorCoordinates, default_sensor
+from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.cures import cures_of
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.free_form import FreeForm
@@ -242,7 +242,7 @@ def audit_recorded(
     low, high = min(low, high), max(low, high, low + 1e-9)
     extent = Extent.of(diagnosis.recording)
     own = mean[None, : 6 * known.n_gaussians + 2]
-    null: SensorCoordinates | FreeForm
+    null: CalibratedSensor
     if sensor is not None:
         null = sensor_of(sensor)
     elif is_free_form(own[:, :-2]):

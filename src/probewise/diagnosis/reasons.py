@@ -14,6 +14,8 @@ __all__ = ["reason_of"]
 
 Names = tuple[str, ...]
 
+_ALARM = 0.01
+
 
 def reason_of(
     search: Search,
@@ -22,6 +24,8 @@ def reason_of(
     hypotheses: tuple[Hypothesis, ...],
     effects: tuple[EffectFound, ...],
     p_value: float,
+    p_value_after: float,
+    fails: bool,
     few: bool,
     pairs: Sequence[Alias],
     where: Sequence[Place],
@@ -37,6 +41,10 @@ def reason_of(
         What was weighed.
     verdict, combination, hypotheses, effects, p_value, where
         As the diagnosis has them.
+    p_value_after
+        That nothing is missing from the repaired model.
+    fails
+        Whether what leads predicts readings kept back far worse than the plain sensor does.
     few
         Whether there are too few readings to say anything.
     pairs
@@ -67,9 +75,15 @@ def reason_of(
         known = " and ".join(name.replace("_", " ") for name in search.beside(noise))
         beside = f", beside {known}" if known else ""
         return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
+    if fails:
+        return (
+            f"Something is missing (p = {p_value:.2g}); {hypotheses[0].label} explains these readings best, and "
+            "predicts those kept back far worse than the sensor without it."
+        )
     if verdict == "cannot_tell":
         leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
         cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
         return f"These {n} readings are too few to decide between {leading}{cure}."
     said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
-    return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g})."
+    more = f" Something more is missing: after the repair p = {p_value_after:.2g}." if p_value_after < _ALARM else ""
+    return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g}).{more}"

@@ -10,9 +10,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, known_scene
+from probewise.diagnosis.coordinates import FARTHEST, CalibratedSensor, known_scene
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
-from probewise.diagnosis.free_form import FreeForm
 from probewise.diagnosis.verdict import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
@@ -34,7 +33,7 @@ class SensorAndShape:
     `starts` (n_starts, n_params) are coordinates near the readings' best explanations; see `of`.
     """
 
-    sensor: SensorCoordinates | FreeForm
+    sensor: CalibratedSensor
     shape: Shape
     starts: FloatArray
 

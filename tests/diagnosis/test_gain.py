@@ -1,0 +1,37 @@
+"""What is kept back in turn."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise.diagnosis.gain import compare_scans, parts_kept_back
+from probewise.recordings import Recording, paper_plan
+
+PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))
+
+
+def test_a_few_scans_are_kept_back_one_by_one():
+    parts, names = parts_kept_back(PAPER)
+    np.testing.assert_array_equal(parts, PAPER.plan.scan)
+    assert names == PAPER.plan.scan_names
+
+
+def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
+    """Sixteen scans: eight lines over each of two orientations."""
+    plan = PAPER.plan
+    rows = np.flatnonzero(plan.scan < 2)
+    scan = np.concatenate([8 * plan.scan[rows] + (np.arange(len(rows)) // 12) % 8])
+    taken = plan.take(rows)
+    many = type(taken)(
+        **{
+            **{name: getattr(taken, name) for name in taken.__dataclass_fields__},
+            "scan": np.sort(scan),
+            "scan_names": tuple(f"line_{k}" for k in range(16)),
+        }
+    )
+    parts, names = parts_kept_back(Recording(many, np.zeros(len(many))))
+    assert len(names) == 2
+    assert names[0].endswith("0 degrees")
+    np.testing.assert_array_equal(parts, np.round(many.orientation_rad / (np.pi / 2)).astype(int) - int(parts[0] != 0))
+    held = compare_scans(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
+    assert dict(held.by_scan) == {names[0]: 1.0, names[1]: -1.0}

@@ -44,7 +44,7 @@ Names = tuple[str, ...]
 _WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
 # An effect may look like another Gaussian, and be explained better by its name at fewer of them.
 _RIVAL_ORDER = 100.0  # nats behind the best: an SSF order so far back is not searched
-_WORTH_GROWING = 20.0  # nats behind the best of its size: no combination grows from there
+_WORTH_GROWING = 20.0  # nats behind the best of its size: nothing more grows from there
 _WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
 _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
 _SINGLES = 6  # effects that are refitted alone
@@ -140,7 +140,9 @@ class _Searcher:
         if self.depth > 1:
             self._screen_pairs(null)
         self._grow_beam()
-        self._weigh_unknown(self._nulls())
+        # Beside a form of the SSF that the readings refute, it is the form that is missing.
+        best = max(c.log_z for c in self._nulls())
+        self._weigh_unknown([c for c in self._nulls() if c.log_z > best - _WORTH_GROWING])
         self._refit_what_matters()
         self._other_orders()
         self._speak_for_the_unnamed()

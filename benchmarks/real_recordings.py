@@ -66,10 +66,11 @@ def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
     extent, law, floor = Extent.of(recording), white(int(recording.usable.sum())), sd_floor(recording)
     one = default_sensor(extent, 1)
     found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law, floor)
-    wanted = FreeForm.about(one) if free_form else default_sensor(extent, 2)
     if free_form:
-        starts = np.pad(found.z, (0, wanted.n_params - one.n_params))[None, :]
+        wanted = FreeForm.about(one)
+        starts = wanted.start_from(found.z)
     else:
+        wanted = default_sensor(extent, 2)
         starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
     found = _best(Model(wanted, (), recording.plan), recording, starts, law, floor)
     for name in names:

@@ -99,7 +99,7 @@ def test_backlash_is_named_measured_located_and_repaired():
     assert found.verdict == "named"
     assert found.combination == ("backlash",)
     width = document["effects"][0]["parameters"][0]
-    assert width["mean"] == pytest.approx(0.7, abs=3 * width["sd"])  # by chance beyond once in 370 seeds
+    assert width["interval95"][0] < 0.7 < width["interval95"][1]
     assert found.p_value < 1e-6
     assert found.where[0].covariate in VOCABULARY["backlash"].covariates
     gain = found.improvement
@@ -124,7 +124,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     assert found.combination == ()
     assert "backlash explains these readings best" in found.reason
     assert found.repaired.effects == ()
-    assert found.hypotheses[0].probability == pytest.approx(1.0, abs=0.3)
+    assert found.hypotheses[0].probability > 0.7
 
 
 def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():

@@ -204,7 +204,8 @@ class FittedSensor(ShowsItself):
     def summary(self) -> str:
         """Describe the sensor in plain text."""
         unit, n = self.instrumentation.unit, self.n_gaussians
-        form = "an SSF of free form" if self.free_form else f"{n} Gaussian{'s' if n > 1 else ''}"
+        bending = frozenset(mixture_names(n)[6:] if self.free_form else ())  # nobody reads twenty Gaussians one by one
+        form = "an SSF of free form" if bending else f"{n} Gaussian{'s' if n > 1 else ''}"
         lines = [
             f"{form}, {len(self.samples)} posterior samples"
             + (f", with {', '.join(self.effects)}" if self.effects else ""),
@@ -218,14 +219,14 @@ class FittedSensor(ShowsItself):
                 f"{o.log_z:>10.2f} ± {o.log_z_error:.2f}{'  most probable' if o is best else ''}"
                 for o in self.orders
             ]
-        told = [name for name in self.names if not (self.free_form and name in mixture_names(n)[6:])]
+        told = [name for name in self.names if name not in bending]
         width = max(9, *(len(name) for name in told))
         lines.append(f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval")
         mean, sd, interval = self.mean(), self.sd(), self.interval()
         lines += [
-            f"{name:<{width}}  {mean[name]:>11.5g}  {sd[name]:>11.3g}  {low:.5g} to {high:.5g}"
-            for name, (low, high) in interval.items()
-            if name in told
+            f"{name:<{width}}  {mean[name]:>11.5g}  {sd[name]:>11.3g}  {interval[name][0]:.5g} to "
+            f"{interval[name][1]:.5g}"
+            for name in told
         ]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 

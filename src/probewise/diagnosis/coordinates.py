@@ -55,6 +55,21 @@ class CalibratedSensor(ABC):
     center: FloatArray
     factor: FloatArray
 
+    def __post_init__(self) -> None:
+        n = self.n_params
+        object.__setattr__(self, "center", frozen(self.center))
+        object.__setattr__(self, "factor", frozen(self.factor))
+        if self.center.shape != (n,) or self.factor.shape != (n, n):
+            raise ShapeError(
+                f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n},) and "
+                f"({n}, {n}) for {self.n_gaussians} Gaussians"
+            )
+
+    @property
+    @abstractmethod
+    def n_params(self) -> int:
+        """Number of coordinates."""
+
     @property
     @abstractmethod
     def worth(self) -> int:
@@ -82,11 +97,6 @@ class CalibratedSensor(ABC):
     @abstractmethod
     def to_natural(self, theta: FloatArray) -> FloatArray:
         """Invert `from_natural`."""
-
-    @property
-    def n_params(self) -> int:
-        """Number of coordinates."""
-        return len(self.center)
 
     @property
     def starts(self) -> FloatArray:
@@ -132,15 +142,10 @@ class SensorCoordinates(CalibratedSensor):
     factor: FloatArray
     exchangeable: bool = True
 
-    def __post_init__(self) -> None:
-        n_params = 6 * self.n_gaussians + 1
-        object.__setattr__(self, "center", frozen(self.center))
-        object.__setattr__(self, "factor", frozen(self.factor))
-        if self.center.shape != (n_params,) or self.factor.shape != (n_params, n_params):
-            raise ShapeError(
-                f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n_params},) and "
-                f"({n_params}, {n_params}) for {self.n_gaussians} Gaussians"
-            )
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return 6 * self.n_gaussians + 1
 
     @property
     def worth(self) -> int:

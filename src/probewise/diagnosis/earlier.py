@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -36,10 +37,7 @@ def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArra
     mean = np.asarray(mean, dtype=np.float64)[at]
     cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
     free = is_free_form(mean[None, :-2])
-
-    def to_natural(theta: FloatArray) -> FloatArray:
-        return free_form_to_natural(theta) if free else theta_to_natural(theta, n_gaussians)
-
+    to_natural = free_form_to_natural if free else partial(theta_to_natural, n_gaussians=n_gaussians)
     center = to_natural(mean[None, :])[0]
     steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
     up = to_natural(mean + np.diag(steps))

@@ -26,7 +26,7 @@ from probewise.diagnosis.rivals import next_readings
 from probewise.diagnosis.search import search
 from probewise.diagnosis.stating import effects_found, noise_found
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.diagnosis.verdict import Diagnosis, EffectFound, Hypothesis, credible_set, decide
+from probewise.diagnosis.verdict import ALARM, Diagnosis, EffectFound, Hypothesis, Improvement, credible_set, decide
 from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary, outside
 from probewise.diagnosis.weighing import Weighing, with_agreement
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
@@ -43,7 +43,6 @@ Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
 """Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
 
 N_DRAWS = 999
-_ALARM = 0.01
 _NO_ALARM = 0.05  # by any rule, so that no other order of the SSF need be asked
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _RUIN = -1.0  # nats a reading kept back, below which what was named repairs nothing
@@ -149,7 +148,7 @@ class _Diagnoser:
         pairs = self._aliases(problem, null.found)
         verdict, combination = decide(hypotheses, self.noise_names, tuple(pairs), self._alike)
         # Physics is named only where the test that counts every look has raised an alarm too.
-        if few or (verdict == "named" and p_value > _ALARM):
+        if few or (verdict == "named" and p_value > ALARM):
             verdict, combination = "cannot_tell", ()
         if constant:
             p_value = 1.0  # readings that never change carry no noise to measure a residual by
@@ -165,13 +164,11 @@ class _Diagnoser:
                 {key: p for key, p in probabilities.items() if in_vocabulary(key[1]) == stated}
             )
         best = self.search.best(mean_names, noise_of) or null
-        after = Linearised.of(best.found, best.evidence[noise_of].law)
-        improvement = improvement_of(self.search, null, best, noise_of, after, p_value, rng=self.rng)
+        after, improvement = self._judged(null, best, noise_of, p_value)
         fails = verdict == "named" and improvement.heldout_log_density_per_reading < _RUIN
         if fails:  # what explains these readings alone is no repair
             verdict, combination, best = "cannot_tell", (), null
-            after = Linearised.of(best.found, best.evidence[noise_of].law)
-            improvement = improvement_of(self.search, null, best, noise_of, after, p_value, rng=self.rng)
+            after, improvement = self._judged(null, best, noise_of, p_value)
         samples = self._sample(best, noise_of)
         written = samples
         if verdict == "unknown" and best is not null:
@@ -232,6 +229,11 @@ class _Diagnoser:
             unknown_shares=self._unknown_shares(),
             weighings=weighings,
         )
+
+    def _judged(self, null: Candidate, best: Candidate, noise: Names, p_value: float) -> tuple[Linearised, Improvement]:
+        """Lay the repaired model out as a linear problem, and measure what it gains over the null."""
+        after = Linearised.of(best.found, best.evidence[noise].law)
+        return after, improvement_of(self.search, null, best, noise, after, p_value, rng=self.rng)
 
     def _p_value(self, null: Candidate, noise: Names, problem: Linearised, draws: FloatArray) -> float:
         """Test that nothing is missing from the mean, be the SSF of the null's order or of a greater one.

@@ -39,6 +39,15 @@ class FreeForm(CalibratedSensor):
         factor[: one.n_params, : one.n_params] = one.factor
         return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
 
+    def start_from(self, one: FloatArray) -> FloatArray:
+        """Start unbent from coordinates of the one Gaussian, (7,): (1, n_params)."""
+        return np.pad(one, (0, N_BENDS))[None, :]
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return 7 + N_BENDS
+
     @property
     def worth(self) -> int:
         """As two: from one Gaussian to any form is one step."""

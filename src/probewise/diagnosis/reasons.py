@@ -7,14 +7,12 @@ from collections.abc import Sequence
 
 from probewise.diagnosis.audit import Alias
 from probewise.diagnosis.locate import Place
-from probewise.diagnosis.verdict import EffectFound, Hypothesis, Verdict
+from probewise.diagnosis.verdict import ALARM, EffectFound, Hypothesis, Verdict
 from probewise.diagnosis.weighed import Search
 
 __all__ = ["reason_of"]
 
 Names = tuple[str, ...]
-
-_ALARM = 0.01
 
 
 def reason_of(
@@ -85,5 +83,5 @@ def reason_of(
         cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
         return f"These {n} readings are too few to decide between {leading}{cure}."
     said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
-    more = f" Something more is missing: after the repair p = {p_value_after:.2g}." if p_value_after < _ALARM else ""
+    more = f" Something more is missing: after the repair p = {p_value_after:.2g}." if p_value_after < ALARM else ""
     return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g}).{more}"

@@ -257,8 +257,7 @@ class _Searcher:
             return
         free = FreeForm.about(first)
         self.sensors[free.n_gaussians] = free
-        start = free.starts + np.pad(last.found.z, (0, free.n_params - first.n_params))
-        bent = self._keep(self._weighed(Model(free, (), plan), start, self._law_of(last)))
+        bent = self._keep(self._weighed(Model(free, (), plan), free.start_from(last.found.z), self._law_of(last)))
         best = max(bent.log_z, last.log_z)
         for n in range(2, self.max_order + 2):
             # One more than the best is always a rival; beyond one that is far behind nothing is to be found.

@@ -121,7 +121,6 @@ def _moved(search: Search, gaps: dict[tuple[int, Names], float]) -> Search:
     """Move the evidence of candidates, and of what is unknown beside them, under every noise model alike."""
     candidates = dict(search.candidates)
     for key, gap in gaps.items():
-        evidence = {k: replace(e, log_z=e.log_z + gap) for k, e in candidates[key].evidence.items()}
-        candidates[key] = replace(candidates[key], evidence=evidence)
+        candidates[key] = candidates[key].moved(gap)
     unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in search.unknown.items()}
     return weighed(replace(search, candidates=candidates, unknown=unknown))

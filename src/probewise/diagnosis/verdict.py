@@ -15,6 +15,7 @@ from probewise.diagnosis.weighing import Weighing
 from probewise.recordings.plan import Recording
 
 __all__ = [
+    "ALARM",
     "Diagnosis",
     "EffectFound",
     "Hypothesis",
@@ -25,6 +26,9 @@ __all__ = [
     "credible_set",
     "decide",
 ]
+
+ALARM = 0.01
+"""p-value below which something is missing."""
 
 _OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
 

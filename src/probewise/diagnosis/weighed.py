@@ -63,12 +63,15 @@ class Candidate:
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> Candidate:
         """Take the evidence of its parameters under each noise model."""
-        return replace(self, evidence=_moved(plain, self.log_factor))
+        return replace(self, evidence=plain).moved(self.log_factor)
 
     def as_share(self, log_share: float, weights: Mapping[str, FloatArray]) -> Candidate:
         """Let it stand for all the variants of its effects."""
-        evidence = _moved(self.evidence, log_share - self.log_share)
-        return replace(self, evidence=evidence, log_share=log_share, weights=weights)
+        return replace(self.moved(log_share - self.log_share), log_share=log_share, weights=weights)
+
+    def moved(self, by: float) -> Candidate:
+        """Move its log evidence under every noise model alike."""
+        return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
 
     @property
     def n_gaussians(self) -> int:
@@ -92,10 +95,6 @@ class Candidate:
         """
         best, plain = self.log_z, min(self.evidence, key=len)
         return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
-
-
-def _moved(evidence: Mapping[Names, NoiseEvidence], by: float) -> dict[Names, NoiseEvidence]:
-    return {noise: replace(e, log_z=e.log_z + by) for noise, e in evidence.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,8 +80,9 @@ def lattice_step(readings: FloatArray) -> float:
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 3:
         return 0.0
-    exact, rounding = _printed(values)
-    return _through(values, rounding) or exact
+    least = 1e-6 * float(values[-1] - values[0])
+    exact = _common_step(values, least)
+    return _through(values, exact or 10 * least) or exact
 
 
 def lattice_step_sd(readings: FloatArray, step: float) -> float:
@@ -92,15 +93,11 @@ def lattice_step_sd(readings: FloatArray, step: float) -> float:
     return max(next(digits, 0.0) / math.sqrt(12) / reach, _DIGITS * step)
 
 
-def _printed(values: FloatArray) -> tuple[float, float]:
-    """Give the exact common step of sorted values, 0 for none, and how far printing may have moved each, both ways."""
-    least = 1e-6 * float(values[-1] - values[0])
-    exact = _common_step(values, least)
-    return exact, exact or 10 * least
-
-
 def _through(values: FloatArray, rounding: float) -> float:
-    """Find the step of a lattice that shows through rounding, from two neighbours outwards; 0 where there is none."""
+    """Find the step of a lattice that shows through rounding, from two neighbours outwards; 0 where there is none.
+
+    `rounding` is how far printing may have moved each value, both ways.
+    """
     gaps = np.diff(values)
     step, start = float(gaps.min()), float(values[np.argmin(gaps)])
     if step <= _TELLING * rounding:

@@ -38,7 +38,7 @@ def _directions() -> FloatArray:
 
 _DIRECTIONS = _directions()
 
-N_BENDS = _DIRECTIONS.shape[1]
+N_BENDS: int = _DIRECTIONS.shape[1]
 """Free amounts that bend the form."""
 
 N_FREE_FORM = 1 + len(_WIDTHS)

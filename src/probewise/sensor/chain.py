@@ -327,8 +327,9 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
         each = response(*alone, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
         weight = np.broadcast_to(footprint.weight[:, 0], (len(which), n_gaussians))
         return np.stack([row @ each[at] for row, at in zip(weight, which, strict=True)])
-    arrays = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
-    out = np.zeros((max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *arrays))), len(layout.plan)))
+    out = np.zeros(
+        (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
+    )
     poses = layout.poses
     for part in layout.straight:
         part.see(footprint, out)
@@ -337,7 +338,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
         if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
             turn = turn[:, :1]
         for g in range(footprint.weight.shape[2]):
-            one = (columns_of(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in arrays)
+            one = (columns_of(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
             seen = seen_by_one(region, Spot(x, y, *turned(turn, *one)), n_nodes)
             out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * seen
     return out
@@ -354,10 +355,9 @@ def _by_geometry(layout: Layout, footprint: Footprint) -> tuple[tuple[Layout, Fo
     n_gaussians, poses = footprint.weight.shape[2], layout.poses
     if n_gaussians < _MANY or footprint.weight.shape[1] > 1 or any(r.n_regions > 1 for _, r in layout.parts):
         return None
-    moments = (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
     places = (poses.x_mm, poses.y_mm, poses.orientation_rad)
-    n_samples = max(len(a) for a in (footprint.weight, *moments, *places))
-    varying = [a.reshape(n_samples, -1) for a in (*moments, *places) if len(a) == n_samples > 1]
+    n_samples = max(len(a) for a in (footprint.weight, *footprint.moments, *places))
+    varying = [a.reshape(n_samples, -1) for a in (*footprint.moments, *places) if len(a) == n_samples > 1]
     if n_samples == 1 or not varying:
         return None
     numbers: dict[bytes, int] = {}  # of the geometries, in order of their first hypothesis
@@ -375,7 +375,7 @@ def _by_geometry(layout: Layout, footprint: Footprint) -> tuple[tuple[Layout, Fo
     def placed(array: FloatArray) -> FloatArray:
         return array if len(array) == 1 else array[first].repeat(n_gaussians, axis=0)
 
-    footprints = Footprint(np.ones((len(first) * n_gaussians, 1, 1)), *map(each, moments))
+    footprints = Footprint(np.ones((len(first) * n_gaussians, 1, 1)), *map(each, footprint.moments))
     still = all(len(a) == 1 for a in places)
     there = layout if still else Layout(layout.regions, Poses(*map(placed, places)), layout.plan)
     return (there, footprints), which

@@ -258,9 +258,7 @@ def field_of(
         )
     n_samples = max(a.shape[0] for a in (footprint.weight, footprint.u_mm, footprint.var_u))
     shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
-    arrays = np.broadcast_arrays(
-        footprint.weight, footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv
-    )
+    arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
     w, mu, mv, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
     w = w * np.repeat(shares, arrays[0].shape[2])
     total = np.zeros((len(v_mm), len(u_mm)))
@@ -281,9 +279,7 @@ def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_g
     The mean over samples of mixtures is a large mixture; its components are merged by the law
     of total covariance, so mean and covariance of the mean field are kept exactly.
     """
-    arrays = np.broadcast_arrays(
-        footprint.weight, footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv
-    )
+    arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
     n_samples, _, n = arrays[0].shape
     shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
     w, u, v, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)

@@ -86,6 +86,11 @@ class Footprint:
     cov_uv: FloatArray
     brightness: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
 
+    @property
+    def moments(self) -> tuple[FloatArray, ...]:
+        """Mean and covariance of each Gaussian: u_mm, v_mm, var_u, var_v, cov_uv."""
+        return (self.u_mm, self.v_mm, self.var_u, self.var_v, self.cov_uv)
+
 
 @dataclass(frozen=True, eq=False)
 class View:

@@ -89,7 +89,7 @@ class StraightEdges:
 
     def _see_each(self, footprint: Footprint, share: FloatArray) -> None:
         """See from places that change with the hypothesis, or with a footprint that changes with the reading."""
-        weight, *moments = (columns_of(a, self.rows) for a in (footprint.weight, *_moments(footprint)))
+        weight, *moments = (columns_of(a, self.rows) for a in (footprint.weight, *footprint.moments))
         if _varies(footprint):
             angles, which = self.turn_rad, np.arange(len(self.rows))
         else:
@@ -206,7 +206,7 @@ class StraightCorners:
         if still and not _varies(footprint):
             out[:, self.rows] = self._views.see(footprint)
             return
-        moved = turned(poses.orientation_rad[..., None], *(columns_of(a, self.rows) for a in _moments(footprint)))
+        moved = turned(poses.orientation_rad[..., None], *(columns_of(a, self.rows) for a in footprint.moments))
         spots = Spot(poses.x_mm[..., None], poses.y_mm[..., None], *moved)  # (n_samples, n_rows, n_gaussians)
         (corner_x, corner_y), (to_x, to_y) = self.corner_mm.T[..., None], self.direction.T[..., None]
         found = mass_in_quadrant(corner_x, corner_y, to_x, to_y, spots)
@@ -259,16 +259,12 @@ class _CornerViews:
 
 def _varies(footprint: Footprint) -> bool:
     """Whether its Gaussians, or what each holds of the light, change with the reading."""
-    return any(a.shape[1] > 1 for a in (footprint.weight, *_moments(footprint)))
+    return any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
 
 
 def _samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
     """Take weight and moments of a footprint that no reading changes, (n_gaussians, n_samples or 1) each."""
-    return tuple(a[:, 0].T for a in (footprint.weight, *_moments(footprint)))
-
-
-def _moments(footprint: Footprint) -> tuple[FloatArray, ...]:
-    return (footprint.u_mm, footprint.v_mm, footprint.var_u, footprint.var_v, footprint.cov_uv)
+    return tuple(a[:, 0].T for a in (footprint.weight, *footprint.moments))
 
 
 def _projected(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import (
@@ -20,8 +21,7 @@ from probewise.sensor import (
     free_form,
     is_free_form,
 )
-from probewise.sensor.chain import Layout, response
-from probewise.sensor.stages import Poses
+from probewise.sensor import chain as chain_module
 
 PLAN = paper_plan()
 ONE = np.array([[0.02, 0.4, -0.3, 0.05, 0.03, 0.01]])
@@ -82,17 +82,18 @@ def test_a_bent_form_sees_what_the_sum_over_its_pixels_sees():
     np.testing.assert_allclose(predicted(bent), by_pixels, atol=0.02)
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(moving):
+@pytest.mark.parametrize("name", [None, "position_scale", "albedo_gradient", "halo", "height_gradient", "edge_shadow"])
+def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(name, monkeypatch):
     """Route one: once a geometry and summed; route two: each hypothesis by itself."""
+    effects = [] if name is None else [VOCABULARY[name].for_extent(Extent(10.0, 60.0, PLAN))]
+    built = Chain(FreeMixture(N_FREE_FORM), FreeLevels(), KnownScene(PLAN.patterns), effects)
     shapes = free_form(np.repeat(ONE, 12, axis=0), 0.1 * RNG.standard_normal((12, N_BENDS)))
     shapes[6:, 1::6] += 0.3
-    footprint = footprint_of(shapes, N_FREE_FORM)
-    shift = np.where(np.arange(12) % 6 < 3, 0.0, 0.2)[:, None] if moving else np.zeros((1, 1))
-    poses = Poses(PLAN.x_mm[None] + shift, PLAN.y_mm[None], PLAN.orientation_rad[None])
-    regions = KnownScene(PLAN.patterns).regions(np.zeros((1, 0)))
-    together = response(Layout(regions, poses, PLAN), footprint)
-    for k in range(12):
-        own = Poses(PLAN.x_mm[None] + shift[k if moving else 0], PLAN.y_mm[None], PLAN.orientation_rad[None])
-        alone = response(Layout(regions, own, PLAN), footprint_of(shapes[k : k + 1], N_FREE_FORM))
-        np.testing.assert_allclose(together[k], alone[0], atol=1e-12)
+    own = np.concatenate([effect.bank()[0][:1] for effect in effects], axis=1) if effects else np.zeros((1, 0))
+    own = np.where(np.arange(12)[:, None] % 6 < 3, 1.0, 1.2) * own
+    theta = np.concatenate([shapes, np.tile([10.0, 60.0], (12, 1)), own], axis=1)
+    together = built.predict(theta, PLAN)
+    monkeypatch.setattr(chain_module, "_MANY", N_FREE_FORM + 1)
+    alone = built.predict(theta, PLAN)
+    np.testing.assert_allclose(together, alone, atol=1e-9)
+    assert np.abs(np.diff(together, axis=0)).max(axis=1).min() > 0.01

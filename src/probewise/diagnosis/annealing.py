@@ -1,4 +1,4 @@
-"""Carry samples from Laplace's approximation to the posterior, by tempered sequential Monte Carlo.
+"""Carry samples from one density to another near it: by their weights, or by tempered sequential Monte Carlo.
 
 The densities between are q^(1 - beta) p^beta (Neal 2001). After each step of beta the samples are resampled by their
 weights and moved: each half by differences of the other half (ter Braak 2006), which leaves the density invariant.
@@ -14,9 +14,10 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["anneal"]
+__all__ = ["anneal", "by_weight"]
 
-_NEAR = 0.7  # share of the first samples that count, from which weights do and no move is needed
+_ENOUGH = 0.5  # share of what is wanted that shall be as good as independent
+_LEAST_OF_IT = 0.8  # of that
 _EFFECTIVE = 0.5  # share of the samples that still count after a step of beta
 _MOVES = 6  # of each sample after a step
 _LAST_MOVES = 12
@@ -24,45 +25,67 @@ _BETWEEN = 6  # moves from one harvest to the next
 _LEAST_STEP = 1e-3
 
 
-def anneal(
-    center: FloatArray,
-    factor: FloatArray,
+def by_weight(
+    first: FloatArray,
+    log_q: Callable[[FloatArray], FloatArray],
     log_p: Callable[[FloatArray], FloatArray],
     *,
-    n_walkers: int,
-    n_harvests: int,
+    n_wanted: int,
     rng: np.random.Generator,
-) -> FloatArray:
-    """Draw from a density near a normal one.
+) -> FloatArray | None:
+    """Draw from a density by the weights of samples of another one, where enough of them count.
 
     Parameters
     ----------
-    center, factor
-        The normal approximation: its mean (n_params,), and the transpose of a square root of its covariance.
-    log_p
-        Log density, unnormalised, (n, n_params) -> (n,); minus infinity where it cannot be.
-    n_walkers, n_harvests
-        Samples carried, even; and how often they are taken, some moves apart.
+    first
+        Samples of the other density in no order, (n_first, n_params): no more of them are weighed than it takes.
+    log_q, log_p
+        Log densities of the samples and of what is wanted, unnormalised, (n, n_params) -> (n,); `log_p` is minus
+        infinity where it cannot be.
+    n_wanted
+        Samples to draw, of which half shall be as good as independent.
     rng
         Source of randomness.
 
     Returns
     -------
-    Samples, (n_walkers n_harvests, n_params).
+    Samples in no order, (n_wanted, n_params); None where too few of `first` count.
     """
-    inverse = np.linalg.inv(factor)
+    gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
+    share = n_effective(gain) / len(gain)
+    enough = min(math.ceil(_ENOUGH * n_wanted / max(share, 1e-9)), len(first))
+    if enough > n_wanted:
+        more = first[n_wanted:enough]
+        gain = np.append(gain, log_p(more) - log_q(more))
+    if n_effective(gain) < _LEAST_OF_IT * _ENOUGH * n_wanted:
+        return None
+    rows = resampled(np.exp(gain - gain.max()), n_wanted, rng)
+    return np.asarray(first[rng.permutation(rows)])
 
-    def log_q(z: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 * np.sum(((z - center) @ inverse) ** 2, axis=1))
 
-    z = center + rng.standard_normal((n_walkers, len(center))) @ factor
-    heights = log_q(z), log_p(z)
-    wanted = n_walkers * n_harvests
-    if n_effective(heights[1] - heights[0]) >= _NEAR * n_walkers:
-        # The approximation is the posterior but for weights.
-        more = center + rng.standard_normal((2 * wanted - n_walkers, len(center))) @ factor
-        gain = np.concatenate([heights[1] - heights[0], log_p(more) - log_q(more)])
-        return np.asarray(np.concatenate([z, more])[resampled(np.exp(gain - gain.max()), wanted, rng)])
+def anneal(
+    first: FloatArray,
+    log_q: Callable[[FloatArray], FloatArray],
+    log_p: Callable[[FloatArray], FloatArray],
+    *,
+    n_wanted: int,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Draw from a density, setting out from samples of another one.
+
+    Parameters
+    ----------
+    first
+        Samples of the other density, (n_walkers, n_params), an even number.
+    log_q, log_p, n_wanted, rng
+        As in `by_weight`.
+
+    Returns
+    -------
+    Samples, (n_wanted, n_params): those carried on, taken as often as it takes, some moves apart.
+    """
+    n_walkers = len(first)
+    z, heights = first, (log_q(first), log_p(first))
     beta, scale = 0.0, 1.0
     while beta < 1.0:
         gain = heights[1] - heights[0]
@@ -72,11 +95,11 @@ def anneal(
         for _ in range(_MOVES if beta < 1.0 else _LAST_MOVES):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
     harvest = [z]
-    for _ in range(n_harvests - 1):
+    while len(harvest) * n_walkers < n_wanted:
         for _ in range(_BETWEEN):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
         harvest.append(z)
-    return np.concatenate(harvest)
+    return np.asarray(rng.permutation(np.concatenate(harvest))[:n_wanted])
 
 
 def _next_beta(gain: FloatArray, beta: float) -> float:

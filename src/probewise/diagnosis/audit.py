@@ -14,9 +14,10 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.commands import MOST_READINGS, commands, minutes_of, rescheduled
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, degrees_of_freedom
+from probewise.diagnosis.joining import join
 from probewise.effects import NamedEffect
 from probewise.recordings.patterns import Uniform
-from probewise.recordings.plan import Plan
+from probewise.recordings.plan import Plan, Recording
 
 __all__ = [
     "Alias",
@@ -180,21 +181,32 @@ def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect
         here = model.predict(z[None, :])[0] - null
         shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
     best = {pair.effects: (0.0, pair) for pair in pairs}
-    for description, plan in candidate_plans(found.model.plan):
-        null = replace_plan(found.model, plan).predict(found.z[None, :])[0]
-        there = {
-            name: (replace_plan(model, plan).predict(z[None, :])[0] - null) * scale
-            for name, (model, z, _, scale) in shapes.items()
-        }
+    plans = candidate_plans(found.model.plan)
+    if not (best and plans):
+        return list(pairs)
+    everywhere = _one_after_another([plan for _, plan in plans])
+    null = replace_plan(found.model, everywhere).predict(found.z[None, :])[0]
+    there = {
+        name: (replace_plan(model, everywhere).predict(z[None, :])[0] - null) * scale
+        for name, (model, z, _, scale) in shapes.items()
+    }
+    ends = np.cumsum([len(plan) for _, plan in plans])
+    for (description, plan), end in zip(plans, ends, strict=True):
+        rows = slice(end - len(plan), end)
         for first, second in best:
             sign = np.sign(float(shapes[first][2] @ shapes[second][2])) or 1.0
-            nats = 0.5 * float(np.sum((there[first] - sign * there[second]) ** 2)) / sd**2
-            per_reading = nats / len(plan)
+            apart = there[first][rows] - sign * there[second][rows]
+            per_reading = 0.5 * float(np.sum(apart**2)) / sd**2 / len(plan)
             if per_reading > best[first, second][0]:
                 readings = min(max(math.ceil(3.0 / per_reading), 1), MOST_READINGS)
                 advised = replace(best[first, second][1], settle_by=description, readings=readings)
                 best[first, second] = (per_reading, advised)
     return [alias for _, alias in best.values()]
+
+
+def _one_after_another(plans: Sequence[Plan]) -> Plan:
+    """Lay plans out as one, so that a model looks at all of them in one prediction."""
+    return join([Recording(plan, np.zeros(len(plan))) for plan in plans]).plan
 
 
 def covariance_of(found: Fit) -> FloatArray:

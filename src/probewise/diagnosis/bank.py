@@ -19,7 +19,7 @@ from probewise.diagnosis.noise import NoiseLaw
 __all__ = ["Bank"]
 
 _ABSENT = 1e-9  # share of a template's sum of squares, below which what a fit leaves of it is rounding
-_REMEMBERED = 3  # laws
+_REMEMBERED = 5  # laws, those asked for last
 
 
 @dataclass(eq=False)
@@ -56,6 +56,12 @@ class Bank:
     def _starts(self) -> IntArray:
         """First column of each template, (n_templates,)."""
         return np.cumsum(self.widths) - self.widths
+
+    @cached_property
+    def members(self) -> dict[str, IntArray]:
+        """Numbers of the templates of each label."""
+        labels = np.array(self.labels)
+        return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
 
     def take(self, members: IntArray) -> Bank:
         """Keep these templates."""
@@ -103,7 +109,9 @@ class Bank:
     def _under(self, law: NoiseLaw) -> _Whitened:
         """Whiten all templates and scale each to unit rms."""
         key = law.linear
-        if key not in self._whitened:
+        if key in self._whitened:
+            self._whitened[key] = self._whitened.pop(key)
+        else:
             if len(self._whitened) >= _REMEMBERED:
                 self._whitened.pop(next(iter(self._whitened)))
             whitened = law(self.columns)

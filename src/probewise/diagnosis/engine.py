@@ -11,6 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.audit import Alias, aliases, settle
+from probewise.diagnosis.averaging import over_hypotheses, over_orders, side_by_side
 from probewise.diagnosis.convergence import require_converged
 from probewise.diagnosis.coordinates import LEAST_READINGS
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
@@ -21,7 +22,7 @@ from probewise.diagnosis.locate import Place, global_p_value, places, places_of_
 from probewise.diagnosis.mending import corrected, improvement_of
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.reasons import reason_of
-from probewise.diagnosis.repaired import ModelSamples, doubted, over_orders, sample_model
+from probewise.diagnosis.repaired import ModelSamples, sample_model
 from probewise.diagnosis.rivals import next_readings
 from probewise.diagnosis.search import search
 from probewise.diagnosis.stating import effects_found, noise_found
@@ -48,6 +49,8 @@ _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _RUIN = -1.0  # nats a reading kept back, below which what was named repairs nothing
 _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
+_LEAST_OF_A_RIVAL = 0.05  # probability of a hypothesis, below which the model does without it
+_MOST_RIVALS = 4  # hypotheses in one model
 _FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
 
 
@@ -172,9 +175,10 @@ class _Diagnoser:
         samples = self._sample(best, noise_of)
         written = samples
         if verdict == "unknown" and best is not null:
-            plain = self._sample_of(self.search.candidates[best.n_gaussians, ()], noise_of)
             share = max(1 - self.search.by_mean[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
-            written = doubted(samples, plain, best.found.model.effects, share, rng=self.rng)
+            written = self._averaged(best, samples, {best.names: 1 - share, (): share}, noise_of)
+        elif verdict in ("named", "cannot_tell") and best is not null:
+            written = self._averaged(best, samples, self.search.by_mean, noise_of)
         null_samples = samples if best is null else self._sample(null, noise_of)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
         where = self._where(null, problem, draws, best, effects, p_value)
@@ -291,6 +295,31 @@ class _Diagnoser:
         parts = [self._sample_of(c, noise) for c in itertools.compress(alike, kept)]
         return over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
 
+    def _averaged(
+        self, best: Candidate, samples: ModelSamples, probabilities: Mapping[Names, float], noise: Names
+    ) -> ModelSamples:
+        """Mix the samples of the best candidate with those of its rivals, by probability, as far as one model can."""
+        form = best.found.model.sensor.exchangeable
+        kept = [(samples, best, probabilities[best.names])]
+        for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
+            options = [
+                c
+                for (_, key), c in self.search.candidates.items()
+                if key == names and c.found.model.sensor.exchangeable == form
+            ]
+            rival = max(options, key=lambda c: c.evidence[noise].log_z, default=None)
+            if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST_RIVALS:
+                break
+            if rival is not None and all(
+                side_by_side(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept
+            ):
+                kept.append((self._sample(rival, noise), rival, probabilities[names]))
+        if len(kept) == 1:
+            return samples
+        sensor = self.search.sensors[max(part.n_gaussians for part, _, _ in kept)]
+        parts, shares = [part for part, _, _ in kept], np.array([p for _, _, p in kept])
+        return over_hypotheses(parts, shares, sensor, self.recording.plan, rng=self.rng)
+
     def _sample_of(self, candidate: Candidate, noise: Names) -> ModelSamples:
         evidence = candidate.evidence[noise]
         return sample_model(candidate.found, evidence, self.recording, weights=candidate.weights, rng=self.rng)
@@ -307,7 +336,7 @@ class _Diagnoser:
         for name, effect in self.built.items():
             if name in self.noise_names or name in UNNAMED:
                 continue
-            templates = self.search.templates.of(found, effect)
+            templates = self.search.templates.of(self.search.about, effect.coarse())
             blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
             scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
             best = int(np.argmax(scores))

@@ -85,8 +85,11 @@ class JointProblem:
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Predict all readings and weigh the usable ones under each law kept: (n_samples, n_params) -> (n_samples,)."""
         usable = self.recording.usable
-        predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
-        residuals = (self.recording.readings[usable] - predicted).T
+        return self.log_likelihood_of(self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable])
+
+    def log_likelihood_of(self, predicted: FloatArray) -> FloatArray:
+        """Weigh predictions of the usable readings, (n_samples, n_usable) -> (n_samples,)."""
+        residuals = (self.recording.readings[self.recording.usable] - predicted).T
         laid_out, log_share = self.noise.laid_out, -math.log(float(self.noise.weights[self._kept].sum()))
         terms = [
             laid_out.log_weights[node] + _log_likelihood(laid_out.laws[node], residuals, self.sd_floor)

@@ -119,7 +119,8 @@ class NoiseModel:
         sd = level.sd[min(node, len(level.sd) - 1)]
         sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
         lost_share = at(level.lost_share)
-        lost = far & np.isclose(self._readings, at(level.lost_value), rtol=1e-9, atol=1e-9) & (lost_share > 0)
+        value = at(level.lost_value)
+        lost = far & (np.abs(self._readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
         carry = np.where(self._steps > 0, at(level.rho) ** np.maximum(self._steps, 1), 0.0)
         carry[lost] = 0.0
         carry[1:][lost[:-1]] = 0.0

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, cast
 
@@ -14,22 +14,24 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.diagnosis.annealing import anneal
+from probewise.diagnosis.annealing import anneal, by_weight
 from probewise.diagnosis.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joint import JointProblem
 from probewise.diagnosis.null import Predictor
+from probewise.diagnosis.quadratic import Quadratic
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
 from probewise.sensor import ACCURATE_NODES
 
-__all__ = ["ModelSamples", "doubted", "over_orders", "sample_model"]
+__all__ = ["ModelSamples", "sample_model"]
 
 N_SAMPLES = 500
 N_WALKERS = 250
+_N_NEAR = 1500  # samples of what stands in for the posterior, which cost next to nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,103 +150,50 @@ def sample_model(
     return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)
 
 
-def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
-    """Mix samples of one hypothesis at several SSF orders by their probability.
-
-    All are written at the largest order: a Gaussian in two equal halves is the same Gaussian.
-
-    Parameters
-    ----------
-    parts
-        Samples of each order, as many of each.
-    weights
-        Probability of each order, (n_parts,).
-    rng
-        Source of randomness.
-    """
-    largest = max(parts, key=lambda part: part.n_gaussians)
-    n = len(largest.theta)
-    counts = rng.multinomial(n, weights)
-    order = rng.permutation(n)
-    theta = [
-        _halved(part.theta[:count], part.n_gaussians, largest.n_gaussians)
-        for part, count in zip(parts, counts, strict=True)
-    ]
-    noise_sd = [part.noise_sd[:count] for part, count in zip(parts, counts, strict=True)]
-    return replace(largest, theta=np.concatenate(theta)[order], noise_sd=np.concatenate(noise_sd)[order])
-
-
-def doubted(
-    repaired: ModelSamples,
-    plain: ModelSamples,
-    effects: Sequence[NamedEffect[Any]],
-    share: float,
-    *,
-    rng: np.random.Generator,
-) -> ModelSamples:
-    """Let a share of the samples be those of the plain sensor, every effect's amplitudes 0 there.
-
-    Where it is not certain what is missing, a repair may fail in scans unlike those that it comes from; then the
-    plain sensor's samples are what keeps a prediction from being sure and wrong.
-
-    Parameters
-    ----------
-    repaired, plain
-        Samples with effects and without, `plain` of no more Gaussians, as many of each.
-    effects
-        Those on the mean.
-    share
-        Probability that it is none of these effects.
-    rng
-        Source of randomness.
-    """
-    absent = [f"{e.name}.{e.prior.names[k]}" for e in effects for k in e.amplitudes]
-    if not all(effect.amplitudes for effect in effects):  # nothing says how such an effect is absent
-        return repaired
-    rows = np.flatnonzero(rng.random(len(repaired.theta)) < share)
-    theta, n_sensor = repaired.theta.copy(), 6 * repaired.n_gaussians + 2
-    theta[rows, :n_sensor] = _halved(plain.theta[rows], plain.n_gaussians, repaired.n_gaussians)[:, :n_sensor]
-    for name in absent:
-        theta[rows, list(repaired.chain.names).index(name)] = 0.0
-    noise_sd = repaired.noise_sd.copy()
-    noise_sd[rows] = plain.noise_sd[rows]
-    return replace(repaired, theta=theta, noise_sd=noise_sd)
-
-
-def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
-    """Write each sample's mixture with more Gaussians, by halving the heaviest."""
-    blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
-    rows = np.arange(len(theta))
-    for _ in range(wanted - n_gaussians):
-        mass = blocks[..., 0] / np.sqrt(blocks[..., 3] * blocks[..., 4] - blocks[..., 5] ** 2)
-        half = blocks[rows, np.argmax(mass, axis=1)].copy()
-        half[:, 0] /= 2
-        blocks = np.concatenate([blocks, half[:, None, :]], axis=1)
-        blocks[rows, np.argmax(mass, axis=1), 0] /= 2
-    return np.concatenate([blocks.reshape(len(theta), 6 * wanted), theta[:, 6 * n_gaussians :]], axis=1)
-
-
 def _posterior_draws(
     found: Fit, noise: NoiseEvidence, recording: Recording, floor: float, annealed: bool, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then annealed."""
-    law = noise.law
+    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then carried to the posterior."""
+    law, model = noise.law, found.model
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
     sigma = law.scale(whitened)
-    variance = max(float(sigma[0]) ** 2 / law.information, 1e-300)
-    curvature = turned.T @ turned / variance + np.eye(len(found.z))
-    factor = np.linalg.inv(np.linalg.cholesky(curvature))
+    sd = max(float(sigma[0]) / math.sqrt(law.information), 1e-150)
+    curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
+    # A step in a coordinate moves those behind it too, none before it. With the effects' first and the sensor's last,
+    # most steps leave the SSF's geometry alone, which a prediction of many at once makes use of.
+    order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
+    steps = np.empty_like(curvature)
+    steps[np.ix_(order, order)] = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(order, order)][::-1, ::-1]))[
+        ::-1, ::-1
+    ]
     normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
-    center = found.z + np.linalg.solve(curvature, turned.T @ normal / variance - found.z)
+    center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
+    draws = center + rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center))) @ steps
     if not annealed:
-        return np.asarray(center + rng.standard_normal((N_SAMPLES, len(center))) @ factor)
-    problem = JointProblem(found.model, recording, noise.at_best, floor)
+        return np.asarray(draws)
+    problem, usable = JointProblem(model, recording, noise.at_best, floor), recording.usable
+    quadratic = Quadratic.of(lambda z: model.predict(z)[:, usable], center, steps, sd)
 
-    def log_p(z: FloatArray) -> FloatArray:
+    def bounded(z: FloatArray, log_likelihood: FloatArray) -> FloatArray:
         inside = (np.abs(z) < FARTHEST).all(axis=1)
-        return np.where(inside, problem.prior.log_prob(z) + problem.log_likelihood(z), -np.inf)
+        return np.where(inside, problem.prior.log_prob(z) + log_likelihood, -np.inf)
 
-    return anneal(center, factor, log_p, n_walkers=N_WALKERS, n_harvests=N_SAMPLES // N_WALKERS, rng=rng)
+    def of_laplace(z: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * np.sum(((z - center) @ quadratic.inverse) ** 2, axis=1))
+
+    def of_quadratic(z: FloatArray) -> FloatArray:
+        return bounded(z, problem.log_likelihood_of(quadratic(z)))
+
+    def of_posterior(z: FloatArray) -> FloatArray:
+        return bounded(z, problem.log_likelihood(z))
+
+    near = by_weight(draws, of_laplace, of_quadratic, n_wanted=_N_NEAR, rng=rng)
+    if near is None:
+        near = anneal(draws[:N_WALKERS], of_laplace, of_quadratic, n_wanted=_N_NEAR, rng=rng)
+    found_all = by_weight(near, of_quadratic, of_posterior, n_wanted=N_SAMPLES, rng=rng)
+    if found_all is None:
+        found_all = anneal(near[:N_WALKERS], of_quadratic, of_posterior, n_wanted=N_SAMPLES, rng=rng)
+    return found_all
 
 
 def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:

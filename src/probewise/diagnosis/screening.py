@@ -23,13 +23,14 @@ _BEST_ENTRIES = 2  # of each effect's bank, for pairs
 
 def log_mean(scores: FloatArray) -> float:
     """Average Bayes factors, given and returned as logs."""
-    return float(logsumexp(scores)) - math.log(len(scores))
+    top = float(scores.max())  # thousands of short lists: a library's care for every case takes ten times as long
+    return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
 
 
 def score_effects(problem: Linearised, bank: Bank) -> dict[str, FloatArray]:
     """Weigh each entry of each effect's bank, labelled by its name: name -> log Bayes factors (n_entries,)."""
-    scores, names = bank.log_bayes_factors(problem)[:, 0], np.array(bank.labels)
-    return {name: scores[names == name] for name in dict.fromkeys(bank.labels)}
+    scores = bank.log_bayes_factors(problem)[:, 0]
+    return {name: scores[members] for name, members in bank.members.items()}
 
 
 def score_unknown(problem: Linearised, bases: Bank) -> dict[str, float]:

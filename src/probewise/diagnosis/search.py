@@ -128,6 +128,7 @@ class _Searcher:
         self._null_fits()
         self._pair_noises()
         null = max(self._nulls(), key=lambda c: c.log_z)
+        self.about = null.found
         level = null.found.predicted
         model, z = null.found.model, null.found.z[None, :]
         slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[self.usable]
@@ -166,6 +167,7 @@ class _Searcher:
                 self.covariates,
                 self.bases,
                 self.unknown_shares,
+                self.about,
                 self.templates,
             )
         )
@@ -358,9 +360,8 @@ class _Searcher:
             grown = [c for c in grown if c.log_z > best_grown - _WORTH_GROWING]
 
     def _wish(self, parent: Candidate, wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
-        """Screen every effect that a fit does not hold yet, by its templates about the null."""
-        null = self.candidates[parent.n_gaussians, ()]
-        bank = self.templates.bank(null.found, list(self.mean_effects.values()))
+        """Screen every effect that a fit does not hold yet, by its templates about the best null."""
+        bank = self.templates.bank(self.about, list(self.mean_effects.values()))
         against = 0.0 if parent.names else self._coincidence(parent.worth)
         for noise, evidence in parent.steering():
             scores = score_effects(Linearised.of(parent.found, evidence.law), bank)

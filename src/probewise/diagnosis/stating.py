@@ -98,7 +98,7 @@ def _too_small(
     null = search.candidates[search.order, ()]
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(null.found, best.law)
-    templates = search.templates.of(null.found, effect)
+    templates = search.templates.of(search.about, effect.coarse())
     middle = len(templates.columns) // 2
     effect = templates.variant(middle)
     values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))

@@ -117,6 +117,7 @@ class Search:
     covariates: tuple[Covariate, ...]
     unknown_bases: Bank
     unknown_shares: Mapping[str, float]
+    about: Fit  # where the templates that screen and test are laid out
     templates: TemplateMemory
     probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
     order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
@@ -153,10 +154,14 @@ class Search:
         return max(scores, key=lambda names: scores[names], default=())
 
     def looks(self, found: Fit) -> list[Bank]:
-        """List every template that a test looks at about a fit."""
+        """List every template that a test looks at about a fit: of the effects that it lacks, and the unknown.
+
+        All are laid out about one fit: those of one recording predict much the same, and which templates a test looks
+        with is its own choice.
+        """
         on_mean = [effect for effect in self.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]
-        return [self.templates.bank(found, missing), self.unknown_bases]
+        return [self.templates.bank(self.about, missing), self.unknown_bases]
 
     @property
     def order(self) -> int:

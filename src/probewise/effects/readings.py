@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -74,6 +75,11 @@ class Lag(NamedEffect[FloatArray]):
     units: ClassVar[tuple[str, ...]] = ("s",)
     covariates: ClassVar[tuple[str, ...]] = ("slope", "direction")
     amplitudes: ClassVar[tuple[int, ...]] = ()
+
+    @property
+    def nothing(self) -> Mapping[int, float]:
+        """A time constant of which nothing is left at the next reading."""
+        return {0: 1e-3 * self.shortest_s}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

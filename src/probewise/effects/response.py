@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -30,6 +31,11 @@ class Nonlinearity(NamedEffect[FloatArray]):
     units: ClassVar[tuple[str, ...]] = ("1",)
     covariates: ClassVar[tuple[str, ...]] = ("level",)
     amplitudes: ClassVar[tuple[int, ...]] = ()
+
+    @property
+    def nothing(self) -> Mapping[int, float]:
+        """An exponent of one."""
+        return {0: 1.0}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -35,6 +36,11 @@ class Saturation(NamedEffect[FloatArray]):
     units: ClassVar[tuple[str, ...]] = ("reading", "reading")
     covariates: ClassVar[tuple[str, ...]] = ("level",)
     amplitudes: ClassVar[tuple[int, ...]] = ()
+
+    @property
+    def nothing(self) -> Mapping[int, float]:
+        """A level out of reach, of whatever softness."""
+        return {0: self.highest + 100 * self.softest}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, Self, TypeVar
 
@@ -50,6 +51,14 @@ class NamedEffect(Effect[V], Protocol[V]):
     def amplitudes(self) -> tuple[int, ...]:
         """Which parameters are amplitudes: the readings change in proportion to first order, 0 means absent."""
         ...
+
+    @property
+    def nothing(self) -> Mapping[int, float] | None:
+        """Values of parameters, by number, at which it does nothing; None where no setting says that.
+
+        By default all amplitudes 0.
+        """
+        return dict.fromkeys(self.amplitudes, 0.0) or None
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

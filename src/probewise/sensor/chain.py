@@ -17,7 +17,7 @@ from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
 from probewise.sensor.commanded import height_ratio, is_commanded, light_of, raised_as_commanded
 from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, Spot, seen_by_one, turned
-from probewise.sensor.ssf import FieldSSF, SSFModel
+from probewise.sensor.ssf import FieldSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
     Footprint,
@@ -31,6 +31,9 @@ from probewise.sensor.stages import (
 from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 
 __all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "response"]
+
+_MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
+_FEW = 8  # hypotheses, of which all Gaussians are seen at once even where no geometry is shared
 
 
 class Levels(Protocol):
@@ -184,8 +187,29 @@ class Chain:
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = raised_as_commanded(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
-        seen = response(layout, footprint, n_nodes=self.n_nodes)
+        geometries = self._geometries(theta) if footprint.weight.shape[1] == 1 else None
+        if geometries is None:
+            seen = response(layout, footprint, n_nodes=self.n_nodes)
+        else:
+            alone = self._layout_of(theta[geometries.first].repeat(footprint.weight.shape[2], axis=0), plan)
+            seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
+
+    def _geometries(self, theta: FloatArray) -> _Geometries | None:
+        """Find hypotheses that differ in the amounts of many Gaussians alone; None where there is no gain in that."""
+        if not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY:
+            return None
+        own = np.ones(theta.shape[1], dtype=np.bool_)
+        n_ssf = len(self.ssf.names)
+        own[:n_ssf:6] = False
+        own[n_ssf : n_ssf + len(self.levels.names)] = False
+        for effect, columns in self._columns:
+            own[columns] = effect.stage <= Stage.FOOTPRINT
+        numbers: dict[bytes, int] = {}  # of the geometries, in order of their first hypothesis
+        which = np.array([numbers.setdefault(row.tobytes(), len(numbers)) for row in theta[:, own]])
+        if 2 * len(numbers) > len(theta) > _FEW:
+            return None
+        return _Geometries(np.unique(which, return_index=True)[1], which)
 
     def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
         """Lay out the scene under the poses; where no hypothesis changes either, once for a plan."""
@@ -240,9 +264,6 @@ class Chain:
             start, end = end, end + len(effect.prior.names)
             pairs.append((effect, slice(start, end)))
         return pairs
-
-
-_MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,13 +341,6 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     -------
     R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
     """
-    shared = _by_geometry(layout, footprint)
-    if shared is not None:
-        alone, which = shared
-        n_gaussians = footprint.weight.shape[2]
-        each = response(*alone, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
-        weight = np.broadcast_to(footprint.weight[:, 0], (len(which), n_gaussians))
-        return np.stack([row @ each[at] for row, at in zip(weight, which, strict=True)])
     out = np.zeros(
         (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
     )
@@ -344,41 +358,39 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     return out
 
 
-def _by_geometry(layout: Layout, footprint: Footprint) -> tuple[tuple[Layout, Footprint], IntArray] | None:
-    """Find hypotheses that differ in the weights of many Gaussians alone: a response is linear in those.
+@dataclass(frozen=True, eq=False)
+class _Geometries:
+    """Hypotheses that differ in the amounts of their Gaussians alone: what is seen is linear in those.
 
-    Returns
-    -------
-    A layout and a footprint with one Gaussian a hypothesis, all Gaussians of each geometry in turn, and which geometry
-    is each hypothesis', (n_samples,); None where that is no gain.
+    `first` hypothesis of each geometry, (n_geometries,), and `which` is each hypothesis', (n_samples,).
     """
-    n_gaussians, poses = footprint.weight.shape[2], layout.poses
-    if n_gaussians < _MANY or footprint.weight.shape[1] > 1 or any(r.n_regions > 1 for _, r in layout.parts):
-        return None
-    places = (poses.x_mm, poses.y_mm, poses.orientation_rad)
-    n_samples = max(len(a) for a in (footprint.weight, *footprint.moments, *places))
-    varying = [a.reshape(n_samples, -1) for a in (*footprint.moments, *places) if len(a) == n_samples > 1]
-    if n_samples == 1 or not varying:
-        return None
-    numbers: dict[bytes, int] = {}  # of the geometries, in order of their first hypothesis
-    rows = np.concatenate(varying, axis=1)
-    which = np.array([numbers.setdefault(row.tobytes(), len(numbers)) for row in rows])
-    if 2 * len(numbers) > n_samples:
-        return None
-    first = np.unique(which, return_index=True)[1]
 
-    def each(array: FloatArray) -> FloatArray:
-        """One Gaussian a hypothesis: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
-        own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[first]
-        return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
+    first: IntArray
+    which: IntArray
 
-    def placed(array: FloatArray) -> FloatArray:
-        return array if len(array) == 1 else array[first].repeat(n_gaussians, axis=0)
+    def response(self, layout: Layout, footprint: Footprint, *, n_nodes: int) -> FloatArray:
+        """Integrate as `response` does, each Gaussian of each geometry once, as a hypothesis of its own.
 
-    footprints = Footprint(np.ones((len(first) * n_gaussians, 1, 1)), *map(each, footprint.moments))
-    still = all(len(a) == 1 for a in places)
-    there = layout if still else Layout(layout.regions, Poses(*map(placed, places)), layout.plan)
-    return (there, footprints), which
+        Parameters
+        ----------
+        layout
+            What lies under each of these: that of each geometry in turn, as many times as there are Gaussians.
+        footprint
+            Of all hypotheses, its weights the same at every reading.
+        n_nodes
+            Nodes of the quadrature over curved edges.
+        """
+        n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
+
+        def each(array: FloatArray) -> FloatArray:
+            """One Gaussian a hypothesis: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
+            own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[self.first]
+            return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
+
+        one_each = Footprint(np.ones((len(self.first) * n_gaussians, 1, 1)), *map(each, footprint.moments))
+        parts = response(layout, one_each, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
+        weight = np.broadcast_to(footprint.weight[:, 0], (n_samples, n_gaussians))
+        return np.stack([own @ parts[at] for own, at in zip(weight, self.which, strict=True)])
 
 
 def _discrete_response(layout: Layout, ssf: FieldSSF) -> FloatArray:

@@ -18,7 +18,7 @@ def normal(center, factor, n, rng):
 def drawn(center, factor, log_p, seed, n_walkers=400, n_wanted=800):
     rng = np.random.default_rng(seed)
     first, log_q = normal(np.array(center), np.array(factor), n_walkers, rng)
-    return anneal(first, log_q, log_p, n_wanted=n_wanted, rng=rng)
+    return anneal(first, log_q, log_p, n_moves=6, n_wanted=n_wanted, rng=rng)
 
 
 def test_a_wrong_approximation_is_put_right():

@@ -8,27 +8,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["anneal", "by_weight"]
+__all__ = ["Density", "anneal", "by_weight"]
 
 _ENOUGH = 0.5  # share of what is wanted that shall be as good as independent
-_LEAST_OF_IT = 0.8  # of that
+_LEAST_OF_IT = 0.5  # of that
 _EFFECTIVE = 0.5  # share of the samples that still count after a step of beta
-_MOVES = 6  # of each sample after a step
-_LAST_MOVES = 12
-_BETWEEN = 6  # moves from one harvest to the next
+_AT_LAST = 3  # times as many moves when the density itself is reached
 _LEAST_STEP = 1e-3
+
+Density: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Log densities of samples, unnormalised, (n, n_params) -> (n,)."""
 
 
 def by_weight(
     first: FloatArray,
-    log_q: Callable[[FloatArray], FloatArray],
-    log_p: Callable[[FloatArray], FloatArray],
+    log_q: Density,
+    log_p: Density,
     *,
     n_wanted: int,
     rng: np.random.Generator,
@@ -43,7 +45,7 @@ def by_weight(
         Log densities of the samples and of what is wanted, unnormalised, (n, n_params) -> (n,); `log_p` is minus
         infinity where it cannot be.
     n_wanted
-        Samples to draw, of which half shall be as good as independent.
+        Samples to draw, of which half shall be as good as independent, a quarter at least.
     rng
         Source of randomness.
 
@@ -54,6 +56,8 @@ def by_weight(
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
     share = n_effective(gain) / len(gain)
     enough = min(math.ceil(_ENOUGH * n_wanted / max(share, 1e-9)), len(first))
+    if share * len(first) < _LEAST_OF_IT * _ENOUGH * n_wanted:
+        return None
     if enough > n_wanted:
         more = first[n_wanted:enough]
         gain = np.append(gain, log_p(more) - log_q(more))
@@ -65,9 +69,10 @@ def by_weight(
 
 def anneal(
     first: FloatArray,
-    log_q: Callable[[FloatArray], FloatArray],
-    log_p: Callable[[FloatArray], FloatArray],
+    log_q: Density,
+    log_p: Density,
     *,
+    n_moves: int,
     n_wanted: int,
     rng: np.random.Generator,
 ) -> FloatArray:
@@ -79,6 +84,8 @@ def anneal(
         Samples of the other density, (n_walkers, n_params), an even number.
     log_q, log_p, n_wanted, rng
         As in `by_weight`.
+    n_moves
+        Moves of each sample after a step of beta, and from one harvest to the next.
 
     Returns
     -------
@@ -92,11 +99,11 @@ def anneal(
         after = _next_beta(gain, beta)
         kept = resampled(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
-        for _ in range(_MOVES if beta < 1.0 else _LAST_MOVES):
+        for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
     harvest = [z]
     while len(harvest) * n_walkers < n_wanted:
-        for _ in range(_BETWEEN):
+        for _ in range(n_moves):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
         harvest.append(z)
     return np.asarray(rng.permutation(np.concatenate(harvest))[:n_wanted])
@@ -119,8 +126,8 @@ def _moved(
     heights: tuple[FloatArray, FloatArray],
     beta: float,
     scale: float,
-    log_q: Callable[[FloatArray], FloatArray],
-    log_p: Callable[[FloatArray], FloatArray],
+    log_q: Density,
+    log_p: Density,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
     """Move one half by differences of the other, then the other by the first's; adapt the step's length."""

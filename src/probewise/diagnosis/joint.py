@@ -16,7 +16,7 @@ from probewise.diagnosis.fit import Model
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["JointProblem", "StandardNormal"]
+__all__ = ["JointProblem", "StandardNormal", "log_likelihood_of_whitened"]
 
 _HELD = 0.999  # of the evidence by the nodes of the noise that are kept; the rest is made up for
 
@@ -85,15 +85,12 @@ class JointProblem:
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Predict all readings and weigh the usable ones under each law kept: (n_samples, n_params) -> (n_samples,)."""
         usable = self.recording.usable
-        return self.log_likelihood_of(self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable])
-
-    def log_likelihood_of(self, predicted: FloatArray) -> FloatArray:
-        """Weigh predictions of the usable readings, (n_samples, n_usable) -> (n_samples,)."""
-        residuals = (self.recording.readings[self.recording.usable] - predicted).T
+        predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
+        residuals = (self.recording.readings[usable] - predicted).T
         laid_out, log_share = self.noise.laid_out, -math.log(float(self.noise.weights[self._kept].sum()))
         terms = [
-            laid_out.log_weights[node] + _log_likelihood(laid_out.laws[node], residuals, self.sd_floor)
-            for node in self._kept
+            laid_out.log_weights[node] + log_likelihood_of_whitened(law, law(residuals), self.sd_floor)
+            for node, law in ((node, laid_out.laws[node]) for node in self._kept)
         ]
         out = np.asarray(logsumexp(terms, axis=0)) + log_share
         return np.where(np.isfinite(out), out, -np.inf)
@@ -107,10 +104,9 @@ class JointProblem:
         return kept
 
 
-def _log_likelihood(law: NoiseLaw, residuals: FloatArray, sd_floor: float) -> FloatArray:
-    """Log likelihood of residuals (n_points, n_samples) under one law, log sd integrated out: (n_samples,)."""
+def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray, sd_floor: float) -> FloatArray:
+    """Log likelihood of whitened residuals (n_points, n_samples) under one law, log sd integrated out: (n_samples,)."""
     n_points = law.n_points
-    whitened = law(residuals)
     sigma = law.scale(whitened, floor=sd_floor)
     curvature = law.tail.scale_curvature(whitened, sigma, n_points) if law.share else 2.0 * n_points
     peak = -law.misfit(whitened, sigma, floor=sd_floor) - 0.5 * n_points * math.log(2 * math.pi)

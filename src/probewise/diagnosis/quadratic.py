@@ -20,57 +20,49 @@ _NEGLIGIBLE = 0.02  # noise sd, over all readings together: less of a change at 
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """Second-order predictions of the usable readings.
+    """Second-order predictions at `e` steps from a point, (n_samples, n_params) of them.
 
-    `inverse` (n_params, n_params) turns a move from `center` into steps; `predicted` (n_points,) are the predictions
-    there; products of steps, one and by pairs, times `amounts` (n_terms, n_changes) are amounts of the orthonormal
-    `changes` (n_changes, n_points).
+    Predictions there, `center` (n_points,), and amounts of the orthonormal `changes` (n_changes, n_points), which are
+    products of steps, single and by `pairs`, times `shares` (n_terms, n_changes).
     """
 
     center: FloatArray
-    inverse: FloatArray
     pairs: tuple[IntArray, IntArray]
-    predicted: FloatArray
-    amounts: FloatArray
+    shares: FloatArray
     changes: FloatArray
 
     @classmethod
-    def of(
-        cls, predict: Callable[[FloatArray], FloatArray], center: FloatArray, steps: FloatArray, sd: float
-    ) -> Quadratic:
-        """Lay out.
+    def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> Quadratic:
+        """Lay out: it is exact at every single step, back and forth, and at the sum of any two.
 
         Parameters
         ----------
         predict
-            The model, (n_samples, n_params) -> (n_samples, n_points).
-        center
-            About which, (n_params,).
-        steps
-            One a row, (n_params, n_params); it is exact at each, back and forth, and at the sum of any two.
+            The model at so many steps, (n_samples, n_params) -> (n_samples, n_points).
+        n_params
+            Number of parameters, one step each.
         sd
             Noise of a reading.
         """
-        p = len(center)
-        first, second = np.triu_indices(p)
+        first, second = np.triu_indices(n_params)
         apart = first != second
-        z = np.concatenate([np.zeros((1, p)), steps, -steps, steps[first[apart]] + steps[second[apart]]])
-        y = predict(center + z)
-        here, up, down, both = y[0], y[1 : p + 1] - y[0], y[p + 1 : 2 * p + 1] - y[0], y[2 * p + 1 :] - y[0]
-        terms = np.empty((len(first), y.shape[1]))
-        terms[~apart] = 0.5 * (up + down)
-        terms[apart] = both - up[first[apart]] - up[second[apart]]
-        terms = np.concatenate([0.5 * (up - down), terms])
-        squares, axes = np.linalg.eigh(terms @ terms.T)
-        kept = squares > (_NEGLIGIBLE * sd) ** 2
-        lengths = np.sqrt(squares[kept])
-        inverse = np.asarray(np.linalg.inv(steps), dtype=np.float64)
-        amounts, changes = axes[:, kept] * lengths, (axes[:, kept] / lengths).T @ terms
-        return cls(center, inverse, (first, second), here, amounts, changes)
+        one = np.eye(n_params)
+        y = predict(np.concatenate([np.zeros((1, n_params)), one, -one, one[first[apart]] + one[second[apart]]]))
+        up, down, both = y[1 : n_params + 1] - y[0], y[n_params + 1 : 2 * n_params + 1] - y[0], y[2 * n_params + 1 :]
+        squares = np.empty((len(first), y.shape[1]))
+        squares[~apart] = 0.5 * (up + down)
+        squares[apart] = both - y[0] - up[first[apart]] - up[second[apart]]
+        terms = np.concatenate([0.5 * (up - down), squares])
+        lengths, axes = np.linalg.eigh(terms @ terms.T)
+        kept = lengths > (_NEGLIGIBLE * sd) ** 2
+        root = np.sqrt(lengths[kept])
+        return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
 
-    def __call__(self, z: FloatArray) -> FloatArray:
-        """Predict the usable readings, (n_samples, n_params) -> (n_samples, n_points)."""
-        e = (z - self.center) @ self.inverse
+    def amounts(self, e: FloatArray) -> FloatArray:
+        """Give the amount of each change, (n_samples, n_changes)."""
         first, second = self.pairs
-        products = np.concatenate([e, e[:, first] * e[:, second]], axis=1)
-        return np.asarray(self.predicted + (products @ self.amounts) @ self.changes)
+        return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)
+
+    def __call__(self, e: FloatArray) -> FloatArray:
+        """Predict, (n_samples, n_points)."""
+        return np.asarray(self.center + self.amounts(e) @ self.changes)

@@ -14,13 +14,14 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.diagnosis.annealing import anneal, by_weight
+from probewise.diagnosis.annealing import Density, anneal, by_weight
 from probewise.diagnosis.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joint import JointProblem
 from probewise.diagnosis.null import Predictor
 from probewise.diagnosis.quadratic import Quadratic
+from probewise.diagnosis.surrogate import Surrogate
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.recordings import fingerprint
@@ -31,7 +32,10 @@ __all__ = ["ModelSamples", "sample_model"]
 
 N_SAMPLES = 500
 N_WALKERS = 250
-_N_NEAR = 1500  # samples of what stands in for the posterior, which cost next to nothing
+_MOVES = 6  # of samples of the posterior after a step
+# What stands in for it costs next to nothing.
+_N_NEAR = 2000
+_MOVES_NEAR = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,32 +172,29 @@ def _posterior_draws(
     ]
     normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
-    draws = center + rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center))) @ steps
+    draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
-        return np.asarray(draws)
+        return np.asarray(center + draws @ steps)
     problem, usable = JointProblem(model, recording, noise.at_best, floor), recording.usable
-    quadratic = Quadratic.of(lambda z: model.predict(z)[:, usable], center, steps, sd)
+    quadratic = Quadratic.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
+    near = Surrogate.of(quadratic, center, steps, recording.readings[usable], law, floor)
 
-    def bounded(z: FloatArray, log_likelihood: FloatArray) -> FloatArray:
-        inside = (np.abs(z) < FARTHEST).all(axis=1)
-        return np.where(inside, problem.prior.log_prob(z) + log_likelihood, -np.inf)
+    def of_laplace(e: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * np.sum(e**2, axis=1))
 
-    def of_laplace(z: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 * np.sum(((z - center) @ quadratic.inverse) ** 2, axis=1))
+    def of_posterior(e: FloatArray) -> FloatArray:
+        z = center + e @ steps
+        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
+        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    def of_quadratic(z: FloatArray) -> FloatArray:
-        return bounded(z, problem.log_likelihood_of(quadratic(z)))
+    def carried(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
+        weighed = by_weight(first, log_q, log_p, n_wanted=n, rng=rng)
+        if weighed is not None:
+            return weighed
+        return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng)
 
-    def of_posterior(z: FloatArray) -> FloatArray:
-        return bounded(z, problem.log_likelihood(z))
-
-    near = by_weight(draws, of_laplace, of_quadratic, n_wanted=_N_NEAR, rng=rng)
-    if near is None:
-        near = anneal(draws[:N_WALKERS], of_laplace, of_quadratic, n_wanted=_N_NEAR, rng=rng)
-    found_all = by_weight(near, of_quadratic, of_posterior, n_wanted=N_SAMPLES, rng=rng)
-    if found_all is None:
-        found_all = anneal(near[:N_WALKERS], of_quadratic, of_posterior, n_wanted=N_SAMPLES, rng=rng)
-    return found_all
+    e = carried(draws, of_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
+    return center + carried(e, near.log_density, of_posterior, _MOVES, N_SAMPLES) @ steps
 
 
 def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:

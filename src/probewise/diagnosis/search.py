@@ -360,8 +360,9 @@ class _Searcher:
             grown = [c for c in grown if c.log_z > best_grown - _WORTH_GROWING]
 
     def _wish(self, parent: Candidate, wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
-        """Screen every effect that a fit does not hold yet, by its templates about the best null."""
-        bank = self.templates.bank(self.about, list(self.mean_effects.values()))
+        """Screen every effect that a fit does not hold yet, by its templates about the null of the same SSF."""
+        null = self.candidates[parent.n_gaussians, ()]
+        bank = self.templates.bank(null.found, list(self.mean_effects.values()))
         against = 0.0 if parent.names else self._coincidence(parent.worth)
         for noise, evidence in parent.steering():
             scores = score_effects(Linearised.of(parent.found, evidence.law), bank)

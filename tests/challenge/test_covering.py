@@ -37,6 +37,10 @@ def test_a_scan_overlaps_with_the_scans_of_its_mounting():
     region = Region("scan", scans=("a", "b"))
     assert place_overlap(region, [place("scan", scan="a")]) == 0.5
     assert place_overlap(region, [place("scan", scan="c")]) == 0.0
+    both = [place("scan", scan="a"), place("scan", scan="b"), place("time", 0.0, 1.0)]
+    assert place_overlap(region, both) == 1.0
+    weaker = Place("scan", "c", None, None, 0.01, 3.0, *[np.zeros(0)] * 3)
+    assert place_overlap(region, [*both, weaker]) == 1.0
 
 
 def found(*parameters):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -263,21 +264,41 @@ def test_a_bump_is_found_where_it_is():
 
 
 def test_an_effect_is_where_it_has_half_its_strength():
-    x_mm = np.arange(-50.0, 51.0)
-    place = Covariate("place", x_mm, np.arange(101))
-    change = 2.0 * np.exp(-0.5 * ((x_mm - 10) / 8) ** 2)
+    """Along the scan that it was seen in, not along the one that went across it."""
+    x_mm, there = np.arange(-50.0, 51.0), np.zeros(101)
+    both = np.concatenate([x_mm, there]), np.concatenate([there, x_mm])
+    plan = replace(line(101).plan, x_mm=both[0], y_mm=both[1])
+    change = 2.0 * np.exp(-0.5 * ((both[0] - 10) ** 2 + both[1] ** 2) / 8**2)
+    change[101:] *= 0.9
     glint = VOCABULARY["glint"].for_extent(EXTENT)
-    (found,) = places_of_effect(glint, change, [place], change, p_value=0.001, size=8.0, sd=0.5)
+    across = Covariate("place", both[1][101:], np.arange(101, 202))
+    (found,) = places_of_effect(glint, change, change, plan, [across], change, p_value=0.001, size=8.0, sd=0.5)
     half = 8 * math.sqrt(2 * math.log(2))
     assert (found.covariate, found.scan) == ("place", None)
     assert found.start == pytest.approx(10 - half, abs=1)
     assert found.end == pytest.approx(10 + half, abs=1)
 
 
+def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
+    """Readings from 10 to 60 that never rise above 50: a model without a ceiling, fitted to them, tops at some 52."""
+    without = np.linspace(10.0, 60.0, 101)
+    change = np.minimum(without, 50.0) - without
+    level = Covariate("level", np.minimum(without, 52.0), np.arange(101))
+    effect = VOCABULARY["saturation"].for_extent(EXTENT)
+    plan = line(101, scans=1).plan
+    (found,) = places_of_effect(
+        effect, change, without + change, plan, [level], change, p_value=0.001, size=8.0, sd=0.5
+    )
+    assert found.covariate == "level"
+    assert found.start == pytest.approx(50.5, abs=0.6)
+    assert found.end == pytest.approx(60.0, abs=1e-9)
+
+
 def test_an_effect_of_one_scan_is_in_that_scan():
     scan = Covariate("scan", np.repeat([0.0, 1.0], 6), np.arange(12), groups=True)
     effect = VOCABULARY["scan_misplacement"].for_extent(EXTENT).variants()[1]
-    (found,) = places_of_effect(effect, np.ones(12), [scan], np.ones(12), p_value=0.001, size=8.0, sd=0.5)
+    one = np.ones(12)
+    (found,) = places_of_effect(effect, one, one, line(6).plan, [scan], one, p_value=0.001, size=8.0, sd=0.5)
     assert (found.covariate, (found.scan,), found.start) == ("scan", effect.scans, None)
 
 

@@ -82,8 +82,9 @@ def place_overlap(region: Region, places: Sequence[Place]) -> float:
     place = next((p for p in places if p.covariate == region.covariate), None)
     if place is None:
         return 0.0
-    if region.scans:
-        return 1 / len(region.scans) if place.scan in region.scans else 0.0
+    if region.scans:  # an effect that is bound to several is told one by one, each as strong as it is
+        own = {p.scan for p in places if (p.covariate, p.p_value, p.z) == ("scan", place.p_value, place.z)}
+        return len(own & {*region.scans}) / len(own | {*region.scans})
     if region.low is None or region.high is None or place.start is None or place.end is None:
         return 0.0
     both = min(region.high, place.end) - max(region.low, place.start)

@@ -367,6 +367,8 @@ class _Diagnoser:
             named += places_of_effect(
                 effect,
                 change,
+                best.found.predicted,
+                self.recording.plan.take(self.usable),
                 covariates,
                 residuals,
                 p_value=p_value,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.covariates import Covariate
 from probewise.diagnosis.evidence import Linearised
 from probewise.effects import NamedEffect
+from probewise.recordings.plan import Plan
 
 __all__ = ["Place", "global_p_value", "places", "places_of_effect", "windows"]
 
@@ -195,6 +196,8 @@ def places(
 def places_of_effect(
     effect: NamedEffect[Any],
     change: FloatArray,
+    predicted: FloatArray,
+    plan: Plan,
     covariates: Sequence[Covariate],
     residuals: FloatArray,
     *,
@@ -210,6 +213,10 @@ def places_of_effect(
         The effect; one that is bound to scans is in those.
     change
         What it makes of the readings, (n_points,).
+    predicted
+        The readings with it, (n_points,): a level is what would be read without it.
+    plan
+        Of the readings: a place is along the scans in which it is strongest.
     covariates
         Those of the recording.
     residuals
@@ -224,6 +231,10 @@ def places_of_effect(
     if name is None or not np.any(change):
         return []
     covariate = known[name]
+    if name == "level":
+        covariate = replace(covariate, values=(predicted - change)[covariate.rows])
+    if name == "place":
+        covariate = _along_the_strongest(change, plan) or covariate
     curve = _curve(covariate, residuals, sd)
     if name == "scan" or (effect.scans and "scan" in effect.covariates and "scan" in known):
         curve = _curve(known["scan"], residuals, sd)
@@ -233,6 +244,14 @@ def places_of_effect(
     felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
     values = covariate.values[felt]
     return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve)]
+
+
+def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:
+    """Take the places along X or along Y, of readings that were come to that way: where a change is greater."""
+    along_x, along_y = (np.flatnonzero(plan.direction[:, k] != 0) for k in (0, 1))
+    strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
+    rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
+    return Covariate("place", values[rows], rows) if rows.size else None
 
 
 def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:

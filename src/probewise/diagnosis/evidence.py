@@ -31,7 +31,7 @@ SCALES = np.geomspace(0.05, 25.0, 8)
 """Prior scales of an effect's rms, in noise sd: a mixture with a heavy tail."""
 
 LEAST_VISIBLE = 4.0
-"""Least size (lambda) of what counts as an effect: from about there on the alarm at one in a hundred sees more than it misses."""
+"""Least size (lambda) of what counts as an effect: there the alarm at one in a hundred sees more than it misses."""
 
 _INVISIBLE = -50.0  # log Bayes factor of a template of which nothing survives
 

@@ -62,9 +62,21 @@ def test_an_effect_at_nothing_does_nothing(name):
     theta = np.concatenate([samples.theta, own], axis=1)
     # Two quadratures where a pose changes, and a central difference where a scene does.
     np.testing.assert_allclose(chain.predict(theta, PLAN), samples.chain.predict(samples.theta, PLAN), atol=2e-4)
-    level = chain.noise_level(theta, PLAN, np.ones((5, 1)))
-    assert np.allclose(level.sd, 1.0)
-    assert np.allclose(level.rho, 0.0)
+    level, plain = (
+        c.noise_level(t, PLAN, np.ones((5, 1))) for c, t in ((chain, theta), (samples.chain, samples.theta))
+    )
+    for share in ("sd", "rho", "wide_share", "lost_share", "step"):
+        here, there = np.broadcast_arrays(getattr(level, share), getattr(plain, share))
+        np.testing.assert_allclose(here, there, err_msg=share)
+
+
+def test_no_lag_is_none_where_the_clock_stands_still():
+    """Two readings at one time: nothing has waited, and still nothing is held back."""
+    plan = dataclasses.replace(PLAN, time_s=2.0 * (np.arange(len(PLAN)) // 2))
+    samples = samples_of(1, 5)
+    chain = default_sensor(EXTENT, 1).chain(plan, (BUILT["lag"],), n_nodes=ACCURATE_NODES)
+    theta = np.concatenate([samples.theta, np.zeros((5, 1))], axis=1)
+    np.testing.assert_allclose(chain.predict(theta, plan), samples.chain.predict(samples.theta, plan), atol=1e-9)
 
 
 def with_effect(name: str, n_gaussians: int, mark: float) -> ModelSamples:

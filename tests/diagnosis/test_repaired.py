@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from probewise.calibration import FittedSensor
-from probewise.diagnosis.coordinates import default_sensor
+from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, default_sensor
+from probewise.diagnosis.evidence import weigh
+from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.free_form import FreeForm
-from probewise.diagnosis.repaired import ModelSamples
+from probewise.diagnosis.noise import white
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.repaired import ModelSamples, sample_model
 from probewise.effects import Extent
 from probewise.recordings import Recording, two_way_plan
 from probewise.sensor import total_variation
@@ -32,3 +36,21 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     mixture = sensor.mixture()
     np.testing.assert_allclose(mixture.mean_mm, sensor.field.mean_mm, atol=sensor.field.pixel_mm)
     assert total_variation(mixture, sensor.field) < 0.1
+
+
+def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
+    """An earlier sensor whose white level is twenty of its sds off: the fit rests at six of them."""
+    rng = np.random.default_rng(0)
+    center = default_sensor(Extent(10.0, 60.0, PLAN), 1).center
+    tight = SensorCoordinates(1, center, np.diag([0.05, 0.05, 0.01, 0.01, 0.02, 0.05, 0.05]), exchangeable=False)
+    truth = tight.theta(np.zeros((1, 7)))
+    truth[:, -1] += 20 * 0.05
+    readings = tight.chain(PLAN, (), n_nodes=16).predict(truth, PLAN)[0] + 0.3 * rng.standard_normal(len(PLAN))
+    recording = Recording(PLAN, readings)
+    found = fit(Model(tight, (), PLAN), recording, np.zeros(7), white(len(PLAN)), sd_floor=1e-3)
+    noise = weigh(found, NoiseModel((), recording), sd_floor=1e-3)
+    samples = sample_model(found, noise, recording, weights={}, rng=rng)
+    z = tight.z(samples.theta)
+    assert z[:, -1].max() < FARTHEST
+    assert z[:, -1].min() > FARTHEST - 1.5
+    assert len(np.unique(z[:, -1])) > 250

@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["Density", "anneal", "by_weight"]
@@ -54,17 +55,26 @@ def by_weight(
     Samples in no order, (n_wanted, n_params); None where too few of `first` count.
     """
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
-    share = n_effective(gain) / len(gain)
+    share = _independent(gain, first[:n_wanted]) / len(gain)
     enough = min(math.ceil(_ENOUGH * n_wanted / max(share, 1e-9)), len(first))
     if share * len(first) < _LEAST_OF_IT * _ENOUGH * n_wanted:
         return None
     if enough > n_wanted:
         more = first[n_wanted:enough]
         gain = np.append(gain, log_p(more) - log_q(more))
-    if n_effective(gain) < _LEAST_OF_IT * _ENOUGH * n_wanted:
+    if _independent(gain, first[: len(gain)]) < _LEAST_OF_IT * _ENOUGH * n_wanted:
         return None
     rows = resampled(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])
+
+
+def _independent(log_weight: FloatArray, samples: FloatArray) -> float:
+    """Count weighted samples by Kish's number, copies of one as one."""
+    _, which = np.unique(samples[:, 0], return_inverse=True)
+    if not np.isfinite(log_weight).any():
+        return 0.0
+    with np.errstate(divide="ignore"):
+        return n_effective(np.log(np.bincount(which, np.exp(log_weight - log_weight.max()))))
 
 
 def anneal(
@@ -90,9 +100,16 @@ def anneal(
     Returns
     -------
     Samples, (n_wanted, n_params): those carried on, taken as often as it takes, some moves apart.
+
+    Raises
+    ------
+    NotConvergedError
+        If none of the first samples can be.
     """
     n_walkers = len(first)
     z, heights = first, (log_q(first), log_p(first))
+    if not np.isfinite(heights[1]).any():
+        raise NotConvergedError("no sample of what stands in for the posterior is within the bounds of the prior")
     beta, scale = 0.0, 1.0
     while beta < 1.0:
         gain = heights[1] - heights[0]
@@ -111,7 +128,7 @@ def anneal(
 
 def _next_beta(gain: FloatArray, beta: float) -> float:
     """Find the largest beta, by halving, at which enough samples still count."""
-    enough = _EFFECTIVE * len(gain)
+    enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
     low, high = beta, 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -30,7 +31,7 @@ from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.verdict import ALARM, Diagnosis, EffectFound, Hypothesis, Improvement, credible_set, decide
 from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary, outside
 from probewise.diagnosis.weighing import Weighing, with_agreement
-from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
+from probewise.effects import EFFECTS, NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
@@ -51,7 +52,6 @@ _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is besi
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _LEAST_OF_A_RIVAL = 0.05  # probability of a hypothesis, below which the model does without it
 _MOST_RIVALS = 4  # hypotheses in one model
-_FOR_A_MEAN = 8  # samples whose mean prediction stands for the posterior's
 
 
 def diagnose(
@@ -108,8 +108,9 @@ def diagnose(
         known = sensor_of(sensor)
     able = {name: effect for name, effect in fitted.items() if effect is not None}
     built = {name: effect for name, effect in able.items() if known is None or known.admits(effect)}
-    found = _Diagnoser(recording, built, known, floor, thorough, rng).run()
-    return found if recording is everything else _of_everything(found, everything)
+    diagnoser = _Diagnoser(recording, built, known, floor, thorough, rng)
+    found = diagnoser.run()
+    return found if recording is everything else _of_everything(found, diagnoser.fits, everything)
 
 
 @dataclass(eq=False)
@@ -172,13 +173,15 @@ class _Diagnoser:
         if fails:  # what explains these readings alone is no repair
             verdict, combination, best = "cannot_tell", (), null
             after, improvement = self._judged(null, best, noise_of, p_value)
+        self.fits = null.found, best.found
+        self.sampled: dict[tuple[Names, bool, Names], ModelSamples] = {}
         samples = self._sample(best, noise_of)
         written = samples
         if verdict == "unknown" and best is not null:
             share = max(1 - self.search.by_mean[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
             written = self._averaged(best, samples, {best.names: 1 - share, (): share}, noise_of)
-        elif verdict in ("named", "cannot_tell") and best is not null:
-            written = self._averaged(best, samples, self.search.by_mean, noise_of)
+        elif verdict in ("named", "cannot_tell") and best.names:
+            written = self._averaged(best, samples, self._likely(best, noise_of), noise_of)
         null_samples = samples if best is null else self._sample(null, noise_of)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
         where = self._where(null, problem, draws, best, effects, p_value)
@@ -282,37 +285,49 @@ class _Diagnoser:
         return {name: p / total for name, p in shares.items()}
 
     def _sample(self, candidate: Candidate, noise: Names) -> ModelSamples:
-        """Draw from the posterior of a candidate's hypothesis, over all SSF orders that matter."""
-        sensor = candidate.found.model.sensor
-        alike = [
-            c
-            for (_, names), c in self.search.candidates.items()
-            if names == candidate.names and c.found.model.sensor.exchangeable == sensor.exchangeable
-        ]
+        """Draw from the posterior of a candidate's hypothesis, over all SSF orders that matter; once."""
+        key = candidate.names, candidate.found.model.sensor.exchangeable, noise
+        if key not in self.sampled:
+            self.sampled[key] = self._sample_orders(self._of_form(candidate, candidate.names), noise)
+        return self.sampled[key]
+
+    def _sample_orders(self, alike: Sequence[Candidate], noise: Names) -> ModelSamples:
+        """Draw from the posterior of one hypothesis at several SSF orders, by their evidence."""
         log_z = np.array([c.evidence[noise].log_z for c in alike])
         weights = np.exp(log_z - log_z.max())
         kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
         parts = [self._sample_of(c, noise) for c in itertools.compress(alike, kept)]
         return over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
 
+    def _of_form(self, best: Candidate, names: Names) -> list[Candidate]:
+        """List the refitted candidates of a combination whose SSF fits into one model with that of the best."""
+        form = best.found.model.sensor.exchangeable
+        return [
+            c
+            for (_, key), c in self.search.candidates.items()
+            if key == names and c.found.model.sensor.exchangeable == form
+        ]
+
+    def _likely(self, best: Candidate, noise: Names) -> dict[Names, float]:
+        """Weigh what one model can hold beside the best candidate: under its noise, by the form of its SSF."""
+        out: dict[Names, float] = {}
+        for names in {names for _, names in self.search.candidates if EFFECTS.keys() | best.names >= {*names}}:
+            log_z = [c.evidence[noise].log_z for c in self._of_form(best, names)]
+            if log_z:
+                out[names] = float(np.logaddexp.reduce(log_z)) + self.search.prior.log_mean(names)
+        total = np.logaddexp.reduce(list(out.values()))
+        return {names: math.exp(value - total) for names, value in out.items()}
+
     def _averaged(
         self, best: Candidate, samples: ModelSamples, probabilities: Mapping[Names, float], noise: Names
     ) -> ModelSamples:
         """Mix the samples of the best candidate with those of its rivals, by probability, as far as one model can."""
-        form = best.found.model.sensor.exchangeable
         kept = [(samples, best, probabilities[best.names])]
         for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
-            options = [
-                c
-                for (_, key), c in self.search.candidates.items()
-                if key == names and c.found.model.sensor.exchangeable == form
-            ]
-            rival = max(options, key=lambda c: c.evidence[noise].log_z, default=None)
             if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST_RIVALS:
                 break
-            if rival is not None and all(
-                side_by_side(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept
-            ):
+            rival = max(self._of_form(best, names), key=lambda c: c.evidence[noise].log_z)
+            if all(side_by_side(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept):
                 kept.append((self._sample(rival, noise), rival, probabilities[names]))
         if len(kept) == 1:
             return samples
@@ -382,12 +397,9 @@ class _Diagnoser:
         return list(first.values())
 
 
-def _of_everything(found: Diagnosis, everything: Recording) -> Diagnosis:
+def _of_everything(found: Diagnosis, fits: tuple[Fit, Fit], everything: Recording) -> Diagnosis:
     """Carry what part of a recording told to the whole of it: predictions and residuals of every row."""
-    predicted = [
-        samples.chain.predict(samples.theta[:_FOR_A_MEAN], everything.plan).mean(axis=0)
-        for samples in (found.null, found.repaired)
-    ]
+    predicted = [replace(fit.model, plan=everything.plan).predict(fit.z[None, :])[0] for fit in fits]
     readings = np.where(everything.usable, everything.readings, np.nan)
     return replace(
         found,

@@ -106,7 +106,7 @@ def sample_model(
 ) -> ModelSamples:
     """Draw from the posterior about a fit, under the noise model it was weighed with.
 
-    From its Laplace approximation, and on from there by tempering (`anneal`): where the SSF has several
+    From its Laplace approximation, and on from there by way of the model to second order: where the SSF has several
     Gaussians the posterior is bent, and what the approximation alone draws predicts new angles worse by
     tens of nats.
 
@@ -172,6 +172,7 @@ def _posterior_draws(
     ]
     normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
+    center = np.clip(center, -FARTHEST, FARTHEST)
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)

@@ -117,7 +117,7 @@ class Search:
     covariates: tuple[Covariate, ...]
     unknown_bases: Bank
     unknown_shares: Mapping[str, float]
-    about: Fit  # where the templates that screen and test are laid out
+    about: Fit  # where the templates of the tests are laid out
     templates: TemplateMemory
     probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
     order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean

@@ -78,8 +78,8 @@ class Lag(NamedEffect[FloatArray]):
 
     @property
     def nothing(self) -> Mapping[int, float]:
-        """A time constant of which nothing is left at the next reading."""
-        return {0: 1e-3 * self.shortest_s}
+        """No time at all."""
+        return {0: 0.0}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -99,7 +99,8 @@ class Lag(NamedEffect[FloatArray]):
         """
         same = np.diff(plan.scan, prepend=-1) == 0
         waited = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
-        carry = np.exp(-waited / theta)  # 0 at the first reading of a scan
+        tau_s = theta[:, :1]
+        carry = np.where(tau_s > 0, np.exp(-waited / np.where(tau_s > 0, tau_s, 1.0)), 0.0)  # 0 where a scan begins
         held = (1 - carry) * value
         reach, longest = 1, int(np.bincount(plan.scan).max(initial=1))
         while reach < longest:

@@ -33,6 +33,7 @@ from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 __all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "response"]
 
 _MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
+_SAME = 1e-9  # mm and mm^2: closer than that, rounding alone tells Gaussians apart
 _FEW = 8  # hypotheses, of which all Gaussians are seen at once even where no geometry is shared
 
 
@@ -187,7 +188,7 @@ class Chain:
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = raised_as_commanded(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
-        geometries = self._geometries(theta) if footprint.weight.shape[1] == 1 else None
+        geometries = self._geometries(theta, footprint)
         if geometries is None:
             seen = response(layout, footprint, n_nodes=self.n_nodes)
         else:
@@ -195,9 +196,10 @@ class Chain:
             seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
-    def _geometries(self, theta: FloatArray) -> _Geometries | None:
+    def _geometries(self, theta: FloatArray, footprint: Footprint) -> _Geometries | None:
         """Find hypotheses that differ in the amounts of many Gaussians alone; None where there is no gain in that."""
-        if not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY:
+        few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
+        if few or footprint.weight.shape[1] > 1:
             return None
         own = np.ones(theta.shape[1], dtype=np.bool_)
         n_ssf = len(self.ssf.names)
@@ -209,7 +211,10 @@ class Chain:
         which = np.array([numbers.setdefault(row.tobytes(), len(numbers)) for row in theta[:, own]])
         if 2 * len(numbers) > len(theta) > _FEW:
             return None
-        return _Geometries(np.unique(which, return_index=True)[1], which)
+        first = np.unique(which, return_index=True)[1]
+        # An effect may set Gaussians by the amounts of others, as a skirt about their common centre.
+        moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
+        return None if len(first) < len(theta) and any(moved) else _Geometries(first, which)
 
     def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
         """Lay out the scene under the poses; where no hypothesis changes either, once for a plan."""

@@ -95,6 +95,15 @@ def test_a_credible_set_holds_the_truth_by_its_label(make):
     ]
     assert row(results, "95 % credible set holds the truth").found.value == 0.75
     assert row(results, "size of the credible set, lambda 8").found.value == 1.5
+    assert row(results, "  the truth and its aliases as one").found.value == 1.5
+
+
+def test_aliases_of_the_truth_count_as_one_in_a_set(make):
+    hide = make.hidden("lag", cosines={"lag": 1.0, "backlash": 0.99})
+    sets = (["lag", "backlash", "halo"], ["backlash", "lag"], ["halo"])
+    results = [make.single("lag", hide=hide, credible_set=own) for own in sets]
+    assert row(results, "size of the credible set, lambda 8").found.value == 2.0
+    assert row(results, "  the truth and its aliases as one").found.value == pytest.approx(4 / 3)
 
 
 def test_only_a_name_can_be_the_wrong_name(make):
@@ -142,6 +151,10 @@ def test_the_held_out_gain_is_a_ratio_of_sums(make):
     of_truth = row(results, "  share of what the truth itself would gain").found.value
     assert of_truth == pytest.approx((20 + 10 - 1) / 60)
     assert row(results, "held-out worse than the null by over 1 nat").found.value == pytest.approx(1 / 3)
+    assert row(results, "  of the right model, fitted to the same").found.value == 0.0
+    of_right = {"null": -100.0, "repaired": -100.0, "right": -100.5, "true": -80.0}
+    worse = make.single(held_out=dict.fromkeys(("angle", "pattern", "direction"), of_right))
+    assert row([*results, worse], "  of the right model, fitted to the same").found.value == 0.25
 
 
 def test_both_of_a_pair_have_to_be_named(make):

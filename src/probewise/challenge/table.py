@@ -145,10 +145,18 @@ def _probabilities(done: list[Result]) -> list[Row]:
     return [
         Row("95 % credible set holds the truth", share(covered), 0.95),
         Row("size of the credible set, lambda 8", mean(sizes[8.0]), most=1.25),
+        Row("  the truth and its aliases as one", mean([_merged_size(r) for r in _singles(done, 8.0)])),
         Row("size of the credible set, lambda 12", mean(sizes[12.0]), most=1.1),
+        Row("  the truth and its aliases, lambda 12", mean([_merged_size(r) for r in _singles(done, 12.0)])),
         Row("expected calibration error", calibration_error(done), most=0.02),
         Row("wrong name stated above .9", share([_surely_wrong(r) for r in done]), most=0.005),
     ]
+
+
+def _merged_size(result: Result) -> float:
+    """Count the hypotheses of a credible set, the right one and what so many readings cannot tell from it as one."""
+    right = sum(fits(names_of(label), answers(result, merged=True)) for label in result["credible_set"])
+    return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
 def _places(done: list[Result]) -> list[Row]:
@@ -189,6 +197,10 @@ def _held_out(done: list[Result]) -> list[Row]:
         Row("  share of what the truth itself would gain", resampled(_gains_of(white, "true"), _ratio)),
         Row("  the same, outside the vocabulary", resampled(_gains_of(outside, "true"), _ratio)),
         Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
+        # What noise alone makes of the best that these readings allow.
+        Row(
+            "  of the right model, fitted to the same", share([bool(own < -1.0) for own in gains[:, :, 1].sum(axis=1)])
+        ),
     ]
 
 

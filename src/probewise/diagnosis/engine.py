@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -12,10 +10,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.audit import Alias, aliases, settle
-from probewise.diagnosis.averaging import over_hypotheses, over_orders, side_by_side
 from probewise.diagnosis.convergence import require_converged
 from probewise.diagnosis.coordinates import LEAST_READINGS
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.ensemble import Ensemble
 from probewise.diagnosis.evidence import Blocks, Linearised
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joining import join
@@ -23,7 +21,6 @@ from probewise.diagnosis.locate import Place, global_p_value, places, places_of_
 from probewise.diagnosis.mending import corrected, improvement_of
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.reasons import reason_of
-from probewise.diagnosis.repaired import ModelSamples, sample_model
 from probewise.diagnosis.rivals import next_readings
 from probewise.diagnosis.search import search
 from probewise.diagnosis.stating import effects_found, noise_found
@@ -31,7 +28,7 @@ from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.verdict import ALARM, Diagnosis, EffectFound, Hypothesis, Improvement, credible_set, decide
 from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary, outside
 from probewise.diagnosis.weighing import Weighing, with_agreement
-from probewise.effects import EFFECTS, NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
+from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
@@ -49,9 +46,6 @@ _NO_ALARM = 0.05  # by any rule, so that no other order of the SSF need be asked
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _RUIN = -1.0  # nats a reading kept back, below which what was named repairs nothing
 _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
-_LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
-_LEAST_OF_A_RIVAL = 0.05  # probability of a hypothesis, below which the model does without it
-_MOST_RIVALS = 4  # hypotheses in one model
 
 
 def diagnose(
@@ -174,15 +168,14 @@ class _Diagnoser:
             verdict, combination, best = "cannot_tell", (), null
             after, improvement = self._judged(null, best, noise_of, p_value)
         self.fits = null.found, best.found
-        self.sampled: dict[tuple[Names, bool, Names], ModelSamples] = {}
-        samples = self._sample(best, noise_of)
-        written = samples
+        ensemble = Ensemble(self.search, noise_of, self.rng)
+        written = samples = ensemble.of(best)
         if verdict == "unknown" and best is not null:
             share = max(1 - self.search.by_mean[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
-            written = self._averaged(best, samples, {best.names: 1 - share, (): share}, noise_of)
+            written = ensemble.averaged(best, {best.names: 1 - share, (): share})
         elif verdict in ("named", "cannot_tell") and best.names:
-            written = self._averaged(best, samples, self._likely(best, noise_of), noise_of)
-        null_samples = samples if best is null else self._sample(null, noise_of)
+            written = ensemble.averaged(best, ensemble.likely(best))
+        null_samples = samples if best is null else ensemble.of(null)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
         where = self._where(null, problem, draws, best, effects, p_value)
         residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
@@ -283,61 +276,6 @@ class _Diagnoser:
                 shares[name] = shares.get(name, 0.0) + p
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}
-
-    def _sample(self, candidate: Candidate, noise: Names) -> ModelSamples:
-        """Draw from the posterior of a candidate's hypothesis, over all SSF orders that matter; once."""
-        key = candidate.names, candidate.found.model.sensor.exchangeable, noise
-        if key not in self.sampled:
-            self.sampled[key] = self._sample_orders(self._of_form(candidate, candidate.names), noise)
-        return self.sampled[key]
-
-    def _sample_orders(self, alike: Sequence[Candidate], noise: Names) -> ModelSamples:
-        """Draw from the posterior of one hypothesis at several SSF orders, by their evidence."""
-        log_z = np.array([c.evidence[noise].log_z for c in alike])
-        weights = np.exp(log_z - log_z.max())
-        kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
-        parts = [self._sample_of(c, noise) for c in itertools.compress(alike, kept)]
-        return over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
-
-    def _of_form(self, best: Candidate, names: Names) -> list[Candidate]:
-        """List the refitted candidates of a combination whose SSF fits into one model with that of the best."""
-        form = best.found.model.sensor.exchangeable
-        return [
-            c
-            for (_, key), c in self.search.candidates.items()
-            if key == names and c.found.model.sensor.exchangeable == form
-        ]
-
-    def _likely(self, best: Candidate, noise: Names) -> dict[Names, float]:
-        """Weigh what one model can hold beside the best candidate: under its noise, by the form of its SSF."""
-        out: dict[Names, float] = {}
-        for names in {names for _, names in self.search.candidates if EFFECTS.keys() | best.names >= {*names}}:
-            log_z = [c.evidence[noise].log_z for c in self._of_form(best, names)]
-            if log_z:
-                out[names] = float(np.logaddexp.reduce(log_z)) + self.search.prior.log_mean(names)
-        total = np.logaddexp.reduce(list(out.values()))
-        return {names: math.exp(value - total) for names, value in out.items()}
-
-    def _averaged(
-        self, best: Candidate, samples: ModelSamples, probabilities: Mapping[Names, float], noise: Names
-    ) -> ModelSamples:
-        """Mix the samples of the best candidate with those of its rivals, by probability, as far as one model can."""
-        kept = [(samples, best, probabilities[best.names])]
-        for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
-            if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST_RIVALS:
-                break
-            rival = max(self._of_form(best, names), key=lambda c: c.evidence[noise].log_z)
-            if all(side_by_side(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept):
-                kept.append((self._sample(rival, noise), rival, probabilities[names]))
-        if len(kept) == 1:
-            return samples
-        sensor = self.search.sensors[max(part.n_gaussians for part, _, _ in kept)]
-        parts, shares = [part for part, _, _ in kept], np.array([p for _, _, p in kept])
-        return over_hypotheses(parts, shares, sensor, self.recording.plan, rng=self.rng)
-
-    def _sample_of(self, candidate: Candidate, noise: Names) -> ModelSamples:
-        evidence = candidate.evidence[noise]
-        return sample_model(candidate.found, evidence, self.recording, weights=candidate.weights, rng=self.rng)
 
     def _spread(self, values: FloatArray) -> FloatArray:
         out = np.full(len(self.recording), np.nan)

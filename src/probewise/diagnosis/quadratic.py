@@ -20,9 +20,9 @@ _NEGLIGIBLE = 0.02  # noise sd, over all readings together: less of a change at 
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """Second-order predictions at `e` steps from a point, (n_samples, n_params) of them.
+    """Second-order predictions at `e` steps from a point: `center` + `amounts(e)` @ `changes`.
 
-    Predictions there, `center` (n_points,), and amounts of the orthonormal `changes` (n_changes, n_points), which are
+    `center` (n_points,) are the predictions there, `changes` (n_changes, n_points) orthonormal; their amounts are
     products of steps, single and by `pairs`, times `shares` (n_terms, n_changes).
     """
 
@@ -62,7 +62,3 @@ class Quadratic:
         """Give the amount of each change, (n_samples, n_changes)."""
         first, second = self.pairs
         return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)
-
-    def __call__(self, e: FloatArray) -> FloatArray:
-        """Predict, (n_samples, n_points)."""
-        return np.asarray(self.center + self.amounts(e) @ self.changes)

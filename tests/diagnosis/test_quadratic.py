@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,21 @@ def curve(z):
 
 def predicted(quadratic, e):
     return quadratic.center + quadratic.amounts(e) @ quadratic.changes
+
+
+CARRY = np.where(np.arange(40) % 20 > 0, 0.4, 0.0)
+LOST = np.arange(40) == 7
+LAW = NoiseLaw(np.linspace(0.8, 1.2, 40), np.where(LOST | np.roll(LOST, 1), 0.0, CARRY), LOST)
+
+
+def noisy(sd, seed=5, law=LAW):
+    """Readings at the centre, with noise that the law makes independent."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal(40) * np.where(rng.random(40) < law.share, law.times, 1.0)
+    own = np.zeros(40)
+    for k in range(40):
+        own[k] = law.carry[k] * own[k - 1] + np.sqrt(1 - law.carry[k] ** 2) * white[k]
+    return curve(CENTER[None, :])[0] + sd * law.sd * own
 
 
 def about_the_center(e):
@@ -55,21 +72,33 @@ def test_what_makes_no_difference_is_left_out(sd):
     assert np.linalg.norm(predicted(full, one) - predicted(thin, one), axis=1).max() < 9 * 0.02 * sd
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1])
-def test_the_density_is_that_of_its_predictions(share):
-    """Route two: readings predicted one by one and whitened; under normal noise it looks at a few sums alone."""
-    rng = np.random.default_rng(5)
-    carry = np.where(np.arange(40) % 20 > 0, 0.4, 0.0)
-    lost = np.arange(40) == 7
-    law = NoiseLaw(np.linspace(0.8, 1.2, 40), np.where(lost | np.roll(lost, 1), 0.0, carry), lost, share, 5.0)
-    quadratic = Quadratic.of(about_the_center, 3, 1e-9)
-    readings = curve(CENTER[None, :])[0] + 0.05 * rng.standard_normal(40)
-    e = rng.standard_normal((30, 3))
+def test_the_density_is_that_of_its_predictions():
+    """Route two: readings predicted one by one and whitened; it looks at a few sums alone."""
+    quadratic, readings = Quadratic.of(about_the_center, 3, 1e-9), noisy(0.05)
+    e = np.random.default_rng(5).standard_normal((30, 3))
     z = CENTER + e @ STEPS
-    expected = log_likelihood_of_whitened(law, law((readings - predicted(quadratic, e)).T), 1e-3) - 0.5 * np.sum(
-        z**2, axis=1
-    )
-    found = Surrogate.of(quadratic, CENTER, STEPS, readings, law, 1e-3).log_density(e)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-    far = Surrogate.of(quadratic, CENTER, STEPS, readings, law, 1e-3).log_density(np.full((1, 3), 100.0))
-    assert far[0] == -np.inf
+    residuals = (readings - predicted(quadratic, e)).T
+    expected = log_likelihood_of_whitened(LAW, LAW(residuals), 1e-3) - 0.5 * np.sum(z**2, axis=1)
+    near = Surrogate.of(quadratic, CENTER, STEPS, readings, LAW, 1e-3)
+    np.testing.assert_allclose(near.log_density(e), expected, rtol=1e-9)
+    assert near.log_density(np.full((1, 3), 100.0))[0] == -np.inf
+
+
+def test_under_a_tail_the_density_falls_off_as_it_should():
+    """By the mean of the true fall over the noise: one reading's says little, and thousands differ by chance."""
+    tailed = dataclasses.replace(LAW, share=0.1, times=5.0)
+    e = 0.3 * np.random.default_rng(6).standard_normal((20, 3))
+    quadratic = Quadratic.of(about_the_center, 3, 1e-9)
+    falls = []
+    for seed in range(60):
+        readings = noisy(0.1, seed, tailed)
+        near = Surrogate.of(quadratic, CENTER, STEPS, readings, tailed, 1e-3)
+        true = [
+            log_likelihood_of_whitened(tailed, tailed((readings - predicted(quadratic, at)).T), 1e-3)
+            for at in (e, np.zeros((1, 3)))
+        ]
+        prior = 0.5 * np.sum((CENTER + e @ STEPS) ** 2, axis=1) - 0.5 * np.sum(CENTER**2)
+        falls.append([true[1] - true[0], near.log_density(np.zeros((1, 3))) - near.log_density(e) - prior])
+    true, found = np.mean(falls, axis=0)
+    np.testing.assert_allclose(found, true, rtol=0.25, atol=0.3)
+    assert true.max() > 5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -20,8 +20,9 @@ __all__ = ["Surrogate"]
 class Surrogate:
     """The log density of coordinates z = center + e @ steps, by e, (n_samples, n_params).
 
-    `residual` (n_rows,) and `changes` (n_rows, n_changes) are whitened; under normal noise in the axes of the space
-    that they span, where a sum of squares has few terms.
+    The noise is normal: of a law with a tail residuals are those of normal noise that say as much. `residual`
+    (n_changes + 1,) and `changes` (n_changes + 1, n_changes) are whitened, in the axes of the space that they span,
+    where a sum of squares has few terms.
     """
 
     quadratic: Quadratic
@@ -43,11 +44,11 @@ class Surrogate:
         sd_floor: float,
     ) -> Self:
         """Set predictions against readings, (n_points,)."""
-        residual, changes = law(readings - quadratic.center), law(quadratic.changes.T)
-        if law.share == 0:
-            _, turned = np.linalg.qr(np.concatenate([changes, residual[:, None]], axis=1))
-            residual, changes = turned[:, -1], turned[:, :-1]
-        return cls(quadratic, center, steps, law, sd_floor, residual, changes)
+        residual = law(readings - quadratic.center)[:, None]
+        residual = law.as_normal(residual, np.maximum(law.scale(residual, floor=sd_floor), 1e-150))
+        _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
+        normal = replace(law, share=0.0, times=1.0)
+        return cls(quadratic, center, steps, normal, sd_floor, turned[:, -1], turned[:, :-1])
 
     def log_density(self, e: FloatArray) -> FloatArray:
         """Prior and likelihood but for a constant, (n_samples,); minus infinity outside the prior's bounds."""

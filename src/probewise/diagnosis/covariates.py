@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.effects import edge_distance
+from probewise.effects import edge_distance, sign_of_move
 from probewise.recordings.plan import Plan
 from probewise.scene import region_of
 
@@ -58,9 +58,8 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
         Predicted reading and its slope along the move, both (n_usable,).
     """
     everything = np.arange(len(usable))
-    direction = plan.direction[usable]
-    sign: FloatArray = np.where(direction[:, 0] != 0, np.sign(direction[:, 0]), np.sign(direction[:, 1]))
-    moving = np.flatnonzero(sign != 0)  # elsewhere there is no way to tell a slope along
+    sign = sign_of_move(plan)[usable]
+    moving = np.flatnonzero(sign != 0)
     scan = plan.scan[usable]
     degrees = np.asarray(np.round(np.degrees(plan.orientation_rad[usable]), 6), dtype=np.float64)
     pooled: Mapping[str, FloatArray] = {
@@ -76,8 +75,8 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
             out.append(Covariate(name, values[there], there))
     if moving.size and _varies(slope[moving]):
         out.append(Covariate("slope", slope[moving], moving))
-    if moving.size and _varies(sign):
-        out.append(Covariate("direction", sign, everything, groups=True))
+    if _varies(sign[moving]):
+        out.append(Covariate("direction", sign[moving], moving, groups=True))
     if _varies(degrees):
         out.append(Covariate("orientation", degrees, everything, groups=True))
     if len(np.unique(scan)) > 1:

@@ -18,7 +18,7 @@ from probewise._arrays import FloatArray, frozen
 from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.covariates import Covariate
 from probewise.diagnosis.evidence import Linearised
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, sign_of_move
 from probewise.recordings.plan import Plan
 
 __all__ = ["Place", "global_p_value", "places", "places_of_effect", "windows"]
@@ -227,6 +227,9 @@ def places_of_effect(
         Of the noise.
     """
     known = {c.name: c for c in covariates if c.scan is None}
+    sign = sign_of_move(plan)
+    if "direction" not in known and np.ptp(sign) > 0:  # to stand still is no direction, but tells what a move does
+        known["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
     name = next((name for name in effect.covariates if name in known), None)
     if name is None or not np.any(change):
         return []

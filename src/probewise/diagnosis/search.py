@@ -472,11 +472,14 @@ class _Searcher:
         model = parent.found.model.with_effect(templates.variants[variant])
         ranked = own[np.argsort(-scores[own])]
         starts = []
-        for at in ranked[: 2 if scores[ranked[0]] > 5 else 1]:
+        # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
+        plain = parent.evidence[min(parent.evidence, key=len)].law
+        problems = [problem] if plain.alike(problem.law) else [problem, Linearised.of(parent.found, plain)]
+        for about, at in itertools.product(problems, ranked[: 2 if scores[ranked[0]] > 5 else 1]):
             columns = templates.columns[at]
-            amount = np.asarray(np.linalg.lstsq(problem.project(columns), problem.residual)[0], dtype=np.float64)
+            amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
             setting = effect.start(templates.settings[at], amount)
-            z = parent.found.z + problem.absorbed(parent.found, columns @ amount)
+            z = parent.found.z + about.absorbed(parent.found, columns @ amount)
             starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # A null with several basins: with the effect the best may be another one than without.

@@ -22,7 +22,7 @@ from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Known
 from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
-from probewise.effects.moves import in_scans
+from probewise.effects.moves import in_scans, sign_of_move
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, SignalDependentNoise
 from probewise.effects.noise_law import NoiseRows, draw_readings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
@@ -145,5 +145,6 @@ __all__ = [
     "lattice_step",
     "lattice_step_sd",
     "log_density",
+    "sign_of_move",
     "variance",
 ]

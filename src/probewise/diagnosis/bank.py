@@ -19,7 +19,8 @@ from probewise.diagnosis.noise import NoiseLaw
 __all__ = ["Bank"]
 
 _ABSENT = 1e-9  # share of a template's sum of squares, below which what a fit leaves of it is rounding
-_REMEMBERED = 5  # laws, those asked for last
+_REMEMBERED = 5  # laws, those asked for last, as long as they take no more than so many bytes
+_MOST_BYTES = 2**28
 
 
 @dataclass(eq=False)
@@ -112,7 +113,8 @@ class Bank:
         if key in self._whitened:
             self._whitened[key] = self._whitened.pop(key)
         else:
-            if len(self._whitened) >= _REMEMBERED:
+            room = min(max(_MOST_BYTES // max(self.columns.nbytes, 1), 1), _REMEMBERED)
+            while len(self._whitened) >= room:
                 self._whitened.pop(next(iter(self._whitened)))
             whitened = law(self.columns)
             norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))

@@ -54,15 +54,16 @@ def by_weight(
     -------
     Samples in no order, (n_wanted, n_params); None where too few of `first` count.
     """
+    least = _LEAST_OF_IT * _ENOUGH * n_wanted
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
     share = _independent(gain, first[:n_wanted]) / len(gain)
-    enough = min(math.ceil(_ENOUGH * n_wanted / max(share, 1e-9)), len(first))
-    if share * len(first) < _LEAST_OF_IT * _ENOUGH * n_wanted:
+    if share * len(first) < least:
         return None
+    enough = min(math.ceil(_ENOUGH * n_wanted / share), len(first))
     if enough > n_wanted:
         more = first[n_wanted:enough]
         gain = np.append(gain, log_p(more) - log_q(more))
-    if _independent(gain, first[: len(gain)]) < _LEAST_OF_IT * _ENOUGH * n_wanted:
+    if _independent(gain, first[: len(gain)]) < least:
         return None
     rows = resampled(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])

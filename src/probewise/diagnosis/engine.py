@@ -313,6 +313,7 @@ class _Diagnoser:
     ) -> list[Place]:
         """Say where what was named is, the largest first; then where else the residual stands out."""
         covariates, residuals = self.search.covariates, null.found.residuals
+        plan = self.recording.plan.take(self.usable)
         sizes = {effect.name: effect.size_lambda for effect in effects}
         named: list[Place] = []
         for effect in sorted(best.found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
@@ -321,7 +322,7 @@ class _Diagnoser:
                 effect,
                 change,
                 best.found.predicted,
-                self.recording.plan.take(self.usable),
+                plan,
                 covariates,
                 residuals,
                 p_value=p_value,

@@ -87,10 +87,11 @@ class JointProblem:
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         residuals = (self.recording.readings[usable] - predicted).T
-        laid_out, log_share = self.noise.laid_out, -math.log(float(self.noise.weights[self._kept].sum()))
+        laid_out, kept = self.noise.laid_out, self._kept
+        laws, log_share = [laid_out.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         terms = [
-            laid_out.log_weights[node] + log_likelihood_of_whitened(law, law(residuals), self.sd_floor)
-            for node, law in ((node, laid_out.laws[node]) for node in self._kept)
+            log_weight + log_likelihood_of_whitened(law, law(residuals), self.sd_floor)
+            for log_weight, law in zip(laid_out.log_weights[kept], laws, strict=True)
         ]
         out = np.asarray(logsumexp(terms, axis=0)) + log_share
         return np.where(np.isfinite(out), out, -np.inf)

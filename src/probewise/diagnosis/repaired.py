@@ -166,10 +166,8 @@ def _posterior_draws(
     # A step in a coordinate moves those behind it too, none before it. With the effects' first and the sensor's last,
     # most steps leave the SSF's geometry alone, which a prediction of many at once makes use of.
     order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
-    steps = np.empty_like(curvature)
-    steps[np.ix_(order, order)] = np.linalg.inv(np.linalg.cholesky(curvature[np.ix_(order, order)][::-1, ::-1]))[
-        ::-1, ::-1
-    ]
+    at, steps = np.ix_(order, order), np.empty_like(curvature)
+    steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
     normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
     center = np.clip(center, -FARTHEST, FARTHEST)

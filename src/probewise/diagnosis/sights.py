@@ -89,12 +89,10 @@ class LaidOut:
         for at, effect in enumerate(built.values()):
             if effect.stage is Stage.NOISE:
                 continue
-            templates = effect_templates(found, effect, np.arange(len(plan)))
-            n = len(templates.columns)
-            for k in np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64)):
-                columns.append(templates.columns[k])
-                settings.append(templates.settings[k])
-                owner.append(at)
+            templates = effect_templates(found, effect, np.arange(len(plan)), most=most)
+            columns += templates.columns
+            settings += templates.settings
+            owner += [at] * len(templates.columns)
         entry = np.repeat(np.arange(len(settings)), [c.shape[1] for c in columns[1:]])
         return cls(
             slopes / expected.sd,

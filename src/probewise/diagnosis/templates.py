@@ -22,6 +22,9 @@ from probewise.sensor import Stage
 __all__ = ["EffectTemplates", "TemplateMemory", "effect_templates", "subsets"]
 
 
+_AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
+
+
 @dataclass(frozen=True, eq=False)
 class EffectTemplates:
     """An effect's bank about a fit, all its variants': for each entry its columns, the setting and the variant."""
@@ -66,47 +69,57 @@ class TemplateMemory:
         return self.known[key]
 
 
-def effect_templates(found: Fit, effect: NamedEffect[Any], usable: IntArray) -> EffectTemplates:
-    """Difference the chain with and without each variant of the effect."""
+def effect_templates(
+    found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
+) -> EffectTemplates:
+    """Difference the chain with and without each variant of the effect, of `most` entries spread evenly."""
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
+    choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
+    entries = np.concatenate(banks)
+    if most is not None and most < len(entries):
+        kept = np.linspace(0, len(entries) - 1, most).round().astype(np.int64)
+        choice, entries = choice[kept], entries[kept]
     gates = effect.gates(found.model.plan)
     if gates is not None:
         (everywhere,) = _columns(found, effect, gates.always[None, :, :], usable)
-        columns = tuple(everywhere * opened[usable, None] for opened in gates.opened)
-        return EffectTemplates(columns, tuple(itertools.chain(*banks)), variants, np.arange(len(variants)))
-    # Variants bound to the same scans and patterns differ in their priors alone: one prediction does for them.
-    by_entry: list[FloatArray] = []
-    first = 0
-    for _, group in itertools.groupby(variants, key=lambda variant: (variant.scans, variant.patterns)):
-        last = first + len(list(group))
-        by_entry += _columns(found, variants[first], np.concatenate(banks[first:last]), usable)
-        first = last
-    choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
-    return EffectTemplates(tuple(by_entry), tuple(itertools.chain(*banks)), variants, choice)
+        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
+    else:
+        # Variants bound to the same scans and patterns differ in their priors alone: one prediction does for them.
+        columns = []
+        for _, group in itertools.groupby(range(len(choice)), key=lambda at: _bound_to(variants[choice[at]])):
+            at = list(group)
+            columns += _columns(found, variants[choice[at[0]]], entries[at], usable)
+    return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
+
+
+def _bound_to(variant: NamedEffect[Any]) -> tuple[object, object]:
+    return variant.scans, variant.patterns
 
 
 def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
-    """Predict all settings of a bank at once, in the scans that the effect is bound to: each (n_usable, n_columns)."""
+    """Predict the settings of a bank, in the scans that the effect is bound to: each (n_usable, n_columns)."""
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)
     n_rows = bank.shape[0] * bank.shape[1]
     own = {e.name: effect_values(e, found.z[None, plain.columns_of(e.name)]) for e in plain.effects}
-    each = {name: np.repeat(values, n_rows, axis=0) for name, values in own.items()}
-    each[effect.name] = bank.reshape(n_rows, -1)
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
-    theta = model.theta_of(np.repeat(sensor, n_rows, axis=0), each)
     before = np.zeros(len(plan))
     before[usable] = found.predicted
-    if effect.scans:
-        inside = np.flatnonzero(in_scans(plan, effect.scans))
-        change = np.zeros((n_rows, len(plan)))
-        change[:, inside] = model.chain.predict(theta, plan.take(inside)) - before[inside]
-    elif effect.stage >= Stage.SEEN:  # what acts on what has been seen needs no second look
-        view = plain.chain.look(plain.theta_of(sensor, own), plan)
-        change = model.chain.read(view, theta, plan) - before
-    else:
-        change = model.chain.predict(theta, plan) - before
+    inside = np.flatnonzero(in_scans(plan, effect.scans)) if effect.scans else slice(None)
+    there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
+    # What acts on what has been seen needs no second look.
+    seen = None if effect.stage < Stage.SEEN else plain.chain.look(plain.theta_of(sensor, own), there)
+    change = np.zeros((n_rows, len(plan)))
+    step = max(_AT_ONCE // len(there), 1)
+    for first in range(0, n_rows, step):
+        rows = slice(first, min(first + step, n_rows))
+        n = rows.stop - first
+        each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
+        each[effect.name] = bank.reshape(n_rows, -1)[rows]
+        theta = model.theta_of(np.repeat(sensor, n, axis=0), each)
+        read = model.chain.predict(theta, there) if seen is None else model.chain.read(seen, theta, there)
+        change[rows, inside] = read - before[inside]
     return np.split(change[:, usable].T, len(bank), axis=1)
 
 

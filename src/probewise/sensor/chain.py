@@ -33,6 +33,7 @@ from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 __all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "response"]
 
 _MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
+_MOST_NUMBERS = 2_000_000  # held at once of footprints that differ from reading to reading
 _SAME = 1e-9  # mm and mm^2: closer than that, rounding alone tells Gaussians apart
 _FEW = 8  # hypotheses, of which all Gaussians are seen at once even where no geometry is shared
 
@@ -144,9 +145,19 @@ class Chain:
         ParameterError
             If the plan has a pattern that the scene lacks, or theta names no proper SSF.
         """
+        at_once = self._at_once(theta, plan)
+        if at_once < len(theta):
+            blocks = (theta[first : first + at_once] for first in range(0, len(theta), at_once))
+            return np.concatenate([self.predict(block, plan) for block in blocks])
         view = self.look(theta, plan)
         plain = not self.effects and not is_commanded(plan)
         return self._scaled(view.seen, theta) if plain else self.read(view, theta, plan)
+
+    def _at_once(self, theta: FloatArray, plan: Plan) -> int:
+        """Count the hypotheses whose footprints may be held at once where they can differ from reading to reading."""
+        if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
+            return len(theta)
+        return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
 
     def read(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
         """Turn what is seen into readings, (n_samples, n_points): the way from SEEN on, as `predict` goes it.

@@ -89,22 +89,30 @@ class StraightEdges:
 
     def _see_each(self, footprint: Footprint, share: FloatArray) -> None:
         """See from places that change with the hypothesis, or with a footprint that changes with the reading."""
-        weight, *moments = (columns_of(a, self.rows) for a in (footprint.weight, *footprint.moments))
-        if _varies(footprint):
-            angles, which = self.turn_rad, np.arange(len(self.rows))
-        else:
-            angles, which = np.unique(self.turn_rad, return_inverse=True)
+        weight, *moments = (self._own(a) for a in (footprint.weight, *footprint.moments))
+        varies = _varies(footprint)
+        angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
         per_sd, shift = np.broadcast_arrays(*_projected(angles[:, None], *moments))
         share[:] = 0.0
         step = max(1, _BLOCK // len(self.rows))
         for start in range(0, len(share), step):
             block = slice(start, start + step)
+            distance = _rows_of(self.distance_mm, block)
             for g in range(footprint.weight.shape[2]):
-                cells = _rows_of(shift, block)[:, which, g] + _rows_of(self.distance_mm, block)
-                cells = cells * (_rows_of(per_sd, block)[:, which, g] * PER_SD)
+                own_shift, own_per_sd = _rows_of(shift, block)[:, :, g], _rows_of(per_sd, block)[:, :, g]
+                if which is not None:
+                    own_shift, own_per_sd = own_shift[:, which], own_per_sd[:, which]
+                cells = own_shift + distance
+                cells = cells * (own_per_sd * PER_SD)
                 cells += CENTRE
                 replace_by_cumulative(cells)
                 share[block] += cells * _rows_of(weight, block)[:, :, g]
+
+    def _own(self, array: FloatArray) -> FloatArray:
+        """Take the columns of these readings, as a view where they are neighbours."""
+        if self._place is None or array.shape[1] == 1:
+            return columns_of(array, self.rows)
+        return array[:, self._place]
 
 
 @dataclass(frozen=True, eq=False)

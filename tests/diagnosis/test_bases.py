@@ -24,6 +24,7 @@ MISMATCHES = {
     "a slip along X at a moment": IN_X * (TIME > 0.5),
     "a gain that wanders in time": SIGNAL * np.sin(9 * TIME),
     "a wave in time": np.sin(20 * TIME),
+    "a tone that slides": np.sin(2 * np.pi * (4 * TIME + 14 * TIME**2)),
     "a bend of the response": SIGNAL * (SIGNAL.max() - SIGNAL),
     "a gain for each angle": SIGNAL * np.cos(2 * PLAN.orientation_rad),
     "a start of each scan": np.exp(-(np.arange(N) - np.repeat(STARTS, np.diff(STARTS, append=N))) / 2),

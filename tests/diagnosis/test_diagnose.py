@@ -257,6 +257,36 @@ def test_an_earlier_sensor_is_taken_as_the_prior():
     np.testing.assert_allclose(ratio, math.sqrt(0.5), rtol=0.25)
 
 
+def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named():
+    """To first order the SSF's width takes a scale up; at a third it does not, though no template shows that."""
+    found = diagnose(recording("paper", hidden.PositionScale(-0.3, 0.0)), rng=np.random.default_rng(0))
+    strict(found)
+    scale = next(effect for effect in found.effects if effect.name == "position_scale")
+    assert scale.probability > 0.05
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [(hidden.PlaceStep(-0.8, 1.4), "missing_tooth"), (hidden.StickSlip(0.5, 6.0, 0.3), "stick_slip")],
+)
+def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
+    """A step of the arm at one place is among the bases of places too: by that name or as one of those."""
+    found = diagnose(recording("paper", effect), rng=np.random.default_rng(0))
+    document = strict(found)
+    assert found.verdict == "unknown"
+    assert name in [candidate["name"] for candidate in document["unknown_candidates"][:2]]
+
+
+def test_a_tone_that_slides_is_no_memory_of_the_noise():
+    plain = recording("paper")
+    turns = (plain.plan.time_s - plain.plan.time_s[0]) / np.ptp(plain.plan.time_s)
+    tone = 1.2 * np.sin(2 * np.pi * (4 * turns + 14 * turns**2))
+    found = diagnose(dataclasses.replace(plain, readings=plain.readings + tone), rng=np.random.default_rng(0))
+    strict(found)
+    assert found.verdict == "unknown"
+    assert "time" in [place.covariate for place in found.where[:2]]
+
+
 @pytest.mark.slow
 def test_what_has_a_name_of_our_own_is_unknown_and_its_repair_predicts():
     """The paper slips; the model that finds it moves the arm instead, and no name of the vocabulary is given."""

@@ -31,7 +31,7 @@ from probewise.diagnosis.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.verdict import Hypothesis, credible_set, decide
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
-from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, two_way_plan
+from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import jittered
 from probewise.sensor import footprint_of, mixture_names
 
@@ -111,6 +111,38 @@ def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
     one = (np.zeros((5, 1)),) * 5
     templates = EffectTemplates(one, one, (Backlash(),) * 3, np.array([0, 0, 1, 2, 2]))
     np.testing.assert_allclose(templates.weights(np.log([1.0, 3.0, 10.0, 5.0, 1.0])), [0.2, 0.5, 0.3])
+
+
+@pytest.mark.parametrize("name", ["flicker", "albedo_patch", "scan_angle_error"])
+def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, name):
+    plan = two_way_plan()
+    model = Model(default_sensor(EXTENT, 1), (), plan)
+    z = np.full(model.n_params, 0.2)
+    usable = np.arange(len(plan))
+    found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
+    effect = VOCABULARY[name].for_extent(EXTENT).coarse()
+    whole = effect_templates(found, effect, usable)
+    monkeypatch.setattr("probewise.diagnosis.templates._AT_ONCE", 5 * len(plan))
+    few = effect_templates(found, effect, usable, most=7)
+    assert (len(few.columns), len(few.choice)) == (7, 7)
+    at = np.linspace(0, len(whole.columns) - 1, 7).round().astype(int)
+    for k, own in enumerate(at):
+        np.testing.assert_array_equal(few.settings[k], whole.settings[own])
+        np.testing.assert_allclose(few.columns[k], whole.columns[own], atol=1e-8)  # the error of a response
+        assert few.variant(k) == whole.variant(own)
+
+
+def test_what_changes_nothing_but_the_last_digit_is_no_template():
+    """All scans lie on y = 0: a scale of Y moves nothing, whatever rounding makes of it."""
+    plan = paper_plan()
+    model = Model(default_sensor(Extent(10.0, 60.0, plan), 2), (), plan)
+    z = np.full(model.n_params, 0.2)
+    predicted = model.predict(z[None, :])[0] * (1 + 1e-13)
+    found = Fit(model, z, predicted, np.zeros(len(plan)), np.zeros((len(plan), len(z))), 1.0, 0.0)
+    templates = effect_templates(found, VOCABULARY["position_scale"].for_extent(EXTENT), np.arange(len(plan)))
+    for columns in templates.columns:
+        assert np.abs(columns[:, 0]).max() > 0.01
+        assert not columns[:, 1].any()
 
 
 def test_templates_of_a_variant_are_what_its_scans_change():
@@ -216,6 +248,22 @@ def test_a_bank_weighs_as_blocks_do():
     blocks = Blocks.of(problem, templates, [""] * 4)
     wanted = block_log_bayes_factors(blocks, residuals, n)
     np.testing.assert_allclose(Bank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
+
+
+def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
+    """Route one: products with the fit's basis; route two: each template's columns, less their fit by least squares."""
+    rng = np.random.default_rng(7)
+    n, p = 50, 3
+    slopes = rng.normal(size=(n, p))
+    templates = [slopes[:, :1] + 0.1 * rng.normal(size=(n, 1)), rng.normal(size=(n, 2)), 3.0 * slopes[:, 1:2]]
+    basis, _ = np.linalg.qr(np.concatenate([slopes, np.zeros((p, p))]))
+    problem = Linearised(basis, np.zeros(n + p), white(n), 1.0, n)
+    wanted = []
+    for columns in templates:
+        unit = columns / np.linalg.norm(columns, axis=0)
+        left = unit - slopes @ np.linalg.lstsq(slopes, unit)[0]
+        wanted.append(np.linalg.norm(left) / np.linalg.norm(unit))
+    np.testing.assert_allclose(Bank.of(templates, ["a", "b", "c"], n).surviving(problem), wanted, atol=1e-7)
 
 
 def test_null_draws_have_nothing_in_the_span_of_the_fit():

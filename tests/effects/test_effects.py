@@ -36,13 +36,14 @@ from probewise.effects import (
     Saturation,
     ScanAngleError,
     ScanMisplacement,
+    StickSlip,
 )
 from probewise.effects.spots import scanned_lines
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import jittered
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel, Stage
+from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel, Poses, Stage
 
 PLAN = jittered(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
@@ -302,6 +303,21 @@ def test_a_missing_tooth_moves_what_lies_beyond_it_along_its_axis_alone():
         moved = replace(PLAN, **{name: own + 0.7 * (own > at_mm)})
         seen = base().with_effects(tooth).predict(np.array([[0.7, at_mm, float(axis)]]), PLAN)
         np.testing.assert_allclose(seen, base().predict(np.zeros((1, 0)), moved), atol=1e-9)
+
+
+def test_a_slide_that_sticks_lags_ever_more_and_jumps_once_a_period():
+    slide = StickSlip.for_extent(EXTENT)
+    amp_mm, period_mm, phase = 0.8, 20.0, 0.15
+    x_mm = np.linspace(-30, 30, 6001)
+    poses = Poses(x_mm[None], np.zeros((1, len(x_mm))), np.zeros((1, 1)))
+    off = slide.apply(poses, np.array([[amp_mm, period_mm, phase]]), PLAN).x_mm[0] - x_mm
+    turns = x_mm / period_mm + phase
+    since = turns - np.floor(turns)
+    sticks = (since > 0.15) & (since < 0.85)
+    np.testing.assert_allclose(off[sticks], amp_mm * (1 - 2 * since[sticks]), atol=0.08 * amp_mm)
+    once_more = off[x_mm <= 10.0], off[x_mm >= -10.0]  # a period apart
+    np.testing.assert_allclose(*once_more, atol=1e-9)
+    assert np.abs(off).max() < 1.05 * amp_mm
 
 
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():

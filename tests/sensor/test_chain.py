@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
+from probewise.effects import HeightGradient, PositionScale
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
@@ -87,6 +88,15 @@ CHAINS = {
 @pytest.fixture(params=CHAINS, name="model")
 def _model(request):
     return CHAINS[request.param]
+
+
+def test_hypotheses_predicted_in_blocks_read_as_all_at_once(monkeypatch):
+    plan, chain = plan_of(40), Chain(FreeMixture(2), FreeLevels(), KnownScene(PATTERNS))
+    chain = chain.with_effects(HeightGradient(), PositionScale())
+    theta = np.concatenate([thetas(30, 2), np.random.default_rng(3).normal(0, 0.01, (30, 3))], axis=1)
+    whole = chain.predict(theta, plan)
+    monkeypatch.setattr("probewise.sensor.chain._MOST_NUMBERS", 7 * 40 * 2)
+    np.testing.assert_allclose(chain.predict(theta, plan), whole, atol=1e-8)
 
 
 def test_hypotheses_together_equal_one_by_one(model):

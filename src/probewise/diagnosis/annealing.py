@@ -157,8 +157,10 @@ def _moved(
         length = scale * 2.38 / math.sqrt(2 * z.shape[1]) * rng.choice([1.0, 0.3], (len(own), 1))
         to = z[own] + length * (first - second)
         to_q, to_p = log_q(to), log_p(to)
-        rise = (1 - beta) * (to_q - q[own]) + beta * (to_p - p[own])
-        taken = np.log(rng.random(len(own))) < rise
+        inside = np.isfinite(to_q) & np.isfinite(to_p)
+        rise = (1 - beta) * (to_q[inside] - q[own][inside]) + beta * (to_p[inside] - p[own][inside])
+        taken = inside.copy()
+        taken[inside] = np.log(rng.random(len(own)))[inside] < rise
         z[own[taken]], q[own[taken]], p[own[taken]] = to[taken], to_q[taken], to_p[taken]
         accepted += int(taken.sum())
     rate = accepted / len(z)

@@ -107,7 +107,7 @@ def _of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
         yield from _steps(covariate, ways.shift)
         yield from _windows(covariate, ways.adds, (4, 8, 16))
     elif covariate.name == "time":
-        for terms in (3, 8, 24):
+        for terms in (3, 8, 24, 64):
             yield _smooth(covariate, ways.adds, terms)
         for way in (ways.gain, ways.shift):
             yield _smooth(covariate, way, 3)

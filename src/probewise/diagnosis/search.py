@@ -49,6 +49,7 @@ _WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stand
 _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
 _SINGLES = 6  # effects that are refitted alone
 _WORTH_REFITTING = 6.0  # nats behind the best so far: screening about a fit that one effect has bent is so far off
+_FAINT = 0.35  # of a trace; where a null leaves no more to first order, a large effect may show in another way
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _LEAST_ELSEWHERE = 1e-4  # probability of such a combination
 _WORTH_TRYING = 0.05  # of the leading variant's weight
@@ -343,8 +344,11 @@ class _Searcher:
             ranked = sorted(odds, key=lambda names: -odds[names])
             best_so_far = max(c.log_z + self._log_prior(c.names) for c in grown)
             grown = []
-            # A user's own effect was named to be tried, however far it leads from where screening is linear.
-            own = [names for names in ranked if size == 1 and names[0] not in EFFECTS]
+            # A user's own effect was named to be tried, however far it leads from where screening is linear; and
+            # screening says nothing of what the null takes up all but a little of to first order.
+            own = [
+                names for names in ranked if size == 1 and (names[0] not in EFFECTS or names[0] in self._faint(best))
+            ]
             width, behind = (_SINGLES, _WORTH_REFITTING) if size == 1 else (self.beam, STEERING)
             for rank, names in enumerate(dict.fromkeys([*ranked[:width], *own])):
                 # A combination that screening puts this far behind cannot come to matter.
@@ -375,6 +379,12 @@ class _Searcher:
                 known[names, noise] = max(score, known.get((names, noise), -np.inf))
                 if score > wishes.get(names, (-np.inf,))[0]:
                     wishes[names] = (score, parent, name)
+
+    def _faint(self, null: Candidate) -> set[str]:
+        """Name the effects of which a fit leaves little to first order, whatever their setting."""
+        bank = self.templates.bank(null.found, list(self.mean_effects.values()))
+        left = bank.surviving(Linearised.of(null.found, null.law))
+        return {name for name, members in bank.members.items() if left[members].max() < _FAINT}
 
     def _wish_for_pairs(self, grown: list[Candidate], wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
         """Add pairs of which neither effect leads alone."""

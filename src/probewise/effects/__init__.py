@@ -34,7 +34,7 @@ from probewise.effects.response import Nonlinearity
 from probewise.effects.saturation import Saturation
 from probewise.effects.tilt import SensorTilt
 from probewise.effects.vocabulary import NamedEffect, NoiseEffect
-from probewise.effects.waves import Flicker, PeriodicPositionError
+from probewise.effects.waves import Flicker, PeriodicPositionError, StickSlip
 from probewise.effects.wear import SlowSinking, SlowTurn
 
 VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
@@ -78,7 +78,10 @@ VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 """Every effect that the diagnosis weighs, by name."""
 
 UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
-    {effect.name: effect for effect in (ArmKnock, GainStep, BentRails, MissingTooth, Reflection, SlowTurn, SlowSinking)}
+    {
+        effect.name: effect
+        for effect in (ArmKnock, GainStep, BentRails, MissingTooth, StickSlip, Reflection, SlowTurn, SlowSinking)
+    }
 )
 """Physics outside the vocabulary, by names of our own: what a diagnosis says is unknown, and what it may be."""
 
@@ -139,6 +142,7 @@ __all__ = [
     "SignalDependentNoise",
     "SlowSinking",
     "SlowTurn",
+    "StickSlip",
     "draw_readings",
     "edge_distance",
     "in_scans",

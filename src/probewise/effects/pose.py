@@ -62,11 +62,14 @@ class Backlash(NamedEffect[Poses]):
         )
 
 
+_LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
+
+
 @dataclass(frozen=True)
 class PositionScale(NamedEffect[Poses]):
     """Steps that are not as long as they should be: X (1 + x), Y (1 + y)."""
 
-    typical: float = 0.002
+    typical: float = 0.01
 
     name: ClassVar[str] = "position_scale"
     stage: ClassVar[Stage] = Stage.POSE
@@ -76,7 +79,7 @@ class PositionScale(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: two thousandths are typical of a drive that was calibrated by a ruler."""
+        """Need no scale: a hundredth is typical, a wheel that is taken for another makes tenths."""
         return cls()
 
     @cached_property
@@ -90,8 +93,8 @@ class PositionScale(NamedEffect[Poses]):
         return replace(value, x_mm=value.x_mm * (1 + theta[:, :1]), y_mm=value.y_mm * (1 + theta[:, 1:2]))
 
     def bank(self) -> FloatArray:
-        """One setting of two columns: linear in both."""
-        return self.typical * np.eye(2)[None, :, :]
+        """List settings of two columns: a small one, which the SSF's width may take up, and large ones."""
+        return np.array([self.typical, *_LARGE_SCALES])[:, None, None] * np.eye(2)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many percent the arm moves too far."""

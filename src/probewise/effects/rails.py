@@ -20,7 +20,7 @@ from probewise.sensor.stages import Poses, Stage
 __all__ = ["BentRails", "MissingTooth"]
 
 _UNIT_MM = 10.0
-_MOST_PLACES = 48
+_MOST_PLACES = 160
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What comes back again and again: sine waves in time and in place."""
+"""What comes back again and again: sine waves in time and in place, and a slide that sticks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["Flicker", "PeriodicPositionError"]
+__all__ = ["Flicker", "PeriodicPositionError", "StickSlip"]
 
 # Two turns: whatever the phase, one of its names lies far from both ends.
 _PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 _MOST_FREQUENCIES = 1024
+_ORDERS = np.arange(1, 7)  # of a sawtooth's waves; the slip takes a sixth of the period
+_SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # of each, damped lest the sum overshoot
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,58 @@ class PeriodicPositionError(NamedEffect[Poses]):
         return (
             f"the arm swings by {give_or_take(mean[0], sd[0])} mm about the place it was sent to, again every "
             f"{give_or_take(mean[1], sd[1])} mm of X: a gear or lead screw that is not round"
+        )
+
+
+@dataclass(frozen=True)
+class StickSlip(NamedEffect[Poses]):
+    """A slide that sticks and jumps: X + amp_mm saw(X / period_mm + phase), a sawtooth from 1 to -1."""
+
+    typical_mm: float = 0.3
+    shortest_mm: float = 3.0
+    longest_mm: float = 25.0
+    n_periods: int = 32
+    n_phases: int = 6
+
+    name: ClassVar[str] = "stick_slip"
+    stage: ClassVar[Stage] = Stage.POSE
+    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "1")
+    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Look from three steps of X to a quarter of its range, where X moves."""
+        x_mm = np.unique(extent.plan.x_mm)
+        if len(x_mm) < 8:
+            return None
+        shortest, longest = 3 * float(np.median(np.diff(x_mm))), 0.25 * float(np.ptp(x_mm))
+        return cls(0.003 * extent.length_mm, shortest, longest) if longest > shortest else None
+
+    @cached_property
+    def prior(self) -> Product:
+        """How far it is off at most, of either sign, period over its orders of magnitude, and phase in turns."""
+        period = LogUniform(self.shortest_mm, self.longest_mm)
+        return Product({"amp_mm": HeavyTailed(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
+
+    def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        """Shift the poses along X, (n_samples, n_points)."""
+        turns = 2 * np.pi * (value.x_mm / theta[:, 1:2] + theta[:, 2:3])
+        saw = sum(share * np.sin(order * turns) for order, share in zip(_ORDERS, _SHARES, strict=True))
+        return replace(value, x_mm=value.x_mm + theta[:, :1] * saw)
+
+    def bank(self) -> FloatArray:
+        """Every phase at periods evenly spaced in waves over the range, (n_periods n_phases, 1, 3)."""
+        waves = np.linspace(1.0 / self.longest_mm, 1.0 / self.shortest_mm, self.n_periods + 2)[1:-1]
+        periods, phases = np.meshgrid(1 / waves, np.arange(self.n_phases) / self.n_phases - 0.5, indexing="ij")
+        amounts = np.full(periods.size, self.typical_mm)
+        return np.stack([amounts, periods.ravel(), phases.ravel()], axis=-1)[:, None, :]
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how far the slide is off, and after which way it jumps."""
+        return (
+            f"the slide sticks and jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, again every "
+            f"{give_or_take(mean[1], sd[1])} mm of X: it runs dry"
         )
 
 

@@ -49,6 +49,7 @@ _WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stand
 _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
 _SINGLES = 6  # effects that are refitted alone
 _WORTH_REFITTING = 6.0  # nats behind the best so far: screening about a fit that one effect has bent is so far off
+_TAKEN_APART = 3  # leading combinations, of which each effect is left out in turn
 _FAINT = 0.35  # of a trace; where a null leaves no more to first order, a large effect may show in another way
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _LEAST_ELSEWHERE = 1e-4  # probability of such a combination
@@ -142,6 +143,7 @@ class _Searcher:
         if self.depth > 1:
             self._screen_pairs(null)
         self._grow_beam()
+        self._take_apart()
         # Beside a form of the SSF that the readings refute, it is the form that is missing.
         best = max(c.log_z for c in self._nulls())
         self._weigh_unknown([c for c in self._nulls() if c.log_z > best - _WORTH_GROWING])
@@ -421,18 +423,30 @@ class _Searcher:
             still_open = [n for n, p in merged.items() if p > 0.02]
             if not still_open:
                 return
-            names = max(still_open, key=lambda n: merged[n])
-            parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
-            held = max(parts, key=lambda c: (len(c.names), c.log_z))
-            for added in [n for n in names if n not in held.names]:
-                grown = self._refit(held, added)
-                if grown is None:
-                    self.not_felt.add(names)
-                    for noise, evidence in held.evidence.items():
-                        known = self.about_parts.get((names, noise), np.inf)
-                        self.about_parts[names, noise] = min(known, evidence.log_z)
-                    break
-                held = grown
+            self._reach(max(still_open, key=lambda n: merged[n]))
+
+    def _take_apart(self) -> None:
+        """Refit the leading combinations less one effect: what screening put first may be superfluous."""
+        ranked = sorted(self.candidates.values(), key=lambda c: -(c.log_z + self._log_prior(c.names)))
+        for candidate in [c for c in ranked if len(c.names) > 1][:_TAKEN_APART]:
+            for rest in itertools.combinations(candidate.names, len(candidate.names) - 1):
+                refitted = {names for _, names in self.candidates}
+                if rest not in refitted | self.not_felt:
+                    self._reach(rest)
+
+    def _reach(self, names: Names) -> None:
+        """Refit a combination, from the largest of its parts that is."""
+        parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
+        held = max(parts, key=lambda c: (len(c.names), c.log_z))
+        for added in [n for n in names if n not in held.names]:
+            grown = self._refit(held, added)
+            if grown is None:
+                self.not_felt.add(names)
+                for noise, evidence in held.evidence.items():
+                    known = self.about_parts.get((names, noise), np.inf)
+                    self.about_parts[names, noise] = min(known, evidence.log_z)
+                break
+            held = grown
 
     def _extend(self, parent: Candidate, name: str) -> tuple[Candidate, dict[Names, float]]:
         """Refit with one more effect, in the likely ones of its variants; give the closed-form scores too."""
@@ -446,8 +460,11 @@ class _Searcher:
         problem = Linearised.of(parent.found, self._law_of(parent))
         scores = score_effects(problem, own)[name]
         weights = templates.weights(scores)
-        tried = self._worth_trying(templates, weights)
-        refitted = [self._refit_variant(parent, name, templates, scores, variant, problem) for variant in tried]
+        # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
+        plain = self._plainly(parent, problem)
+        likeliest = (templates.weights(score_effects(about, own)[name]) for about in plain)
+        tried = list(dict.fromkeys([*self._worth_trying(templates, weights), *(int(np.argmax(w)) for w in likeliest)]))
+        refitted = [self._refit_variant(parent, name, templates, scores, k, [problem, *plain]) for k in tried]
         # What refits have shown of variants counts for more than what screening promised.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
@@ -475,16 +492,13 @@ class _Searcher:
         templates: EffectTemplates,
         scores: FloatArray,
         variant: int,
-        problem: Linearised,
+        problems: Sequence[Linearised],
     ) -> Candidate:
         """Refit with one variant of one more effect, from the best entries of its bank."""
         effect, own = self.mean_effects[name], np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
         ranked = own[np.argsort(-scores[own])]
         starts = []
-        # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
-        plain = parent.evidence[min(parent.evidence, key=len)].law
-        problems = [problem] if plain.alike(problem.law) else [problem, Linearised.of(parent.found, plain)]
         for about, at in itertools.product(problems, ranked[: 2 if scores[ranked[0]] > 5 else 1]):
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
@@ -494,7 +508,12 @@ class _Searcher:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # A null with several basins: with the effect the best may be another one than without.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        return self._weighed(model, np.stack(starts), problem.law)
+        return self._weighed(model, np.stack(starts), problems[0].law)
+
+    def _plainly(self, parent: Candidate, problem: Linearised) -> list[Linearised]:
+        """Lay a fit out under the plainest law of the noise, where that is another one."""
+        plain = parent.evidence[min(parent.evidence, key=len)].law
+        return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
 
     def _other_orders(self) -> None:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""

@@ -468,7 +468,7 @@ class _Searcher:
         # What refits have shown of variants counts for more than what screening promised.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
-        weights = weights / weights[tried[best]]
+        weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
         weights[tried] = np.exp(log_z - log_z[best])
         weights /= weights.sum()
         log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights))

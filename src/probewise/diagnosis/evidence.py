@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, degrees_of_freedom
-from probewise.diagnosis.noise import NoiseLaw, Tail
+from probewise.diagnosis.noise import NoiseLaw, forms
 from probewise.diagnosis.noise_models import LaidOut, NoiseModel
 
 __all__ = [
@@ -84,13 +84,14 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     laid_out = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
     out = np.empty(len(laid_out.laws))
-    normal = [node for node, law in enumerate(laid_out.laws) if law.share == 0]
+    normal = [node for node, law in enumerate(laid_out.laws) if law.tail.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
         out[nodes] = _of_normal_laws(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
-    tailed: dict[tuple[bytes, bytes, bytes], list[int]] = {}  # by their whitening
+    tailed: dict[tuple[tuple[bytes, bytes, bytes], bool], list[int]] = {}  # by whitening, flat tops apart
     for node in sorted({*range(len(out))} - {*normal}):
-        tailed.setdefault(laid_out.laws[node].linear, []).append(node)
+        law = laid_out.laws[node]
+        tailed.setdefault((law.linear, law.flat > 0), []).append(node)
     for nodes in tailed.values():
         out[nodes] = _of_tails(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
     out += [law.log_extra for law in laid_out.laws]
@@ -122,12 +123,12 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd
 
 
 def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:
-    """Weigh a fit under laws of one whitening that differ in their tails, (n_laws,)."""
+    """Weigh a fit under laws of one whitening that differ in their tails or flat tops, (n_laws,)."""
     turned = laws[0](joined)
     p, n_points = turned.shape[1] - 1, laws[0].n_points
     slopes, residual = turned[:, :p], turned[:, p:]
     gram = slopes.T @ slopes
-    tail = Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))
+    tail = forms(laws)
     steps, sigma = np.zeros((p, len(laws))), tail.scale(residual, n_points, floor=sd_floor)
     for _ in range(3):
         left = residual - slopes @ steps
@@ -174,8 +175,13 @@ class Linearised:
         sigma = sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
-        augmented = np.concatenate([law.as_normal(whitened, sigma)[:, 0] / sd, -found.z])
-        return cls(basis, augmented - basis @ (basis.T @ augmented), law, sd, n_points)
+        augmented = np.concatenate([law.pseudo(whitened, sigma)[:, 0] / sd, -found.z])
+        residual = augmented - basis @ (basis.T @ augmented)
+        if law.flat:
+            # The noise is known; what says less than its readings should, flat at the top, does not make it smaller.
+            rest = math.sqrt(max(free - float(residual @ residual), 0.0))
+            basis, residual = np.concatenate([basis, np.zeros((1, p))]), np.append(residual, rest)
+        return cls(basis, residual, law, sd, n_points)
 
     @property
     def n_rows(self) -> int:

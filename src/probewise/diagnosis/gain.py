@@ -115,7 +115,7 @@ def _log_density(
     miss = recording.readings[asked] - predicted
     narrow, wide = (
         _log_normal(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
-        for times, share in ((1.0, 1 - law.share), (law.times, law.share))
+        for times, share in ((law.widening, 1 - law.share), (law.times, law.share))
     )
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
 

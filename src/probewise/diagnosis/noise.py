@@ -7,6 +7,7 @@ heavy-tailed noise; so every hypothesis about the mean is weighed under white an
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
@@ -14,9 +15,10 @@ import numpy as np
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.flat import Flat
 from probewise.recordings.plan import Recording
 
-__all__ = ["NoiseLaw", "Tail", "noise_statistics", "steps_within_scans", "white"]
+__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white"]
 
 _EM_STEPS = 12
 _LEAST = 1e-150  # of a scale: readings that are all as predicted are no error
@@ -38,7 +40,8 @@ class NoiseLaw:
     """The law of all readings' noise, up to its overall sd.
 
     Whitening, a linear map, makes residuals independent and of one scale sigma; what is left of each is
-    normal, but with probability `share` `times` as wide: a heavy tail. Readings that are lost say nothing.
+    normal, but with probability `share` `times` as wide: a heavy tail; or rounded, flat at the top. Readings that are
+    lost say nothing.
 
     Parameters
     ----------
@@ -52,6 +55,8 @@ class NoiseLaw:
         The tail; none by default.
     log_extra
         What the law says beyond the density of the readings that are not lost: of those that are.
+    flat, sigma
+        What rounding adds, where there is no tail: a uniform part, so many sigma either way; sigma is then known.
     """
 
     sd: FloatArray
@@ -60,6 +65,8 @@ class NoiseLaw:
     share: float = 0.0
     times: float = 1.0
     log_extra: float = 0.0
+    flat: float = 0.0
+    sigma: float = 1.0
     kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
     def __post_init__(self) -> None:
@@ -78,7 +85,7 @@ class NoiseLaw:
     def alike(self, other: NoiseLaw) -> bool:
         """Tell whether another law is as good as the same."""
         return (
-            (self.share, self.times) == (other.share, other.times)
+            (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
             and np.array_equal(self.lost, other.lost)
             and np.allclose(self.sd, other.sd, rtol=0.03)
             and np.allclose(self.carry, other.carry, atol=0.03)
@@ -109,9 +116,18 @@ class NoiseLaw:
         return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
 
     @cached_property
-    def tail(self) -> Tail:
-        """The tail by itself."""
-        return Tail(self.share, self.times)
+    def tail(self) -> Tail | Flat:
+        """The form of one whitened reading's density."""
+        return forms([self])
+
+    @property
+    def widening(self) -> float:
+        """Sd of a whitened reading in units of sigma, a tail aside: what rounding adds."""
+        return math.sqrt(1 + self.flat**2 / 3)
+
+    def plain(self) -> NoiseLaw:
+        """Leave normal noise of the same whitening."""
+        return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0)
 
     def scale(self, whitened: FloatArray, *, floor: float = 0.0) -> FloatArray:
         """Most likely sigma of whitened residuals, (n_points, k) -> (k,); `floor` is added in quadrature."""
@@ -128,12 +144,22 @@ class NoiseLaw:
         """Turn whitened residuals (n_points, k) into those of normal noise that say as much about the mean."""
         return self.tail.as_normal(whitened, sigma)
 
+    def pseudo(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Give residuals as `as_normal` does, but none farther than it is.
+
+        Beyond a flat top the density falls faster than on the average, and what would be told by that no change needs.
+        """
+        normal = self.as_normal(whitened, sigma)
+        return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
+
     def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw residuals as `as_normal` makes them, in units of their sd, (n_points, n_draws)."""
+        """Draw residuals as `pseudo` makes them, in units of their sd, (n_points, n_draws)."""
         eps = rng.standard_normal((len(self.sd), n_draws))
-        if self.share:
+        if not self.tail.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
-            eps = self.as_normal(eps, np.ones(n_draws)) * math.sqrt(self.information)
+            if self.flat:
+                eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
+            eps = self.pseudo(eps, np.ones(n_draws)) * math.sqrt(self.information)
         return eps * self.kept[:, None]
 
 
@@ -213,6 +239,18 @@ class Tail:
     def _weights(self, squares: FloatArray) -> FloatArray:
         """Expect the precision of each residual, 1 for those of the narrow part."""
         return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * expit(self._log_odds(squares)))
+
+
+def forms(laws: Sequence[NoiseLaw]) -> Tail | Flat:
+    """Take the densities of laws that all have a tail, or all a flat top, together: one of k."""
+    one = len(laws) == 1
+    if laws[0].flat:
+        if one:
+            return Flat(laws[0].flat, laws[0].sigma)
+        return Flat(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]))
+    if one:
+        return Tail(laws[0].share, laws[0].times)
+    return Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))
 
 
 @lru_cache(maxsize=256)

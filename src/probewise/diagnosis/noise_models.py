@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,8 @@ __all__ = ["LaidOut", "NoiseModel", "rough_sd"]
 
 _FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
 _MANY = 12  # nodes of one effect that beside another's would be too many
+_APART = 0.3  # of the logarithm, from one node of the noise beside rounding to the next
+_HALF_STEPS = np.exp(_APART * np.arange(-6, 10))  # of rounding, in sd of the noise beside it: 0.17 to 15
 _FINE = 0.01  # noise sd: how exactly a lost reading holds its value where nothing is rounded
 
 
@@ -43,11 +45,14 @@ class NoiseModel:
         What was read.
     likely
         For some effects by name, the nodes (n_nodes, n_params) that matter, and the log of what each stands for.
+    rounding
+        Step of a lattice that all readings are on, where nothing else is wrong with the noise, or 0.
     """
 
     effects: tuple[NoiseEffect, ...]
     recording: Recording
     likely: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    rounding: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,6 +95,10 @@ class NoiseModel:
         level = self._level(settings, seen)
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law(level, k, far) for k in range(len(settings)))
+        if self.rounding:
+            laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for law in laws for x in _HALF_STEPS)
+            # Sigma is integrated out by these nodes, over its logarithm, as it is elsewhere in closed form.
+            settings, log_weight = np.repeat(settings, len(_HALF_STEPS), axis=0), math.log(_APART)
         return LaidOut(settings, laws, np.full(len(laws), log_weight))
 
     def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, float]:

@@ -150,7 +150,10 @@ def sample_model(
         sd = lattice_step_sd(recording.readings[recording.usable], float(theta[0, i]))
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
-    noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
+    if law.flat:  # the noise beside rounding, as each node of its law has it
+        noise_sd = np.array([own.sigma for own in noise.laid_out.laws])[nodes]
+    else:
+        noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
     return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)
 
 

@@ -16,24 +16,22 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.bank import Bank
+from probewise._arrays import IntArray
 from probewise.diagnosis.bases import unknown_templates, unlike_named
-from probewise.diagnosis.convergence import require_finite
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
-from probewise.diagnosis.evidence import Linearised, NoiseEvidence, weigh
-from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Fit, Model, start_with_more_gaussians, starts_of_one_gaussian
 from probewise.diagnosis.free_form import FreeForm
-from probewise.diagnosis.noise import NoiseLaw, steps_within_scans, white
-from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.diagnosis.noise import steps_within_scans, white
+from probewise.diagnosis.noises import Noises
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
+from probewise.diagnosis.refits import Refits, acts
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
-from probewise.diagnosis.templates import EffectTemplates, TemplateMemory, subsets
-from probewise.diagnosis.visible import log_visible
+from probewise.diagnosis.templates import EffectTemplates, TemplateMemory
 from probewise.diagnosis.weighed import STEERING, TOO_ALIKE, Candidate, Search, nats_apart, outside, weighed
-from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step
+from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
@@ -41,7 +39,6 @@ __all__ = ["search"]
 
 Names = tuple[str, ...]
 
-_WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
 # An effect may look like another Gaussian, and be explained better by its name at fewer of them.
 _RIVAL_ORDER = 100.0  # nats behind the best: an SSF order so far back is not searched
 _WORTH_GROWING = 20.0  # nats behind the best of its size: nothing more grows from there
@@ -53,7 +50,6 @@ _TAKEN_APART = 3  # leading combinations, of which each effect is left out in tu
 _FAINT = 0.35  # of a trace; where a null leaves no more to first order, a large effect may show in another way
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _LEAST_ELSEWHERE = 1e-4  # probability of such a combination
-_WORTH_TRYING = 0.05  # of the leading variant's weight
 _PAIRED = 12  # effects that pairs are screened of, the best alone
 
 
@@ -111,12 +107,9 @@ class _Searcher:
         self.templates = TemplateMemory(self.usable)
         self.extent = Extent.of(self.recording)
         self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
-        self.noise_effects = {n: cast(NoiseEffect, e) for n, e in self.effects.items() if e.stage is Stage.NOISE}
-        self.step = lattice_step(self.recording.readings[self.usable])
-        self.certain = self._certain()
-        open_names = [n for n in self.noise_effects if n != Quantisation.name]
-        single = [self._with_certain(names) for names in subsets(open_names, 1)]
-        self.noise_models = {names: self._noise_model(names) for names in single}
+        on_noise = {n: cast(NoiseEffect, e) for n, e in self.effects.items() if e.stage is Stage.NOISE}
+        self.noises = Noises(self.recording, on_noise, self.prior, self.sd_floor)
+        self.refits = Refits(self.recording, self.sensor, self.noises, self.templates)
         self.candidates: dict[tuple[int, Names], Candidate] = {}
         self.sensors: dict[int, Null] = {}
         self.about_null: dict[tuple[Names, Names], float] = {}  # (mean, noise) -> log evidence
@@ -128,7 +121,10 @@ class _Searcher:
 
     def run(self) -> Search:
         self._null_fits()
-        self._pair_noises()
+        null = max(self._nulls(), key=lambda c: c.log_z)
+        if self.noises.pair_up(null.found, null.evidence):
+            for candidate in self._nulls():
+                self._keep(candidate.with_evidence(self.noises.weigh(candidate.found)))
         null = max(self._nulls(), key=lambda c: c.log_z)
         self.about = null.found
         level = null.found.predicted
@@ -138,7 +134,7 @@ class _Searcher:
         starts = np.flatnonzero(steps_within_scans(self.recording) == 0)
         bases = unknown_templates(self.covariates, level - level.min(), slope, starts)
         named = [effect for name, effect in self.mean_effects.items() if name not in UNNAMED]
-        problem = Linearised.of(null.found, self._law_of(null))
+        problem = Linearised.of(null.found, self.refits.law_of(null))
         self.bases = unlike_named(bases, self.templates.bank(null.found, named), problem)
         if self.depth > 1:
             self._screen_pairs(null)
@@ -159,8 +155,8 @@ class _Searcher:
             Search(
                 self.recording,
                 self.effects,
-                self.noise_models,
-                self.certain,
+                self.noises.models,
+                self.noises.certain,
                 self.sensors,
                 self.candidates,
                 self._screened(),
@@ -194,55 +190,8 @@ class _Searcher:
         out |= self.about_parts
         return {key: value for key, value in out.items() if key[0] not in refitted | self.spoken_for}
 
-    def _certain(self) -> Names:
-        """Name what needs no weighing: that all readings are multiples of a coarse step is no chance."""
-        coarse = self.step > Quantisation.seen_above * rough_sd(self.recording)
-        return (Quantisation.name,) if Quantisation.name in self.noise_effects and coarse else ()
-
-    def _with_certain(self, names: Names) -> Names:
-        return tuple(sorted({*names, *self.certain}))
-
-    def _noise_model(self, names: Names, likely: Mapping[str, tuple[FloatArray, float]] | None = None) -> NoiseModel:
-        # What is certain is not asked again about each fit, whose own residual may be larger.
-        known = {name: (np.array([[self.step]]), 0.0) for name in self.certain}
-        return NoiseModel(tuple(self.noise_effects[n] for n in names), self.recording, {**known, **(likely or {})})
-
-    def _log_noise(self, names: Names) -> float:
-        uncertain = tuple(n for n in names if n not in self.certain)
-        return self.prior.log_noise(uncertain)
-
     def _nulls(self) -> list[Candidate]:
         return [c for (_, names), c in self.candidates.items() if not names]
-
-    def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> Fit:
-        """Go a few steps from each start, then all the way from the best."""
-        if len(starts) > 1:
-            tried = [fit(model, self.recording, start, law, sd_floor=self.sd_floor, max_steps=5) for start in starts]
-            starts = min(tried, key=lambda f: f.objective).z[None, :]
-        return require_finite(fit(model, self.recording, starts[0], law, sd_floor=self.sd_floor, max_steps=max_steps))
-
-    def _weigh_all(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        return {k: weigh(found, noise, sd_floor=self.sd_floor) for k, noise in self.noise_models.items()}
-
-    def _weighed(
-        self,
-        model: Model,
-        starts: FloatArray,
-        law: NoiseLaw,
-        max_steps: int = 30,
-    ) -> Candidate:
-        """Fit under a law of the noise, weigh under every noise model, refit where another one is more probable."""
-        found = self._fit(model, starts, law, max_steps)
-        for _ in range(2):
-            evidence = self._weigh_all(found)
-            best = max(evidence, key=lambda k: evidence[k].log_z + self._log_noise(k))
-            if evidence[best].law.alike(law):
-                break
-            law = evidence[best].law
-            found = self._fit(model, found.z[None, :], law, max_steps)
-        else:
-            evidence = self._weigh_all(found)
-        return Candidate.of(found, law, evidence, log_visible(found, law, self.usable))
 
     def _keep(self, candidate: Candidate) -> Candidate:
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
@@ -253,16 +202,18 @@ class _Searcher:
         plan, law = self.recording.plan, white(self.n_points)
         if self.sensor is not None:
             self.sensors[self.sensor.n_gaussians] = self.sensor
-            self._keep(self._weighed(Model(self.sensor, (), plan), self.sensor.starts, law))
+            self._keep(self.refits.weighed(Model(self.sensor, (), plan), self.sensor.starts, law))
             return
         first = default_sensor(self.extent, 1)
         self.sensors[1] = first
-        last = self._keep(self._weighed(Model(first, (), plan), starts_of_one_gaussian(first), law))
+        last = self._keep(self.refits.weighed(Model(first, (), plan), starts_of_one_gaussian(first), law))
         if self.max_order == 1:
             return
         free = FreeForm.about(first)
         self.sensors[free.n_gaussians] = free
-        bent = self._keep(self._weighed(Model(free, (), plan), free.start_from(last.found.z), self._law_of(last)))
+        bent = self._keep(
+            self.refits.weighed(Model(free, (), plan), free.start_from(last.found.z), self.refits.law_of(last))
+        )
         best = max(bent.log_z, last.log_z)
         for n in range(2, self.max_order + 2):
             # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
@@ -271,35 +222,8 @@ class _Searcher:
             wanted = default_sensor(self.extent, n)
             self.sensors[n] = wanted
             starts = start_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
-            last = self._keep(self._weighed(Model(wanted, (), plan), starts, self._law_of(last)))
+            last = self._keep(self.refits.weighed(Model(wanted, (), plan), starts, self.refits.law_of(last)))
             best = max(best, last.log_z)
-
-    def _law_of(self, candidate: Candidate) -> NoiseLaw:
-        """Give the most probable law of the noise about a fit."""
-        evidence = candidate.evidence
-        return evidence[max(evidence, key=lambda k: evidence[k].log_z + self._log_noise(k))].law
-
-    def _pair_noises(self) -> None:
-        """Where one fault of the noise stands out, look for a second one beside it."""
-        null = max(self._nulls(), key=lambda c: c.log_z)
-        plain = self._with_certain(())
-        single = {k: e for k, e in null.evidence.items() if k != plain}
-        first = max(single, key=lambda k: single[k].log_z, default=plain)
-        if first == plain or single[first].log_z < null.evidence[plain].log_z + _WORTH_A_PAIR:
-            return
-        (name,) = (n for n in first if n not in self.certain)
-        likely = {name: single[first].likely_nodes(name)}
-        best = max(e.log_z + self._log_noise(k) for k, e in null.evidence.items())
-        for other in single:
-            both = tuple(sorted({*first, *other}))
-            if other == first:
-                continue
-            model = self._noise_model(both, likely | self.noise_models[other].every_third())
-            value = weigh(null.found, model, sd_floor=self.sd_floor).log_z
-            if value + self._log_noise(both) > best - _WORTH_A_PAIR:
-                self.noise_models[both] = model
-        for candidate in self._nulls():
-            self._keep(candidate.with_evidence(self._weigh_all(candidate.found)))
 
     def _log_prior(self, names: Names) -> float:
         return self.prior.log_mean(names)
@@ -400,14 +324,14 @@ class _Searcher:
 
     def _refit(self, parent: Candidate, added: str) -> Candidate | None:
         """Refit a candidate with one more effect and keep it, or note that the effect is not felt."""
-        candidate, scores = self._extend(parent, added)
-        if _acts(candidate, parent, self.sd_floor):
+        against = 0.0 if parent.names else self._coincidence(parent.worth)
+        candidate, scores = self.refits.extended(parent, self.mean_effects[added], against)
+        if acts(candidate, parent, self.sd_floor):
             return self._keep(candidate)
         # Laplace fails where an effect is too small to be felt and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
         names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():
-            against = 0.0 if parent.names else self._coincidence(parent.worth)
             self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
         self.not_felt.add(names)
         return None
@@ -448,73 +372,6 @@ class _Searcher:
                 break
             held = grown
 
-    def _extend(self, parent: Candidate, name: str) -> tuple[Candidate, dict[Names, float]]:
-        """Refit with one more effect, in the likely ones of its variants; give the closed-form scores too."""
-        effect = self.mean_effects[name]
-        templates = self.templates.of(parent.found, effect)
-        own = Bank.of(templates.columns, [name] * len(templates.columns), self.n_points)
-        by_noise = {
-            noise: log_mean(score_effects(Linearised.of(parent.found, evidence.law), own)[name])
-            for noise, evidence in parent.steering()
-        }
-        problem = Linearised.of(parent.found, self._law_of(parent))
-        scores = score_effects(problem, own)[name]
-        weights = templates.weights(scores)
-        # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
-        plain = self._plainly(parent, problem)
-        likeliest = (templates.weights(score_effects(about, own)[name]) for about in plain)
-        tried = list(dict.fromkeys([*self._worth_trying(templates, weights), *(int(np.argmax(w)) for w in likeliest)]))
-        refitted = [self._refit_variant(parent, name, templates, scores, k, [problem, *plain]) for k in tried]
-        # What refits have shown of variants counts for more than what screening promised.
-        log_z = np.array([candidate.log_z for candidate in refitted])
-        best = int(np.argmax(log_z))
-        weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
-        weights[tried] = np.exp(log_z - log_z[best])
-        weights /= weights.sum()
-        log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights))
-        if not parent.names:
-            log_share -= self._coincidence(parent.worth)
-        return refitted[best].as_share(log_share, {**parent.weights, name: weights}), by_noise
-
-    def _worth_trying(self, templates: EffectTemplates, weights: FloatArray) -> list[int]:
-        """Choose which of an effect's variants are refitted: the leader, and the next where they are bound to scans.
-
-        Two scans of opposite ways look the same to first order; which was turned by 30 degrees shows in a refit.
-        """
-        first, *others = np.argsort(-weights)[:2].tolist()
-        bound = templates.variants[first].scans or templates.variants[first].patterns
-        return [first, *(k for k in others if bound and weights[k] > _WORTH_TRYING * weights[first])]
-
-    def _refit_variant(
-        self,
-        parent: Candidate,
-        name: str,
-        templates: EffectTemplates,
-        scores: FloatArray,
-        variant: int,
-        problems: Sequence[Linearised],
-    ) -> Candidate:
-        """Refit with one variant of one more effect, from the best entries of its bank."""
-        effect, own = self.mean_effects[name], np.flatnonzero(templates.choice == variant)
-        model = parent.found.model.with_effect(templates.variants[variant])
-        ranked = own[np.argsort(-scores[own])]
-        starts = []
-        for about, at in itertools.product(problems, ranked[: 2 if scores[ranked[0]] > 5 else 1]):
-            columns = templates.columns[at]
-            amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
-            setting = effect.start(templates.settings[at], amount)
-            z = parent.found.z + about.absorbed(parent.found, columns @ amount)
-            starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
-        if self.sensor is not None and len(self.sensor.starts) > 1:
-            # A null with several basins: with the effect the best may be another one than without.
-            starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        return self._weighed(model, np.stack(starts), problems[0].law)
-
-    def _plainly(self, parent: Candidate, problem: Linearised) -> list[Linearised]:
-        """Lay a fit out under the plainest law of the noise, where that is another one."""
-        plain = parent.evidence[min(parent.evidence, key=len)].law
-        return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
-
     def _other_orders(self) -> None:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
         if self.sensor is not None:
@@ -546,15 +403,15 @@ class _Searcher:
         """Refit a candidate's effects at another SSF order; keep it where they are felt."""
         null, sensor = self.candidates[n, ()], self.sensors[n]
         own = source.found.z[source.found.model.sensor.n_params :]
-        candidate = self._weighed(
+        candidate = self.refits.weighed(
             Model(sensor, source.found.model.effects, self.recording.plan),
             np.concatenate([null.found.z, own])[None, :],
-            self._law_of(source),
+            self.refits.law_of(source),
             max_steps=15,
         )
         log_share = source.log_share + self._coincidence(source.worth) - self._coincidence(sensor.worth)
         candidate = candidate.as_share(log_share, source.weights)
-        if _acts(candidate, null, self.sd_floor):
+        if acts(candidate, null, self.sd_floor):
             self._keep(candidate)
 
     def _speak_for_the_unnamed(self) -> None:
@@ -584,14 +441,3 @@ class _Searcher:
                     best = value
                     total = logsumexp(list(by_family.values()))
                     self.unknown_shares = {k: math.exp(v - total) for k, v in by_family.items()}
-
-
-def _acts(candidate: Candidate, parent: Candidate, sd_floor: float) -> bool:
-    """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
-    law = candidate.law
-
-    def misfit(found: Fit) -> float:
-        whitened = law(found.residuals)[:, None]
-        return float(law.misfit(whitened, law.scale(whitened, floor=sd_floor), floor=sd_floor)[0])
-
-    return 2 * (misfit(parent.found) - misfit(candidate.found)) > 3.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -47,7 +47,7 @@ class Surrogate:
         residual = law(readings - quadratic.center)[:, None]
         residual = law.as_normal(residual, np.maximum(law.scale(residual, floor=sd_floor), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
-        normal = replace(law, share=0.0, times=1.0)
+        normal = law.plain()
         return cls(quadratic, center, steps, normal, sd_floor, turned[:, -1], turned[:, :-1])
 
     def log_density(self, e: FloatArray) -> FloatArray:

@@ -181,7 +181,7 @@ def nats_apart(first: Candidate, second: Candidate) -> float:
     Half of the squared distance between their predictions, in sds of the noise as the first has it.
     """
     apart = first.law((first.found.residuals - second.found.residuals)[:, None])
-    return 0.5 * float(np.sum(apart**2)) / first.found.sd**2
+    return 0.5 * float(np.sum(apart**2)) / (first.found.sd * first.law.widening) ** 2
 
 
 def in_vocabulary(noise: Names) -> Names:

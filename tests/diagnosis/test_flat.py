@@ -1,0 +1,122 @@
+"""The law of coarsely rounded readings, against probabilities of lattice cells, quadrature and draws."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from probewise.diagnosis import diagnose
+from probewise.diagnosis.flat import Flat
+from probewise.diagnosis.noise import NoiseLaw, forms
+from probewise.diagnosis.noises import Noises
+from probewise.diagnosis.odds import PriorOdds
+from probewise.effects import VOCABULARY, Extent
+from probewise.recordings import Recording, paper_plan
+from probewise.sensor import Stage
+from probewise.world import concealed as hidden
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+STEP, SIGMA = 4.0, 0.7
+LAW = Flat(0.5 * STEP / SIGMA, SIGMA)
+
+
+def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recording:
+    plan = paper_plan()
+    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
+    mean = World(spot, concealed=concealed).expected(plan)
+    readings = mean + noise_sd * np.random.default_rng(seed).standard_normal(len(plan))
+    return Recording(plan, STEP * np.round(readings / STEP))
+
+
+def noises(recording: Recording) -> Noises:
+    extent = Extent.of(recording)
+    built = {name: kind.for_extent(extent) for name, kind in VOCABULARY.items() if kind.stage is Stage.NOISE}
+    effects = {name: effect for name, effect in built.items() if effect is not None}
+    return Noises(recording, effects, PriorOdds.over(effects), 1e-6)
+
+
+def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
+    """Whatever the mean: the chance that normal noise lands within half a step of the reading, over the step."""
+    mean = np.linspace(-9.0, 9.0, 37)[:, None]
+    reading = STEP
+    cell = norm.cdf((reading + STEP / 2 - mean) / SIGMA) - norm.cdf((reading - STEP / 2 - mean) / SIGMA)
+    misfit = np.array([LAW.misfit(row[None], np.array([SIGMA]), 1)[0] for row in reading - mean])
+    # A difference of cumulatives is exact to 1e-16 of one, and no better: far out it says nothing.
+    told = cell[:, 0] > 1e-12
+    wanted = -np.log(cell[told, 0] / STEP) - 0.5 * np.log(2 * np.pi)
+    np.testing.assert_allclose(misfit[told], wanted, rtol=1e-6, atol=1e-9)
+    assert np.isfinite(misfit).all()
+
+
+@pytest.mark.parametrize("half", [0.8, 2.0, 6.0])
+def test_pseudo_observations_say_as_much_as_the_density_does(half):
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=400_000) + half * rng.uniform(-1, 1, 400_000)
+    flat, one = Flat(half, 1.0), np.ones(1)
+    plain, moved = (flat.as_normal((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.03)
+    assert np.var(plain) == pytest.approx(1 / float(flat.information), rel=0.02)
+
+    def squared_score(x: float) -> float:
+        density = (norm.cdf(x + half) - norm.cdf(x - half)) / (2 * half)
+        slope = (norm.pdf(x + half) - norm.pdf(x - half)) / (2 * half)
+        return slope**2 / density
+
+    wanted = quad(squared_score, -half - 7, half + 7, points=[-half, half], limit=200)[0]
+    assert float(flat.information) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_inside_the_flat_top_a_residual_says_nothing():
+    inside = LAW.as_normal(np.array([[0.0], [0.3]]), np.array([SIGMA]))
+    outside = LAW.as_normal(np.array([[STEP]]), np.array([SIGMA]))
+    assert np.abs(inside).max() < 0.01 * outside[0, 0]
+
+
+def test_laws_of_one_kind_are_taken_together():
+    one = np.ones(5)
+    laws = [NoiseLaw(one, 0 * one, one > 1, flat=flat, sigma=1 / flat) for flat in (1.0, 3.0)]
+    z = np.linspace(-2, 2, 5)[:, None]
+    together, sigma = forms(laws), np.array([1.0, 1 / 3])
+    apart = np.concatenate([law.misfit(z, law.scale(z)) for law in laws])
+    np.testing.assert_allclose(together.misfit(z, sigma, 5), apart)
+    np.testing.assert_allclose(together.scale(z, 5), sigma)
+
+
+def test_no_pseudo_observation_is_farther_than_what_was_read():
+    law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
+    z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
+    pseudo = law.pseudo(z, np.array([0.5]))
+    assert (np.abs(pseudo) <= np.abs(z)).all()
+    np.testing.assert_array_equal(pseudo[3:], z[3:])
+    drawn = law.draws(20_000, rng=np.random.default_rng(0))
+    assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
+
+
+@pytest.mark.parametrize(("noise_sd", "coarse"), [(0.4, True), (3.0, False)])
+def test_rounding_that_hides_the_noise_stands_alone(noise_sd, coarse):
+    found = noises(rounded(noise_sd, 1))
+    assert found.certain == ("quantisation",)
+    assert (list(found.models) == [("quantisation",)]) is coarse
+
+
+@pytest.mark.parametrize("noise_sd", [0.3, 0.7])
+def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise_sd):
+    """Where nine readings of ten say the same, what rounding leaves follows the place, and was taken for physics."""
+    found = diagnose(rounded(noise_sd, 1), rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("noise", ("quantisation",))
+    assert found.p_value > 0.01  # one test; 0.09 and more in twenty others
+    sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
+    assert sigma == pytest.approx(noise_sd, rel=0.5)
+
+
+def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
+    found = diagnose(rounded(0.4, 1, hidden.AmbientGradient(0.15, 0.0)), rng=np.random.default_rng(0))
+    assert found.combination == ("ambient_gradient", "quantisation")
+    slope = next(effect for effect in found.effects if effect.name == "ambient_gradient").parameters[0]
+    assert abs(slope.mean - 0.15) < 4 * slope.sd
+    assert dataclasses.asdict(found.improvement)["log_evidence"] > 10

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import Diagnosis, model_with
 from probewise.effects import VOCABULARY, Extent
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.world.challenge import NO_PHYSICS, Case, kept_back
 
@@ -32,7 +35,8 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     names = [h.name for h in case.truth.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
     if showing and len(showing) == len(case.truth.hidden):
-        models["right"] = model_with(case.recording, showing, rng=fitting)
+        with suppress(ParameterError):  # readings are lost at times, and of these none was
+            models["right"] = model_with(case.recording, showing, rng=fitting)
     sensors = {
         name: samples.fitted_sensor(diagnosis.recording, rng=child)
         for (name, samples), child in zip(models.items(), drawing, strict=False)

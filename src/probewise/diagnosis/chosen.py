@@ -53,4 +53,6 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     noise = on_noise if on_noise in found.noise_models else found.certain
     best = found.best(on_mean, noise) or found.best((), noise)
     assert best is not None  # the calibrated sensor is always weighed
+    if not np.isfinite(best.evidence[noise].log_z):
+        raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that show in this recording")
     return sample_model(best.found, best.evidence[noise], recording, weights=best.weights, rng=rng)

@@ -21,7 +21,6 @@ from probewise.sensor import Stage
 
 __all__ = ["EffectTemplates", "TemplateMemory", "effect_templates", "subsets"]
 
-
 _ROUNDING = 1e-9  # of the largest prediction; what changes by less is not changed
 _AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
 
@@ -121,8 +120,9 @@ def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: Int
         theta = model.theta_of(np.repeat(sensor, n, axis=0), each)
         read = model.chain.predict(theta, there) if seen is None else model.chain.read(seen, theta, there)
         change[rows, inside] = read - before[inside]
-    change[np.abs(change).max(axis=1) < _ROUNDING * np.abs(before).max()] = 0.0
-    return np.split(change[:, usable].T, len(bank), axis=1)
+    columns = change[:, usable].T
+    columns[:, np.abs(columns).max(axis=0) < _ROUNDING * np.abs(before).max()] = 0.0
+    return np.split(columns, len(bank), axis=1)
 
 
 def subsets(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:

@@ -106,8 +106,8 @@ class Bank:
         """Share of each template that a fit leaves, (n_templates,): 0 where its parameters take all of it up."""
         templates = self._under(problem.law).templates
         taken = problem.basis[: problem.n_points].T @ templates
-        whole, left = (np.add.reduceat(np.sum(a**2, axis=0), self._starts) for a in (templates, taken))
-        return np.asarray(np.sqrt(np.maximum(1 - left / np.maximum(whole, 1e-300), 0.0)))
+        whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._starts) for a in (templates, taken))
+        return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
 
     def _of_width(self, width: int) -> tuple[IntArray, IntArray]:
         """Give the numbers of the templates of one width, (n,), and of their columns, (n, width)."""

@@ -23,7 +23,6 @@ from probewise.diagnosis.templates import EffectTemplates, TemplateMemory
 from probewise.diagnosis.visible import log_visible
 from probewise.diagnosis.weighed import Candidate
 from probewise.effects import NamedEffect
-from probewise.recordings.plan import Recording
 
 __all__ = ["Refits", "acts"]
 
@@ -36,7 +35,6 @@ _WORTH_TRYING = 0.05  # of the leading variant's weight
 class Refits:
     """How a recording is fitted: with what is believed of its `sensor`, under which noises, about which templates."""
 
-    recording: Recording
     sensor: Null | None
     noises: Noises
     templates: TemplateMemory
@@ -98,11 +96,11 @@ class Refits:
 
     def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
         """Go a few steps from each start, then all the way from the best."""
-        floor = self.noises.sd_floor
+        recording, floor = self.noises.recording, self.noises.sd_floor
         if len(starts) > 1:
-            tried = [fit(model, self.recording, start, law, sd_floor=floor, max_steps=5) for start in starts]
+            tried = [fit(model, recording, start, law, sd_floor=floor, max_steps=5) for start in starts]
             starts = min(tried, key=lambda f: f.objective).z[None, :]
-        return require_finite(fit(model, self.recording, starts[0], law, sd_floor=floor, max_steps=max_steps))
+        return require_finite(fit(model, recording, starts[0], law, sd_floor=floor, max_steps=max_steps))
 
     def _of_variant(
         self,

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import IntArray
+from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.bases import unknown_templates, unlike_named
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
@@ -109,7 +110,7 @@ class _Searcher:
         self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
         on_noise = {n: cast(NoiseEffect, e) for n, e in self.effects.items() if e.stage is Stage.NOISE}
         self.noises = Noises(self.recording, on_noise, self.prior, self.sd_floor)
-        self.refits = Refits(self.recording, self.sensor, self.noises, self.templates)
+        self.refits = Refits(self.sensor, self.noises, self.templates)
         self.candidates: dict[tuple[int, Names], Candidate] = {}
         self.sensors: dict[int, Null] = {}
         self.about_null: dict[tuple[Names, Names], float] = {}  # (mean, noise) -> log evidence
@@ -246,7 +247,7 @@ class _Searcher:
         templates = self._templates(null.found, list(self.mean_effects))
         for noise, evidence in null.steering():
             problem = Linearised.of(null.found, evidence.law)
-            singles = score_effects(problem, self.templates.bank(null.found, list(self.mean_effects.values())))
+            singles = score_effects(problem, self._bank(null))
             ranked = sorted(singles, key=lambda name: -float(singles[name].max()))[:_PAIRED]
             if not ranked or log_mean(singles[ranked[0]]) < _WORTH_PAIRING:
                 continue
@@ -272,9 +273,8 @@ class _Searcher:
             grown = []
             # A user's own effect was named to be tried, however far it leads from where screening is linear; and
             # screening says nothing of what the null takes up all but a little of to first order.
-            own = [
-                names for names in ranked if size == 1 and (names[0] not in EFFECTS or names[0] in self._faint(best))
-            ]
+            always = (self.mean_effects.keys() - EFFECTS) | self._faint(best) if size == 1 else set()
+            own = [names for names in ranked if names[0] in always]
             width, behind = (_SINGLES, _WORTH_REFITTING) if size == 1 else (self.beam, STEERING)
             for rank, names in enumerate(dict.fromkeys([*ranked[:width], *own])):
                 # A combination that screening puts this far behind cannot come to matter.
@@ -292,7 +292,7 @@ class _Searcher:
     def _wish(self, parent: Candidate, wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
         """Screen every effect that a fit does not hold yet, by its templates about the null of the same SSF."""
         null = self.candidates[parent.n_gaussians, ()]
-        bank = self.templates.bank(null.found, list(self.mean_effects.values()))
+        bank = self._bank(null)
         against = 0.0 if parent.names else self._coincidence(parent.worth)
         for noise, evidence in parent.steering():
             scores = score_effects(Linearised.of(parent.found, evidence.law), bank)
@@ -306,9 +306,12 @@ class _Searcher:
                 if score > wishes.get(names, (-np.inf,))[0]:
                     wishes[names] = (score, parent, name)
 
+    def _bank(self, null: Candidate) -> Bank:
+        return self.templates.bank(null.found, list(self.mean_effects.values()))
+
     def _faint(self, null: Candidate) -> set[str]:
         """Name the effects of which a fit leaves little to first order, whatever their setting."""
-        bank = self.templates.bank(null.found, list(self.mean_effects.values()))
+        bank = self._bank(null)
         left = bank.surviving(Linearised.of(null.found, null.law))
         return {name for name, members in bank.members.items() if left[members].max() < _FAINT}
 

@@ -98,11 +98,8 @@ class PeriodicPositionError(NamedEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Look from three steps of X to twice its range, where X moves."""
-        x_mm = np.unique(extent.plan.x_mm)
-        if len(x_mm) < 8:
-            return None
-        shortest, longest = 3 * float(np.median(np.diff(x_mm))), 2 * float(np.ptp(x_mm))
-        return cls(0.003 * extent.length_mm, shortest, longest)
+        shortest, reach = _steps_and_range(extent.plan)
+        return cls(0.003 * extent.length_mm, shortest, 2 * reach) if reach > 0 else None
 
     @cached_property
     def prior(self) -> Product:
@@ -153,11 +150,8 @@ class StickSlip(NamedEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Look from three steps of X to a quarter of its range, where X moves."""
-        x_mm = np.unique(extent.plan.x_mm)
-        if len(x_mm) < 8:
-            return None
-        shortest, longest = 3 * float(np.median(np.diff(x_mm))), 0.25 * float(np.ptp(x_mm))
-        return cls(0.003 * extent.length_mm, shortest, longest) if longest > shortest else None
+        shortest, reach = _steps_and_range(extent.plan)
+        return cls(0.003 * extent.length_mm, shortest, 0.25 * reach) if 0.25 * reach > shortest else None
 
     @cached_property
     def prior(self) -> Product:
@@ -184,6 +178,12 @@ class StickSlip(NamedEffect[Poses]):
             f"the slide sticks and jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, again every "
             f"{give_or_take(mean[1], sd[1])} mm of X: it runs dry"
         )
+
+
+def _steps_and_range(plan: Plan) -> tuple[float, float]:
+    """Measure three steps of X and its range, mm; 0 and 0 where X takes fewer than eight places."""
+    x_mm = np.unique(plan.x_mm)
+    return (3 * float(np.median(np.diff(x_mm))), float(np.ptp(x_mm))) if len(x_mm) >= 8 else (0.0, 0.0)
 
 
 def _sine_and_cosine(amplitude: float, rates: FloatArray) -> FloatArray:

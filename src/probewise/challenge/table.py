@@ -12,6 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.challenge.estimates import Estimate, mean, resampled, share
+from probewise.challenge.ideal import ideal_set_size, most_often_right
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     NOISE,
@@ -125,8 +126,13 @@ def _naming(done: list[Result]) -> list[Row]:
     found = {size: share([leading_name_right(r) for r in _singles(done, size)]) for size in targets}
     falls = [_fall(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
+    rows = []
+    for size, least in targets.items():
+        best = [most_often_right(r["hidden"][0]) for r in _on_mean(_singles(done, size))]
+        rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
+        rows.append(Row(f"  who knows all but the name, at most, lambda {size:g}", mean(best)))
     return [
-        *(Row(f"right name first, lambda {size:g}", found[size], least) for size, least in targets.items()),
+        *rows,
         Row("right name first, largest fall as lambda grows", worst, most=0.0),
     ]
 
@@ -141,13 +147,22 @@ def _fall(before: Estimate, after: Estimate) -> Estimate:
 
 def _probabilities(done: list[Result]) -> list[Row]:
     covered = [any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in done]
-    sizes = {size: [float(len(r["credible_set"])) for r in _singles(done, size)] for size in (8.0, 12.0)}
+    rows = []
+    for size, most in ((8.0, 1.25), (12.0, 1.1)):
+        singles = _singles(done, size)
+        best = [ideal_set_size(r["hidden"][0]) for r in _on_mean(singles)]
+        rows += [
+            Row(
+                f"size of the credible set, lambda {size:g}",
+                mean([float(len(r["credible_set"])) for r in singles]),
+                most=most,
+            ),
+            Row(f"  the truth and its aliases as one, lambda {size:g}", mean([_merged_size(r) for r in singles])),
+            Row(f"  who knows all but the name, aliases as one, lambda {size:g}", mean(best)),
+        ]
     return [
         Row("95 % credible set holds the truth", share(covered), 0.95),
-        Row("size of the credible set, lambda 8", mean(sizes[8.0]), most=1.25),
-        Row("  the truth and its aliases as one", mean([_merged_size(r) for r in _singles(done, 8.0)])),
-        Row("size of the credible set, lambda 12", mean(sizes[12.0]), most=1.1),
-        Row("  the truth and its aliases, lambda 12", mean([_merged_size(r) for r in _singles(done, 12.0)])),
+        *rows,
         Row("expected calibration error", calibration_error(done), most=0.02),
         Row("wrong name stated above .9", share([_surely_wrong(r) for r in done]), most=0.005),
     ]

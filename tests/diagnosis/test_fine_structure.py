@@ -1,0 +1,110 @@
+"""Fine structure of an SSF: its slopes by a second route, what it takes up and what it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.coordinates import default_sensor, known_scene
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fine_structure import with_fine_structure
+from probewise.diagnosis.fit import Fit, Model, fit
+from probewise.diagnosis.free_form import FreeForm
+from probewise.diagnosis.noise import white
+from probewise.diagnosis.own_model import OwnModel
+from probewise.effects import VOCABULARY, Extent
+from probewise.priors import LogUniform, Product
+from probewise.recordings import Recording, paper_plan, two_way_plan
+from probewise.sensor import Chain, FixedLevels, FreeMixture
+from probewise.world.spots import Blob, gaussian_spot, ring_spot
+from probewise.world.world import World
+
+NOISE_SD = 0.4
+
+
+def fitted(recording: Recording, *, free: bool = True) -> Fit:
+    sensor = default_sensor(Extent.of(recording), 1)
+    law = white(len(recording))
+    one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law, sd_floor=NOISE_SD)
+    if not free:
+        return one
+    form = FreeForm.about(sensor)
+    start = form.start_from(one.z)[0]
+    return fit(Model(form, (), recording.plan), recording, start, law, sd_floor=NOISE_SD)
+
+
+def usable(recording: Recording) -> np.ndarray:
+    return np.flatnonzero(recording.usable)
+
+
+def noise_free(spot, plan) -> Recording:
+    return Recording(plan, World(spot).expected(plan))
+
+
+def test_the_slopes_are_those_of_a_mixture_with_a_little_of_each():
+    """Second route: a true mixture of the fitted Gaussian and one narrow one, by a difference in its share."""
+    recording = noise_free(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5), paper_plan())
+    found = fitted(recording, free=False)
+    more = with_fine_structure(found, usable(recording))
+    n_more = more.slopes.shape[1] - 7
+    assert n_more > 30
+    assert (more.z[7:] == 0).all()
+    theta = found.model.sensor.theta(found.z[None, :])[0]
+    blob, levels = theta[:6], theta[6:]
+    covariance = np.linalg.inv(2 * np.array([[blob[3], blob[5]], [blob[5], blob[4]]]))
+    # The one in the middle: that whose slopes depend least on where the Gaussian is.
+    aa, cc, bb = np.linalg.inv(2 * 0.35**2 * covariance)[[0, 0, 1], [0, 1, 1]]
+    share = 1e-4
+    mass = np.sqrt((aa * bb - cc**2) / (blob[3] * blob[4] - blob[5] ** 2))
+    two = np.concatenate([blob, [blob[0] * share / (1 - share) * mass, blob[1], blob[2], aa, bb, cc]])
+    chain = Chain(FreeMixture(2), FixedLevels(*levels), known_scene(recording.plan), ())
+    slope = (chain.predict(two[None, :], recording.plan)[0] - found.predicted) / share
+    closest = np.linalg.norm(more.slopes[:, 7:] / 0.03 - slope[:, None], axis=0).min()
+    assert closest < 1e-3 * np.linalg.norm(slope)
+
+
+@pytest.mark.parametrize("plan", [paper_plan(), two_way_plan()], ids=["paper", "two_way"])
+def test_it_takes_up_what_a_free_form_leaves_of_a_ring(plan):
+    recording = noise_free(ring_spot(4.0, 1.2, pixel_mm=0.5), plan)
+    found = fitted(recording)
+    found = replace(found, sd=NOISE_SD)
+    more = with_fine_structure(found, usable(recording))
+
+    def left(about: Fit) -> float:
+        design = np.concatenate([about.slopes / NOISE_SD, np.eye(about.slopes.shape[1])])
+        target = np.concatenate([about.residuals / NOISE_SD, -about.z])
+        return float(np.linalg.norm(target - design @ np.linalg.lstsq(design, target, rcond=None)[0]))
+
+    rest = float(np.linalg.norm(found.residuals) / NOISE_SD)
+    assert rest > 1.0  # something is left of a ring, in noise sds
+    prior = np.linalg.norm(found.z)
+    assert np.sqrt(max(left(more) ** 2 - prior**2, 0.0)) < 0.5 * rest
+
+
+def test_effects_outlast_it():
+    plan = two_way_plan()
+    world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
+    rng = np.random.default_rng(7)
+    recording = Recording(plan, world.expected(plan) + NOISE_SD * rng.standard_normal(len(plan)))
+    found = fitted(recording)
+    law = white(len(recording))
+    extent = Extent.of(recording)
+    without, beside = (Linearised.of(f, law) for f in (found, with_fine_structure(found, usable(recording))))
+    for name in ("backlash", "lag", "sensor_tilt", "ambient_gradient", "glint", "battery_sag", "flicker"):
+        effect = VOCABULARY[name].for_extent(extent)
+        model = found.model.with_effect(effect)
+        z = np.concatenate([found.z, model.scores_of(effect.bank()[0][:1])[0]])
+        change = (model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0])[:, None]
+        kept = np.linalg.norm(beside.project(change)) / np.linalg.norm(without.project(change))
+        assert kept > 0.9, name
+
+
+def test_a_model_without_an_ssf_stays_as_it_is():
+    plan = paper_plan()
+    prior = Product({"level": LogUniform(1.0, 10.0)})
+    null = OwnModel(lambda parameters, plan: parameters["level"] * np.ones(len(plan)), prior)
+    model = Model(null, (), plan)
+    found = Fit(model, np.zeros(1), np.zeros(len(plan)), np.zeros(len(plan)), np.ones((len(plan), 1)), 1.0, 0.0)
+    assert with_fine_structure(found, np.arange(len(plan))) is found

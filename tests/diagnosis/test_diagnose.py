@@ -73,10 +73,15 @@ def test_a_recording_without_effects_is_clean():
 
 @pytest.mark.parametrize(
     ("seen", "p_value", "n_asked"),
-    [((0.3, 0.9, 0.9, 0.9), 0.3, 1), ((0.001, 0.2, 0.9, 0.9), 0.2, 2), ((0.003, 0.002, 0.001, 0.004), 0.004, 4)],
+    [
+        ((0.3, 0.9, 0.9, 0.9, 0.9), 0.3, 1),
+        ((0.001, 0.2, 0.9, 0.9, 0.9), 0.2, 2),
+        ((0.003, 0.002, 0.001, 0.004, 0.003), 0.004, 5),
+        ((0.003, 0.002, 0.001, 0.004, 0.3), 0.3, 5),
+    ],
 )
-def test_an_alarm_must_stand_at_every_order_of_the_ssf(monkeypatch, seen, p_value, n_asked):
-    """One to three Gaussians and a free form are fitted; the next is asked where one raises an alarm."""
+def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value, n_asked):
+    """One to three Gaussians and a free form are fitted, then fine structure; the next is asked on an alarm."""
     left = list(seen)
     monkeypatch.setattr("probewise.diagnosis.engine.global_p_value", lambda *_: left.pop(0))
     found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.audit import Alias, surviving_cosine
+from probewise.diagnosis.aliases import Alias, surviving_cosine
 from probewise.diagnosis.bank import Bank
 from probewise.diagnosis.coordinates import (
     default_sensor,

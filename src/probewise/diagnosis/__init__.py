@@ -5,7 +5,7 @@ how a poor likelihood is found out: its residuals are tested, located, explained
 the gain is shown on readings kept back.
 """
 
-from probewise.diagnosis.audit import Alias, NextMeasurement
+from probewise.diagnosis.aliases import Alias
 from probewise.diagnosis.audit_document import CURE_PLAN, audit_json
 from probewise.diagnosis.chosen import model_with
 from probewise.diagnosis.document import diagnosis_json, diagnosis_schema
@@ -13,6 +13,7 @@ from probewise.diagnosis.earlier import SensorPrior
 from probewise.diagnosis.engine import Thorough, diagnose
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place
+from probewise.diagnosis.next_scans import NextMeasurement
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
 from probewise.diagnosis.own_model import OwnModel, Parameters

@@ -1,6 +1,6 @@
-"""What the arm could be told to do next: repeat, reverse, respeed, rotate, relight, raise.
+"""What the arm could be told to do next: repeat, reverse, respeed, rotate, relight, raise, or look at something else.
 
-The first three need nothing but the arm; the last three need what the recording's `controls` list.
+The first three need nothing but the arm, the next three what the recording's `controls` list, the last a hand.
 """
 
 from __future__ import annotations
@@ -12,29 +12,88 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.recordings.plan import Plan
+from probewise.diagnosis.joining import join
+from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import COMMANDED
 
-__all__ = ["Command", "behind", "commands", "minutes_of", "rescheduled"]
+__all__ = [
+    "MOST_READINGS",
+    "Command",
+    "Excerpt",
+    "behind",
+    "commands",
+    "distinct_scans",
+    "excerpts",
+    "in_turn",
+    "minutes_of",
+    "one_after_another",
+    "put_off",
+    "reading_s",
+    "rescheduled",
+    "start_after",
+]
 
 BREAK_S = 30.0  # to turn the sensor, or to change what lies under it
+LAY_S = 60.0  # more than that to lay something that the plan had not
 MOST_READINGS = 102
 _LEAST_ROWS = 8
 _MOST_SCANS = 6
+_NEAR = 26  # readings around an edge
 _TURN_DEG = 45.0
 _RAISE = 1.25  # of the height that the recording names
 
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """One scan that the arm could take: which of the six R's, words for it, its readings."""
+    """One scan that the arm could take: which of the six R's, "across" or "lay", words for it, its readings."""
 
     kind: str
     description: str
     plan: Plan
 
+    @property
+    def minutes(self) -> float:
+        """How long it takes, with the break before it."""
+        return minutes_of(self.plan) + (LAY_S / 60.0 if self.kind == "lay" else 0.0)
 
-def commands(plan: Plan, *, strides: Sequence[int] = (1,)) -> list[Command]:
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """Some rows of a scan: a suffix for its name, words to go behind its own."""
+
+    suffix: str
+    words: str
+    rows: IntArray
+
+
+def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Excerpt]:
+    """Take parts of a scan that are worth a scan of their own.
+
+    Parameters
+    ----------
+    scan
+        Its row numbers.
+    strides
+        Every reading, every fourth, ...: one excerpt for each.
+    level
+        What is expected of its readings, in the order of `scan`: one excerpt more, where that changes most.
+    """
+    out = []
+    for stride in strides:
+        rows = scan[::stride][:MOST_READINGS]
+        if rows.size >= _LEAST_ROWS:
+            words = {1: "", 2: " (every second reading)"}.get(stride, f" (every {stride}th reading)")
+            out.append(Excerpt("" if stride == 1 else f"_{stride}", words, rows))
+    if level is not None and scan.size > _NEAR:
+        change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(level)))])
+        first = int(np.argmax(change[_NEAR - 1 :] - change[: 1 - _NEAR]))
+        if change[first + _NEAR - 1] > change[first]:
+            rows = scan[first : first + _NEAR]
+            out.append(Excerpt("_near", f" (the {_NEAR} readings where it changes most)", rows))
+    return out
+
+
+def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
     """List what could be done with the scans of a plan, each pose of a scan once.
 
     Parameters
@@ -43,20 +102,18 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,)) -> list[Command]:
         What was measured, or is to be.
     strides
         Take every reading of a scan, every fourth, ...: a list for each.
+    level
+        What is expected of every row, (n_points,): then also the part of each scan where that changes most.
     """
     controls = plan.instrumentation.controls
     height_mm = plan.instrumentation.height_mm
-    gap_s, start_s = _reading_s(plan), float(plan.time_s.max(initial=0.0)) + BREAK_S
+    gap_s, start_s = reading_s(plan), start_after(plan)
     out: list[Command] = []
-    for scan in _distinct_scans(plan):
+    for scan in distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
         degrees = math.degrees(float(plan.orientation_rad[scan[0]]))
-        for stride in strides:
-            rows = scan[::stride][:MOST_READINGS]
-            if rows.size < _LEAST_ROWS:
-                continue
-            label = name if stride == 1 else f"{name}_{stride}"
-            every = "" if stride == 1 else f", every {stride}th reading"
+        for part in excerpts(scan, strides=strides, level=None if level is None else level[scan]):
+            rows, every, label = part.rows, part.words, f"{name}{part.suffix}"
             once = rescheduled(plan, rows, start_s, gap_s, label)
             both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
             out += [
@@ -110,6 +167,11 @@ def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
     )
 
 
+def start_after(plan: Plan) -> float:
+    """When a scan after a plan can begin, in s."""
+    return float(plan.time_s.max(initial=0.0)) + BREAK_S
+
+
 def minutes_of(plan: Plan) -> float:
     """Estimate how long a plan takes, with the break before it."""
     return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
@@ -145,7 +207,7 @@ def _covariate(plan: Plan, name: str, first: Plan) -> FloatArray:
     return np.full(len(plan), last)
 
 
-def _distinct_scans(plan: Plan) -> list[IntArray]:
+def distinct_scans(plan: Plan) -> list[IntArray]:
     """Row numbers of the first scans of all that move and differ in pattern, orientation or ends."""
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in plan.rows_by_scan():
@@ -157,7 +219,29 @@ def _distinct_scans(plan: Plan) -> list[IntArray]:
     return list(seen.values())[:_MOST_SCANS]
 
 
-def _reading_s(plan: Plan) -> float:
+def one_after_another(scans: Sequence[Command]) -> tuple[Plan, list[IntArray]]:
+    """Lay scans out as one plan, so that a model looks at all of them in one prediction; and the rows of each."""
+    ends = np.cumsum([len(scan.plan) for scan in scans])
+    rows = [np.arange(end - len(scan.plan), end) for end, scan in zip(ends.tolist(), scans, strict=True)]
+    return join([Recording(scan.plan, np.zeros(len(scan.plan))) for scan in scans]).plan, rows
+
+
+def in_turn(scans: Sequence[Command]) -> Plan:
+    """Take scans one after the other, with a break before each."""
+    out: list[Command] = []
+    for scan in scans:
+        out.append(put_off(scan, out[-1].plan) if out else scan)
+    return one_after_another(out)[0]
+
+
+def put_off(scan: Command, plan: Plan) -> Command:
+    """Put a scan off until a plan is over."""
+    delay_s = start_after(plan) - float(scan.plan.time_s[0])
+    return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))
+
+
+def reading_s(plan: Plan) -> float:
+    """Seconds from one reading to the next, the median within scans; 1 s where nothing tells."""
     gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if gaps.size else 1.0

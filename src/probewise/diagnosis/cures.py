@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.diagnosis.commands import BREAK_S, Command, behind, commands
+from probewise.diagnosis.commands import Command, behind, commands, put_off
 from probewise.diagnosis.sights import LEAST_NATS, LEAST_SHARE, Expected, LaidOut, Survivors, nats_between
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
@@ -45,7 +44,7 @@ def cures_of(
     while len(chosen) < _MOST_SCANS:
         taken = {command.plan.scan_names for command in chosen}
         offered = [c for c in commands(plan, strides=_STRIDES) if c.plan.scan_names not in taken]
-        options = [_put_off(command, current) for command in offered]
+        options = [put_off(command, current) for command in offered]
         if not options:
             break
         together = behind(current, [option.plan for option in options])
@@ -76,9 +75,3 @@ def _trouble(laid: LaidOut, rows: IntArray, ailing: Sequence[str]) -> float:
         else:
             total += max(1.0 - nats_between(max(like.values(), default=0.0)) / LEAST_NATS, 0.0)
     return total
-
-
-def _put_off(command: Command, plan: Plan) -> Command:
-    """Put a command off until a plan is over."""
-    delay_s = float(plan.time_s.max()) + BREAK_S - float(command.plan.time_s[0])
-    return replace(command, plan=replace(command.plan, time_s=command.plan.time_s + delay_s))

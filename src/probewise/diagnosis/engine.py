@@ -9,12 +9,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.audit import Alias, aliases, settle
+from probewise.diagnosis.aliases import Alias, aliases, settle
 from probewise.diagnosis.convergence import require_converged
 from probewise.diagnosis.coordinates import LEAST_READINGS
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.ensemble import Ensemble
 from probewise.diagnosis.evidence import Blocks, Linearised
+from probewise.diagnosis.fine_structure import with_fine_structure
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
@@ -42,7 +43,7 @@ Thorough: TypeAlias = Callable[[Search], tuple[Search, tuple[Weighing, ...]]]
 """Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
 
 N_DRAWS = 999
-_NO_ALARM = 0.05  # by any rule, so that no other order of the SSF need be asked
+_NO_ALARM = 0.05  # by any rule, so that no other form of the SSF need be asked
 _LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
 _RUIN = -1.0  # nats a reading kept back, below which what was named repairs nothing
 _DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
@@ -218,7 +219,7 @@ class _Diagnoser:
             improvement=improvement,
             aliases=tuple(pairs),
             noise=noise_found(self.search, best, noise_of, after, samples, rng=self.rng),
-            next_measurement=next_readings(self.search, hypotheses, null),
+            next_measurement=next_readings(self.search, null),
             null=null_samples,
             repaired=written,
             residuals_before=self._spread(null.found.residuals),
@@ -236,17 +237,20 @@ class _Diagnoser:
         return after, improvement_of(self.search, null, best, noise, after, p_value, rng=self.rng)
 
     def _p_value(self, null: Candidate, noise: Names, problem: Linearised, draws: FloatArray) -> float:
-        """Test that nothing is missing from the mean, be the SSF of the null's order or of a greater one.
+        """Test that nothing is missing from the mean, be the SSF of the null's order, of a greater one, or finer still.
 
         The evidence grants a Gaussian only where it gains the ten nats and more that it costs; what an SSF that is no
-        mixture leaves below that is no physics. So an alarm must stand at every order, and the greatest p-value counts.
+        mixture leaves below that is no physics. So an alarm must stand at every order, and beside fine structure about
+        the freest, and the greatest p-value counts.
         """
         p_value = global_p_value(problem, self.search.looks(null.found), draws)
-        for n in sorted(n for n, names in self.search.candidates if not names and n > null.n_gaussians):
+        freer = sorted(n for n, names in self.search.candidates if not names and n > null.n_gaussians)
+        rivals = [null, *(self.search.candidates[n, ()] for n in freer)]
+        asked = [*((c, c.found) for c in rivals[1:]), (rivals[-1], with_fine_structure(rivals[-1].found, self.usable))]
+        for rival, found in asked:
             if p_value > _NO_ALARM:
                 break
-            rival = self.search.candidates[n, ()]
-            problem = Linearised.of(rival.found, rival.evidence[noise].law)
+            problem = Linearised.of(found, rival.evidence[noise].law)
             own = problem.draws(N_DRAWS, rng=self.rng)
             p_value = max(p_value, global_p_value(problem, self.search.looks(rival.found), own))
         return p_value

@@ -55,7 +55,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
             renamed.append(names.index(own))
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
-        scan_names += [s if number == 0 else f"{s} ({number + 1})" for s in plan.scan_names]
+        scan_names += [f"{s} ({number + 1})" if s in scan_names else s for s in plan.scan_names]
     plans = [r.plan for r in recordings]
     shared = set.intersection(*({*p.covariates, *COMMANDED} for p in plans)) & {k for p in plans for k in p.covariates}
     joined = Plan(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from probewise.diagnosis.audit import Alias
+from probewise.diagnosis.aliases import Alias
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.verdict import ALARM, EffectFound, Hypothesis, Verdict
 from probewise.diagnosis.weighed import Search

@@ -1,50 +1,56 @@
-"""Which two hypotheses the next readings are to tell apart."""
+"""Which hypotheses the next readings are to tell apart."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.audit import NextMeasurement, covariance_of, next_measurement
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.fit import Model
-from probewise.diagnosis.verdict import Hypothesis
+from probewise.diagnosis.fit import Fit, degrees_of_freedom
+from probewise.diagnosis.next_scans import NextMeasurement, Rival, next_scans
 from probewise.diagnosis.weighed import Candidate, Search
-from probewise.sensor import Stage
 
 __all__ = ["next_readings"]
 
+_LEAST_PROBABILITY = 0.01
+_MOST_RIVALS = 5
 
-def next_readings(search: Search, hypotheses: tuple[Hypothesis, ...], null: Candidate) -> NextMeasurement | None:
-    """Ask for the readings that tell the two leading refitted hypotheses about the mean apart."""
-    leaders: list[Candidate] = []
-    for hypothesis in hypotheses:
-        names = tuple(n for n in hypothesis.effects if not _on_noise(search, n))
-        candidate = null if names in ((), ("unknown",)) else search.best(names, search.certain)
-        if candidate is not None and all(candidate.names != leader.names for leader in leaders):
-            leaders.append(candidate)
-        if len(leaders) == 2:
+
+def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
+    """Ask for the readings that tell the leading refitted hypotheses about the mean apart."""
+    by_mean = search.by_mean
+    # What has no name at all predicts no more than the null does.
+    probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
+    probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
+    ranked = sorted(probabilities, key=lambda names: -probabilities[names])
+    rivals: list[Rival] = []
+    for names in ranked:
+        candidate = search.best(names, search.certain) if names else null
+        if candidate is not None and (len(rivals) < 2 or probabilities[names] >= _LEAST_PROBABILITY):
+            rivals.append(_as_rival(candidate, probabilities[names]))
+        if len(rivals) == _MOST_RIVALS:
             break
-    if len(leaders) < 2:
-        rival = _rival_of(search, leaders[0], hypotheses)
-        if rival is None:
+    if len(rivals) == 1:
+        imagined = _imagined(search, null)
+        if imagined is None:
             return None
-    else:
-        rival = (leaders[1].found.model, leaders[1].found.z, covariance_of(leaders[1].found))
-    found = leaders[0].found
-    return next_measurement((found.model, found.z, covariance_of(found)), rival, found.sd, search.recording.plan)
+        rivals.append(imagined)
+    return next_scans(rivals, null.found.sd, search.recording.plan)
 
 
-def _rival_of(
-    search: Search, leader: Candidate, hypotheses: tuple[Hypothesis, ...]
-) -> tuple[Model, FloatArray, FloatArray] | None:
+def _as_rival(candidate: Candidate, probability: float) -> Rival:
+    return Rival(candidate.found.model, candidate.found.z, _root_of(candidate.found), probability)
+
+
+def _imagined(search: Search, null: Candidate) -> Rival | None:
     """Make a rival of the most probable effect that is not felt: just as large as lambda 3 here."""
-    ranked = [n for h in hypotheses for n in h.effects if n in search.effects and not _on_noise(search, n)]
-    name = next((n for n in ranked if n not in leader.names), None)
+    by_mean = search.by_mean
+    ranked = [n for names in sorted(by_mean, key=lambda names: -by_mean[names]) for n in names if n in search.effects]
+    name = next(iter(ranked), None)
     if name is None:
         return None
-    effect, found = search.effects[name], leader.found
-    best = max(leader.evidence.values(), key=lambda e: e.log_z)
+    effect, found = search.effects[name], null.found
+    best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
     templates = search.templates.of(found, effect)
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
@@ -54,10 +60,13 @@ def _rival_of(
         setting[k] *= min(3.0 / max(sizes[at], 1e-9), 50.0)
     model = found.model.with_effect(templates.variant(at))
     z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
-    covariance = np.zeros((len(z), len(z)))
-    covariance[: len(found.z), : len(found.z)] = covariance_of(found)
-    return model, z, covariance
+    root = np.zeros((len(z), len(z)))  # of that size, and no other
+    root[: len(found.z), : len(found.z)] = _root_of(found)
+    return Rival(model, z, root, 0.0)
 
 
-def _on_noise(search: Search, name: str) -> bool:
-    return name in search.effects and search.effects[name].stage is Stage.NOISE
+def _root_of(found: Fit) -> FloatArray:
+    """Take the square root of the covariance of a fit's coordinates by Laplace, noise white."""
+    n_points, p = found.slopes.shape
+    variance = found.sd**2 * n_points / degrees_of_freedom(found.slopes, found.sd)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(found.slopes.T @ found.slopes / variance + np.eye(p))).T)

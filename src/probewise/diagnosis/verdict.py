@@ -8,8 +8,9 @@ from typing import Literal, TypeAlias
 
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
-from probewise.diagnosis.audit import Alias, NextMeasurement
+from probewise.diagnosis.aliases import Alias
 from probewise.diagnosis.locate import Place
+from probewise.diagnosis.next_scans import NextMeasurement
 from probewise.diagnosis.repaired import ModelSamples
 from probewise.diagnosis.weighing import Weighing
 from probewise.recordings.plan import Recording

@@ -1,0 +1,164 @@
+"""The next scans: their information by a second route, and what they are for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from probewise.diagnosis.commands import MOST_READINGS, commands, excerpts
+from probewise.diagnosis.coordinates import default_sensor
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.layings import layings
+from probewise.diagnosis.next_scans import Outlook, Rival, mutual_information, next_scans
+from probewise.effects import VOCABULARY, Extent
+from probewise.recordings import HalfPlane, Plan, paper_plan, read_plan, write_plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+
+SPOT = FixedMixture.from_parameters(np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0]))  # a Gaussian of sd 5 mm
+
+
+def outlooks(seed: int, apart: float) -> list[Outlook]:
+    rng = np.random.default_rng(seed)
+    return [Outlook(apart * rng.standard_normal(4), 0.7 * rng.standard_normal((4, 2))) for _ in range(3)]
+
+
+def by_sampling(of: list[Outlook], weights: np.ndarray, n: int = 40_000) -> float:
+    """The mutual information itself: the mean log ratio of the true density to the mixture's."""
+    rng = np.random.default_rng(3)
+    laws = [multivariate_normal(o.mean, np.eye(4) + o.factor @ o.factor.T) for o in of]
+    total = 0.0
+    for law, weight in zip(laws, weights, strict=True):
+        y = law.rvs(n, random_state=rng)
+        densities = np.stack([w * other.pdf(y) for other, w in zip(laws, weights, strict=True)])
+        total += weight * float(np.mean(law.logpdf(y) - np.log(densities.sum(axis=0))))
+    return total
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.5, 1.5, 3.0, 8.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
+    weights = np.array([0.5, 0.3, 0.2])
+    bound, true = (f(outlooks(seed, apart), weights) for f in (mutual_information, by_sampling))
+    entropy = float(-np.sum(weights * np.log(weights)))
+    assert 0.4 * true - 0.02 < bound < true + 0.02
+    assert bound <= entropy + 1e-12
+    if apart == 8.0:
+        assert bound == pytest.approx(entropy, abs=0.02)
+
+
+def test_the_same_predictions_tell_nothing():
+    one = outlooks(0, 1.0)[0]
+    assert mutual_information([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
+
+
+def rival(name: str, probability: float, settings: list[float], plan: Plan) -> Rival:
+    extent = Extent(10.0, 60.0, plan)
+    sensor = default_sensor(extent, 1)
+    effect = VOCABULARY[name].for_extent(extent)
+    model = Model(sensor, (effect,), plan)
+    z = np.concatenate([np.zeros(sensor.n_params), model.scores_of(np.array([settings]))[0]])
+    return Rival(model, z, 0.01 * np.eye(len(z)), probability)
+
+
+@pytest.mark.parametrize(
+    "rivals",
+    [
+        {"edge_misplacement": [0.4], "sensor_tilt": [-0.4, 0.0]},
+        {"edge_misplacement": [0.4], "sensor_tilt": [-0.4, 0.0], "backlash": [-0.8]},
+        {"height_gradient": [0.01], "albedo_gradient": [-0.0014, 0.0]},
+    ],
+)
+def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
+    plan = paper_plan()
+    asked = next_scans([rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan)
+    assert asked is not None
+    assert len(asked.plan) <= MOST_READINGS
+    assert {asked.plan.pattern_names[k] for k in asked.plan.pattern} - plan.patterns.keys()
+    assert asked.expected_log_bayes_factor > 3
+    assert len(set(asked.plan.scan_names)) == len(asked.plan.scan_names)
+    assert (np.diff(asked.plan.time_s) > 0).all()
+    assert asked.plan.time_s[0] > plan.time_s[-1]
+    # What is asked for can be written, read by whoever carries it out, and predicted.
+    write_plan(asked.plan, tmp_path / "next_plan.csv")
+    read = read_plan(tmp_path / "next_plan.csv")
+    assert read.patterns == {name: asked.plan.patterns[name] for name in read.patterns}
+    np.testing.assert_allclose(read.x_mm, asked.plan.x_mm, atol=1e-9)
+
+
+def test_lag_against_backlash_wants_the_other_way():
+    plan = paper_plan()
+    lag, play = rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)
+    asked = next_scans([lag, play], 0.4, plan)
+    assert asked is not None
+    assert "backwards" in asked.description or "forth and back" in asked.description
+
+
+def test_a_plan_that_moves_nowhere_has_no_next_scan():
+    plan = paper_plan().take(np.arange(404, 408))
+    rivals = [rival("hysteresis", 0.5, [0.5], paper_plan()), rival("lag", 0.5, [0.5], paper_plan())]
+    assert next_scans([replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan) is None
+
+
+def read_by(plan: Plan) -> np.ndarray:
+    chain = Chain(SPOT, FixedLevels(0.0, 1.0), KnownScene(plan.patterns), ())
+    return chain.predict(np.empty((1, 0)), plan)[0]
+
+
+def laid(plan: Plan, scan: str) -> Plan:
+    return next(command.plan for command in layings(plan) if command.plan.scan_names == (scan,))
+
+
+def test_a_sheet_turned_half_round_swaps_black_and_white():
+    plan = paper_plan()
+    turned = laid(plan, "boundary_half_round_4")
+    at = np.searchsorted(plan.x_mm[:101], turned.x_mm)
+    np.testing.assert_allclose(read_by(turned), 1 - read_by(plan)[:101][at], atol=1e-12)
+
+
+@pytest.mark.parametrize("edge", [HalfPlane(0.0, 7.0), HalfPlane(0.4, -3.0, inside=0.2, outside=0.9)])
+def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
+    """A round spot cannot tell; places are mirrored on the diagonal through the scan's middle."""
+    plan = replace(paper_plan(), y_mm=paper_plan().y_mm + 4.0)
+    plan = replace(plan, patterns={**plan.patterns, "boundary": edge})
+    turned = laid(plan, "boundary_quarter_4")
+    at = np.arange(0, 101, 4)
+    assert np.ptp(turned.x_mm) == 0
+    np.testing.assert_allclose(read_by(turned), read_by(plan)[at], atol=1e-12)
+
+
+def test_a_sheet_moved_aside_reads_the_same_as_far_aside():
+    plan = paper_plan()
+    moved = laid(plan, "boundary_by_30_mm_near")
+    back = replace(moved, x_mm=moved.x_mm - 30.0, patterns={**moved.patterns, "boundary_by_30_mm": HalfPlane(0.0, 0.0)})
+    np.testing.assert_allclose(read_by(moved), read_by(back), atol=1e-12)
+    # The readings around the edge: it is among them, and not at their end.
+    assert moved.x_mm[5] < 30.0 < moved.x_mm[-6]
+
+
+def test_along_an_edge_there_is_nothing_to_lay_otherwise():
+    plan = paper_plan()
+    along = replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(math.pi / 2, 0.0)})
+    assert {command.kind for command in layings(along)} == {"lay", "across"}
+    assert all("boundary" not in command.description for command in layings(along))
+
+
+def test_excerpts_hold_the_step_and_every_so_many_readings():
+    scan = np.arange(100, 201)
+    level = np.where(np.arange(101) < 60, 10.0, 50.0) + np.linspace(0, 1, 101)
+    every, fourth, near = excerpts(scan, strides=(1, 4), level=level)
+    assert len(every.rows) == 101
+    assert fourth.rows[:3].tolist() == [100, 104, 108]
+    assert near.rows[0] <= 159 < 160 <= near.rows[-1]
+    assert len(excerpts(scan, strides=(1, 4), level=np.ones(101))) == 2  # nothing changes anywhere
+
+
+def test_a_scan_over_a_new_sheet_takes_longer():
+    plan = paper_plan()
+    again = next(c for c in commands(plan, strides=(4,)) if c.kind == "repeat")
+    new = next(c for c in layings(plan) if c.plan.scan_names == ("boundary_half_round_4",))
+    assert new.minutes == pytest.approx(again.minutes + 1.0)

@@ -179,6 +179,10 @@ class _Diagnoser:
         null_samples = samples if best is null else ensemble.of(null)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
         where = self._where(null, problem, draws, best, effects, p_value)
+        if verdict == "unknown" and not where and problem.law.share:
+            # What only readings far out show is noise to a tail.
+            plain = Linearised.of(null.found, problem.law.plain())
+            where = self._where(null, plain, plain.draws(N_DRAWS, rng=self.rng), best, effects, p_value)
         residuals_after, change = best.found.residuals, np.zeros(len(self.recording))
         if verdict == "unknown" and not foreseen:
             improvement, correction = corrected(self.search, null, best, after, noise, improvement, rng=self.rng)

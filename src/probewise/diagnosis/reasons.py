@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from probewise.diagnosis.aliases import Alias
 from probewise.diagnosis.locate import Place
+from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.verdict import ALARM, EffectFound, Hypothesis, Verdict
 from probewise.diagnosis.weighed import Search
 
@@ -69,6 +70,10 @@ def reason_of(
         if candidates:
             like = "; ".join(candidates)
             return f"Something is missing (p = {p_value:.2g}) that has no name; it is most like this: {like}."
+        family = max(search.unknown_shares, key=lambda k: search.unknown_shares[k], default="")
+        if family.endswith(FAR_OUT):
+            covariate = family.removesuffix(FAR_OUT).replace("_", " ")
+            return f"The readings that are far out lie together in {covariate}: something is missing there, not noise."
         place = f" It shows most in {where[0].covariate}." if where else ""
         known = " and ".join(name.replace("_", " ") for name in search.beside(noise))
         beside = f", beside {known}" if known else ""

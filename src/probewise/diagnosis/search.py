@@ -28,6 +28,7 @@ from probewise.diagnosis.noise import steps_within_scans, white
 from probewise.diagnosis.noises import Noises
 from probewise.diagnosis.null import Null
 from probewise.diagnosis.odds import PriorOdds
+from probewise.diagnosis.outlying import outlying, score_together
 from probewise.diagnosis.refits import Refits, acts
 from probewise.diagnosis.screening import log_mean, score_effects, score_pairs, score_unknown
 from probewise.diagnosis.templates import EffectTemplates, TemplateMemory
@@ -434,6 +435,9 @@ class _Searcher:
         for candidate in candidates:
             for noise, evidence in candidate.steering():
                 by_family = score_unknown(Linearised.of(candidate.found, evidence.law), self.bases)
+                if evidence.law.share > 0:
+                    far_out = outlying(candidate.found.residuals, evidence.law)
+                    by_family |= score_together(far_out, self.covariates)
                 if not by_family:
                     continue
                 value = evidence.log_z + log_mean(np.array(list(by_family.values())))

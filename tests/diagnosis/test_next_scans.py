@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.commands import MOST_READINGS, commands, excerpts
+from probewise.diagnosis.commands import MOST_READINGS, commands, excerpts, one_after_another
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.layings import layings
@@ -162,3 +162,13 @@ def test_a_scan_over_a_new_sheet_takes_longer():
     again = next(c for c in commands(plan, strides=(4,)) if c.kind == "repeat")
     new = next(c for c in layings(plan) if c.plan.scan_names == ("boundary_half_round_4",))
     assert new.minutes == pytest.approx(again.minutes + 1.0)
+
+
+def test_a_battery_is_expected_to_stay_as_it_was():
+    plan = paper_plan()
+    everywhere, rows = one_after_another(commands(plan)[:3], plan)
+    assert [len(own) for own in rows] == [101, 101, 102]
+    assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
+    asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan)
+    assert asked is not None
+    assert "battery_mv" not in asked.plan.covariates  # whoever reads it will say

@@ -82,7 +82,7 @@ def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect
     scans = [*commands(found.model.plan, level=null), *layings(found.model.plan)]
     if not (best and scans):
         return list(pairs)
-    everywhere, rows_of = one_after_another(scans)
+    everywhere, rows_of = one_after_another(scans, found.model.plan)
     null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
     there = {
         name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale

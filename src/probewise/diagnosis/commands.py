@@ -219,11 +219,16 @@ def distinct_scans(plan: Plan) -> list[IntArray]:
     return list(seen.values())[:_MOST_SCANS]
 
 
-def one_after_another(scans: Sequence[Command]) -> tuple[Plan, list[IntArray]]:
-    """Lay scans out as one plan, so that a model looks at all of them in one prediction; and the rows of each."""
+def one_after_another(scans: Sequence[Command], after: Plan) -> tuple[Plan, list[IntArray]]:
+    """Lay scans out as one plan, so that a model looks at all of them in one prediction; and the rows of each.
+
+    Covariates that they lack, such as a battery's, stay as they were at the end of the plan before them.
+    """
     ends = np.cumsum([len(scan.plan) for scan in scans])
     rows = [np.arange(end - len(scan.plan), end) for end, scan in zip(ends.tolist(), scans, strict=True)]
-    return join([Recording(scan.plan, np.zeros(len(scan.plan))) for scan in scans]).plan, rows
+    plan = _joined(scans)
+    kept = {name: np.full(len(plan), values[-1]) for name, values in after.covariates.items() if name not in COMMANDED}
+    return replace(plan, covariates={**kept, **plan.covariates}), rows
 
 
 def in_turn(scans: Sequence[Command]) -> Plan:
@@ -231,7 +236,11 @@ def in_turn(scans: Sequence[Command]) -> Plan:
     out: list[Command] = []
     for scan in scans:
         out.append(put_off(scan, out[-1].plan) if out else scan)
-    return one_after_another(out)[0]
+    return _joined(out)
+
+
+def _joined(scans: Sequence[Command]) -> Plan:
+    return join([Recording(scan.plan, np.zeros(len(scan.plan))) for scan in scans]).plan
 
 
 def put_off(scan: Command, plan: Plan) -> Command:

@@ -27,7 +27,8 @@ _STRIDES = (2, 4)
 _PROMISING = 4  # scans for each two rivals of which more than the mean is predicted
 _ENOUGH = 40.0  # squared distance of predictions, in noise sd, beyond which two rivals are told apart all the same
 _SETTLED = 0.05  # share of what is open that may stay open
-_WORTHWHILE = 0.03  # share of what is open that a scan has to tell
+_WORTHWHILE = 0.03  # share of what is open that a further scan has to tell
+_ANYTHING = 1e-6  # the same of the first
 _LEAST_WEIGHT = 0.05  # of a rival, however improbable: a probability may be wrong
 
 
@@ -97,10 +98,10 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
     offered = [*commands(plan, strides=_STRIDES, level=level), *layings(plan)]
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _promising(rivals, sd, offered)]
+    offered = [offered[k] for k in _promising(rivals, sd, offered, plan)]
     if not offered:
         return None
-    everywhere, rows = one_after_another(offered)
+    everywhere, rows = one_after_another(offered, plan)
     outlooks = [rival.outlook(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
@@ -112,7 +113,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
                 gains[k] = mutual_information([outlook.take(together) for outlook in outlooks], weights) - told
-        gains[gains < _WORTHWHILE * uncertain] = 0.0
+        gains[gains < (_WORTHWHILE if chosen else _ANYTHING) * uncertain] = 0.0
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
             break
@@ -149,11 +150,11 @@ def mutual_information(outlooks: Sequence[Outlook], weights: FloatArray) -> floa
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 
 
-def _promising(rivals: Sequence[Rival], sd: float, offered: Sequence[Command]) -> list[int]:
+def _promising(rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan) -> list[int]:
     """Keep, for each two rivals, the few scans in which what they predict differs most a minute."""
     if not offered:
         return []
-    everywhere, rows = one_after_another(offered)
+    everywhere, rows = one_after_another(offered, plan)
     means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
     minutes = np.array([option.minutes for option in offered])
     kept: dict[int, None] = {}

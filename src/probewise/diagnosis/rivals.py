@@ -14,6 +14,7 @@ __all__ = ["next_readings"]
 
 _LEAST_PROBABILITY = 0.01
 _MOST_RIVALS = 5
+_TRIED = 3  # effects that are not felt, as a rival, until some reading tells of one
 
 
 def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
@@ -30,25 +31,21 @@ def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
             rivals.append(_as_rival(candidate, probabilities[names]))
         if len(rivals) == _MOST_RIVALS:
             break
-    if len(rivals) == 1:
-        imagined = _imagined(search, null)
-        if imagined is None:
-            return None
-        rivals.append(imagined)
-    return next_scans(rivals, null.found.sd, search.recording.plan)
+    sd, plan = null.found.sd, search.recording.plan
+    if len(rivals) > 1:
+        return next_scans(rivals, sd, plan)
+    felt = {name for rival in rivals for name in rival.model.names}
+    others = dict.fromkeys(n for names in ranked for n in names if n in search.effects and n not in felt)
+    wanted = (next_scans([*rivals, _imagined(search, null, n)], sd, plan) for n in list(others)[:_TRIED])
+    return next((asked for asked in wanted if asked is not None), None)
 
 
 def _as_rival(candidate: Candidate, probability: float) -> Rival:
     return Rival(candidate.found.model, candidate.found.z, _root_of(candidate.found), probability)
 
 
-def _imagined(search: Search, null: Candidate) -> Rival | None:
-    """Make a rival of the most probable effect that is not felt: just as large as lambda 3 here."""
-    by_mean = search.by_mean
-    ranked = [n for names in sorted(by_mean, key=lambda names: -by_mean[names]) for n in names if n in search.effects]
-    name = next(iter(ranked), None)
-    if name is None:
-        return None
+def _imagined(search: Search, null: Candidate, name: str) -> Rival:
+    """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here."""
     effect, found = search.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
@@ -60,6 +57,8 @@ def _imagined(search: Search, null: Candidate) -> Rival | None:
         setting[k] *= min(3.0 / max(sizes[at], 1e-9), 50.0)
     model = found.model.with_effect(templates.variant(at))
     z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
+    change = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
+    z[: len(found.z)] += problem.absorbed(found, change)  # the sensor as it would then have been fitted
     root = np.zeros((len(z), len(z)))  # of that size, and no other
     root[: len(found.z), : len(found.z)] = _root_of(found)
     return Rival(model, z, root, 0.0)

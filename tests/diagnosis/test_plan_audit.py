@@ -96,6 +96,18 @@ def test_what_a_cure_claims_is_seen_after_all_of_it():
     assert all(effect.name in said for effect in audit.effects)
 
 
+def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
+    """A sensor that looks beside itself, and an edge that lies elsewhere."""
+    audit = audit_plan(paper_plan())
+    cured = {name: cure.kind for cure in audit.cures for name in cure.cured}
+    assert cured["sensor_tilt"] == cured["edge_misplacement"] == "lay"
+    assert cured["backlash"] == "respeed"
+    assert audit.extra_readings <= 150
+    plan = audit.cure_plan
+    assert plan is not None
+    assert {name for name, _ in plan.rows_by_pattern()} <= plan.patterns.keys()
+
+
 def test_a_flat_surface_shows_no_edge():
     plan = thinned(paper_plan())
     flat = replace(plan, patterns=dict.fromkeys(plan.patterns, Uniform(1.0)))
@@ -141,6 +153,16 @@ def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_c
     assert np.isnan(both.covariates["led"][: len(plan)]).all()
     assert (both.covariates["led"][len(plan) :] == 0).all()
     assert both.scan_names[-1] == dark.scan_names[0]
+
+
+def test_a_plan_over_other_patterns_keeps_them_behind_another():
+    plan = paper_plan()
+    quadrants, edge = plan.take(np.arange(404, 408)), plan.take(np.arange(101))
+    other = replace(edge, pattern_names=("tile",), pattern=np.zeros(101, dtype=int), patterns={"tile": Uniform(0.3)})
+    both = behind(quadrants, [other])
+    assert [name for name, _ in both.rows_by_pattern()] == [*(f"quadrant_{k}" for k in "abcd"), "tile"]
+    assert both.patterns["tile"] == Uniform(0.3)
+    assert {both.pattern_names[k] for k in both.pattern[4:]} == {"tile"}
 
 
 def test_a_plan_over_a_pattern_that_is_not_described_is_refused():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from probewise.diagnosis.commands import minutes_of
 from probewise.diagnosis.plan_audit import EffectAudit, PlanAudit
 
 __all__ = ["CURE_PLAN", "audit_json"]
@@ -26,7 +25,7 @@ def audit_json(audit: PlanAudit) -> dict[str, Any]:
         else {
             "plan": CURE_PLAN,
             "readings": len(plan),
-            "minutes": minutes_of(plan),
+            "minutes": audit.extra_minutes,
             "scans": [
                 {
                     "kind": cure.kind,

@@ -89,7 +89,7 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
         first = int(np.argmax(change[_NEAR - 1 :] - change[: 1 - _NEAR]))
         if change[first + _NEAR - 1] > change[first]:
             rows = scan[first : first + _NEAR]
-            out.append(Excerpt("_near", f" (the {_NEAR} readings where it changes most)", rows))
+            out.append(Excerpt("_near", " (where it changes most)", rows))
     return out
 
 
@@ -144,7 +144,7 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
 
 
 def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
-    """Set plans of the same patterns behind a plan.
+    """Set plans behind a plan; a pattern of one name is one pattern.
 
     A covariate that the others lack keeps its last value there, such as a battery's; what is commanded
     (the LED, the height) is as at calibration where a plan does not say.
@@ -152,6 +152,8 @@ def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
     plans = [plan, *more]
     starts = np.cumsum([0, *(len(p.scan_names) for p in plans)])
     commanded = {name for p in plans for name in p.covariates if name in COMMANDED}
+    names = tuple(dict.fromkeys(name for p in plans for name in p.pattern_names))
+    numbers = [np.array([names.index(name) for name in p.pattern_names], dtype=np.int64) for p in plans]
     return replace(
         plan,
         x_mm=np.concatenate([p.x_mm for p in plans]),
@@ -160,7 +162,9 @@ def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
         time_s=np.concatenate([p.time_s for p in plans]),
         scan=np.concatenate([p.scan + start for p, start in zip(plans, starts, strict=False)]),
         scan_names=tuple(name for p in plans for name in p.scan_names),
-        pattern=np.concatenate([p.pattern for p in plans]),
+        pattern=np.concatenate([own[p.pattern] for own, p in zip(numbers, plans, strict=True)]),
+        pattern_names=names,
+        patterns={name: pattern for p in reversed(plans) for name, pattern in p.patterns.items()},
         covariates={
             name: np.concatenate([_covariate(p, name, plan) for p in plans]) for name in {*plan.covariates, *commanded}
         },

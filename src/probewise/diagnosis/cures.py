@@ -1,4 +1,4 @@
-"""The fewest extra readings that cure a plan: greedily, scan by scan, over what the arm can be told to do."""
+"""The fewest extra readings that cure a plan: greedily, scan by scan, over what arm and hand can do."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from probewise._arrays import IntArray
 from probewise.diagnosis.commands import Command, behind, commands, put_off
+from probewise.diagnosis.layings import layings
 from probewise.diagnosis.sights import LEAST_NATS, LEAST_SHARE, Expected, LaidOut, Survivors, nats_between
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
@@ -43,7 +44,8 @@ def cures_of(
     current = plan
     while len(chosen) < _MOST_SCANS:
         taken = {command.plan.scan_names for command in chosen}
-        offered = [c for c in commands(plan, strides=_STRIDES) if c.plan.scan_names not in taken]
+        every = [*commands(plan, strides=_STRIDES), *layings(plan)]
+        offered = [c for c in every if c.plan.scan_names not in taken]
         options = [put_off(command, current) for command in offered]
         if not options:
             break

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
-from probewise.diagnosis.commands import behind, minutes_of
+from probewise.diagnosis.commands import behind
 from probewise.diagnosis.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.cures import cures_of
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
@@ -76,11 +76,12 @@ class EffectAudit:
 
 @dataclass(frozen=True, eq=False)
 class Cure:
-    """One scan to add: which of the six R's, in words, its readings, and the effects that are fine from then on."""
+    """One scan to add: its kind (`Command`), in words, readings, time, and the effects that are fine from then on."""
 
     kind: str
     description: str
     plan: Plan
+    minutes: float
     cured: tuple[str, ...]
 
 
@@ -130,6 +131,11 @@ class PlanAudit(ShowsItself):
         """Number of readings that the cures take."""
         return sum(len(cure.plan) for cure in self.cures)
 
+    @property
+    def extra_minutes(self) -> float:
+        """How long the cures take, with the breaks before each scan."""
+        return sum(cure.minutes for cure in self.cures)
+
     def summary(self) -> str:
         """Say it on one screen."""
         lines = [f"{len(self.plan)} readings in {len(self.plan.scan_names)} scans; {self.assumed}"]
@@ -139,11 +145,10 @@ class PlanAudit(ShowsItself):
         if not self.cures:
             cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else "no scan of this arm helps"
             return "\n".join([*lines, f"cure       {cured}"])
-        plan = self.cure_plan
-        minutes = 0.0 if plan is None else minutes_of(plan)
-        lines.append(f"cure       {self.extra_readings} more readings, about {minutes:.0f} minutes:")
+        lines.append(f"cure       {self.extra_readings} more readings, about {self.extra_minutes:.0f} minutes:")
         for k, cure in enumerate(self.cures, start=1):
-            lines.append(f"  {k}. {cure.description} ({len(cure.plan)}): {', '.join(cure.cured) or 'helps the next'}")
+            so_that = ", ".join(cure.cured) or "helps the next"
+            lines.append(f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}")
         left = [e.name for e in self.after if e.sight != "fine"]
         return "\n".join([*lines, *_listed("left", left or ["nothing"])])
 
@@ -205,7 +210,7 @@ def audit_plan(
     cured = _cured_at(steps)
     n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
     cures = tuple(
-        Cure(c.kind, c.description, c.plan, tuple(name for name, step in cured.items() if step == k))
+        Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
         for k, c in enumerate(chosen[:n_kept], start=1)
     )
     return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])

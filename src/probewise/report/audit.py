@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from probewise.diagnosis import PlanAudit
-from probewise.diagnosis.commands import minutes_of
 from probewise.diagnosis.sights import ALIAS
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
@@ -69,7 +68,12 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     if plan is None:
         if all(effect.sight == "fine" for effect in audit.effects):
             return (paragraph("Nothing is to be cured."),)
-        return (paragraph("No scan that this arm can take, repeated, reversed, faster or turned, would help enough."),)
+        return (
+            paragraph(
+                "No scan that this arm can take, repeated, reversed, faster or turned, nor the sheet laid otherwise, "
+                "would help enough."
+            ),
+        )
     left = [e.name.replace("_", " ") for e in audit.after if e.sight != "fine"]
     return (
         table(
@@ -80,7 +84,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
             ),
         ),
         paragraph(
-            f"{count(len(plan), 'reading')}, about {number(minutes_of(plan), 0)} minutes; "
+            f"{count(len(plan), 'reading')}, about {number(audit.extra_minutes, 0)} minutes; "
             f"the plan is in cure_plan.csv. Left after that: {', '.join(left) or 'nothing'}."
         ),
     )

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.challenge.ideal import ideal_set_size, most_often_right
+from probewise.challenge.ideal import ideal_set_size, most_often_located, most_often_right
 
 
 def hidden(size, **cosines):
@@ -29,6 +29,14 @@ def test_the_hardest_rival_that_is_wrong_bounds_it():
     assert most_often_right(hidden(8.0, backlash=0.99)) == 1.0
     hard = most_often_right(hidden(8.0, halo=0.9))
     assert most_often_right(hidden(8.0, backlash=0.99, halo=0.9, glint=0.6)) == hard < 1
+
+
+def test_a_rival_that_shows_in_the_same_is_no_other_place():
+    shown = {"shows_in": ["slope", "direction"]}
+    assert most_often_located({**hidden(8.0, backlash=1.0), **shown}) == 1.0
+    # A rival in another covariate that leaves the same trace is taken for it every other time.
+    assert most_often_located({**hidden(8.0, nonlinearity=1.0), **shown}) == 0.5
+    assert 0.9 < most_often_located({**hidden(8.0, nonlinearity=0.9), **shown}) < 1.0
 
 
 def test_the_set_holds_one_where_nothing_is_alike_and_aliases_count_once():

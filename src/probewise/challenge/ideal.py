@@ -7,16 +7,17 @@ method that has to learn the rest from the same readings can do better on averag
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Set
+from typing import Any, cast
 
 import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
 from probewise.challenge.scoring import accepted
+from probewise.effects import VOCABULARY
 
-__all__ = ["ideal_set_size", "most_often_right"]
+__all__ = ["ideal_set_size", "most_often_located", "most_often_right"]
 
 _DRAWS = 400
 _HELD = 0.95
@@ -26,9 +27,18 @@ Hidden = Mapping[str, Any]
 
 def most_often_right(hidden: Hidden) -> float:
     """Bound how often the right name or an alias of it comes first: by the one rival that is hardest to tell."""
-    apart = _apart(hidden)
-    right = accepted(hidden)
-    return min((float(ndtr(d / 2)) for name, d in apart.items() if name not in right), default=1.0)
+    return _at_most(hidden, accepted(hidden))
+
+
+def most_often_located(hidden: Hidden) -> float:
+    """Bound how often the right covariate comes first: by the hardest rival that shows in none of the right ones."""
+    shown = set(hidden["shows_in"])
+    covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in hidden["cosines"]}
+    return _at_most(hidden, {name for name, own in covariates.items() if shown & set(own)})
+
+
+def _at_most(hidden: Hidden, right: Set[str]) -> float:
+    return min((float(ndtr(d / 2)) for name, d in _apart(hidden).items() if name not in right), default=1.0)
 
 
 def ideal_set_size(hidden: Hidden) -> float:

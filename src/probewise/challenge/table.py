@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.challenge.estimates import Estimate, mean, resampled, share
-from probewise.challenge.ideal import ideal_set_size, most_often_right
+from probewise.challenge.ideal import ideal_set_size, most_often_located, most_often_right
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     NOISE,
@@ -182,6 +182,7 @@ def _places(done: list[Result]) -> list[Row]:
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
         Row("right covariate first, lambda 8", share(first), 0.98),
+        Row("  who knows all but the name, at most", mean([most_often_located(r["hidden"][0]) for r in shown])),
     ]
 
 

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
-from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
+from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
 from probewise.sensor.commanded import height_ratio, is_commanded, light_of, raised_as_commanded
 from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, Spot, seen_by_one, turned
@@ -364,6 +364,11 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     for part in layout.straight:
         part.see(footprint, out)
     for rows, region in layout.others:
+        if isinstance(region, UniformRegion):  # whatever the footprint
+            level = region.level[:, None]
+            for g in range(footprint.weight.shape[2]):
+                out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * level
+            continue
         x, y, turn = (columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
         if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
             turn = turn[:, :1]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import Diagnosis, Improvement, diagnose, diagnosis_json, diagnosis_schema
-from probewise.effects import VOCABULARY
+from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
 from probewise.sensor import N_FREE_FORM, Stage
@@ -325,3 +325,28 @@ def test_rounding_coarser_than_the_fit_is_still_rounding():
     )
     strict(found)
     assert "quantisation" in found.combination
+
+
+def test_what_a_free_ssf_takes_up_whole_is_no_effect_until_the_sensor_is_known():
+    """A turned sensor has a turned SSF, a blurred edge a blurred one."""
+    plan = two_way_plan()
+    found = clean_diagnosis()
+    named = {name for hypothesis in found.hypotheses for name in hypothesis.effects}
+    assert not {"orientation_error", "edge_blur"} & named
+    blur = VOCABULARY["edge_blur"].for_extent(Extent(10.0, 60.0, plan))
+    heights = np.where(np.arange(len(plan)) < 400, np.nan, 20.0)
+    raised = dataclasses.replace(plan, covariates={**plan.covariates, "height_mm": heights})
+    assert blur.is_of_the_ssf(plan)
+    assert not blur.is_of_the_ssf(raised)
+    higher = dataclasses.replace(raised, covariates={**plan.covariates, "height_mm": np.full(len(plan), 20.0)})
+    assert blur.is_of_the_ssf(higher)
+
+
+def test_a_sensor_that_is_known_shows_that_it_was_turned():
+    """As by a clean diagnosis; the alarm is not silenced by fine structure that the sensor is known not to have."""
+    rng = np.random.default_rng(0)
+    earlier = clean_diagnosis().repaired.fitted_sensor(recording("paper", seed=2), rng=rng)
+    turned = recording("paper", hidden.OrientationError(12.0), seed=5)
+    found = diagnose(turned, sensor=earlier, rng=rng)
+    assert (found.verdict, found.combination) == ("named", ("orientation_error",))
+    assert found.p_value < 1e-6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from probewise.diagnosis.fit import Model
 from probewise.diagnosis.layings import layings
 from probewise.diagnosis.next_scans import Outlook, Rival, mutual_information, next_scans
 from probewise.effects import VOCABULARY, Extent
-from probewise.recordings import HalfPlane, Plan, paper_plan, read_plan, write_plan
+from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
@@ -122,12 +123,14 @@ def test_a_sheet_turned_half_round_swaps_black_and_white():
 
 @pytest.mark.parametrize("edge", [HalfPlane(0.0, 7.0), HalfPlane(0.4, -3.0, inside=0.2, outside=0.9)])
 def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
-    """A round spot cannot tell; places are mirrored on the diagonal through the scan's middle."""
+    """A round spot cannot tell that both were turned."""
     plan = replace(paper_plan(), y_mm=paper_plan().y_mm + 4.0)
     plan = replace(plan, patterns={**plan.patterns, "boundary": edge})
     turned = laid(plan, "boundary_quarter_4")
     at = np.arange(0, 101, 4)
-    assert np.ptp(turned.x_mm) == 0
+    assert np.ptp(turned.x_mm) == pytest.approx(0.0, abs=1e-12)
+    (pattern,) = (turned.patterns[name] for name, _ in turned.rows_by_pattern())
+    assert pattern.normal_rad == pytest.approx(edge.normal_rad + math.pi / 2)
     np.testing.assert_allclose(read_by(turned), read_by(plan)[at], atol=1e-12)
 
 
@@ -145,6 +148,29 @@ def test_along_an_edge_there_is_nothing_to_lay_otherwise():
     along = replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(math.pi / 2, 0.0)})
     assert {command.kind for command in layings(along)} == {"lay", "across"}
     assert all("boundary" not in command.description for command in layings(along))
+    # Of several edges the first that a scan goes across.
+    names = (*plan.pattern_names, "upright")
+    under = np.where(plan.scan == 1, len(names) - 1, plan.pattern)
+    patterns = {**along.patterns, "upright": HalfPlane(0.0, 0.0)}
+    second = replace(along, pattern=under, pattern_names=names, patterns=patterns)
+    assert any("upright, turned half round" in command.description for command in layings(second))
+
+
+def test_short_scans_are_taken_whole():
+    plan = paper_plan().take(np.arange(45, 57))
+    assert {command.kind for command in commands(plan, strides=(2, 4))} == {"repeat", "reverse", "respeed", "rotate"}
+    assert all(len(command.plan) == 12 for command in commands(plan, strides=(2, 4)))
+    tiny = replace(plan, x_mm=plan.x_mm / 10)
+    assert not any(re.search("by -?0 mm", command.description) for command in layings(tiny))
+
+
+def test_a_name_that_is_taken_stands_for_something_else():
+    plan = paper_plan()
+    grey = replace(plan, pattern_names=(*plan.pattern_names, "plain_white"))
+    grey = replace(grey, patterns={**plan.patterns, "plain_white": Uniform(0.8)})
+    white = next(command.plan for command in layings(grey) if command.description == "scan a plain white surface")
+    ((name, _),) = white.rows_by_pattern()
+    assert (white.patterns[name], white.patterns["plain_white"]) == (Uniform(1.0), Uniform(0.8))
 
 
 def test_excerpts_hold_the_step_and_every_so_many_readings():
@@ -172,3 +198,8 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan)
     assert asked is not None
     assert "battery_mv" not in asked.plan.covariates  # whoever reads it will say
+    gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
+    after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
+    everywhere, _ = one_after_another(commands(plan)[:3], after)
+    assert set(everywhere.covariates) == {"battery_mv"}
+    assert (everywhere.covariates["battery_mv"] == gone[-2]).all()

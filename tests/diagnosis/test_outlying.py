@@ -59,6 +59,8 @@ def test_what_is_in_the_tail_follows_bayes_rule():
     odds = (0.05 / 6) * np.exp(-0.5 * (residuals / sigma / 6) ** 2) / (0.95 * np.exp(-0.5 * (residuals / sigma) ** 2))
     np.testing.assert_allclose(outlying(residuals, law), odds / (1 + odds))
     assert outlying(residuals, law)[10] > 0.999
+    residuals[10] = 1e6  # where both densities are nothing
+    assert outlying(residuals, law)[10] == 1.0
 
 
 def spotted(rows: np.ndarray) -> Recording:

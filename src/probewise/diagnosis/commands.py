@@ -74,12 +74,12 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
     scan
         Its row numbers.
     strides
-        Every reading, every fourth, ...: one excerpt for each.
+        Every reading, every fourth, ...: one excerpt for each that leaves eight; every reading where none does.
     level
         What is expected of its readings, in the order of `scan`: one excerpt more, where that changes most.
     """
     out = []
-    for stride in strides:
+    for stride in [s for s in strides if len(scan[::s]) >= _LEAST_ROWS] or [1]:
         rows = scan[::stride][:MOST_READINGS]
         if rows.size >= _LEAST_ROWS:
             words = {1: "", 2: " (every second reading)"}.get(stride, f" (every {stride}th reading)")
@@ -231,7 +231,8 @@ def one_after_another(scans: Sequence[Command], after: Plan) -> tuple[Plan, list
     ends = np.cumsum([len(scan.plan) for scan in scans])
     rows = [np.arange(end - len(scan.plan), end) for end, scan in zip(ends.tolist(), scans, strict=True)]
     plan = _joined(scans)
-    kept = {name: np.full(len(plan), values[-1]) for name, values in after.covariates.items() if name not in COMMANDED}
+    read = {name: values[np.isfinite(values)] for name, values in after.covariates.items() if name not in COMMANDED}
+    kept = {name: np.full(len(plan), values[-1]) for name, values in read.items() if values.size}
     return replace(plan, covariates={**kept, **plan.covariates}), rows
 
 

@@ -15,7 +15,7 @@ from probewise.diagnosis.coordinates import LEAST_READINGS
 from probewise.diagnosis.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.ensemble import Ensemble
 from probewise.diagnosis.evidence import Blocks, Linearised
-from probewise.diagnosis.fine_structure import with_fine_structure
+from probewise.diagnosis.fine_structure import fine_structure
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
@@ -102,7 +102,11 @@ def diagnose(
     if sensor is not None:
         known = sensor_of(sensor)
     able = {name: effect for name, effect in fitted.items() if effect is not None}
-    built = {name: effect for name, effect in able.items() if known is None or known.admits(effect)}
+    built = {
+        name: effect
+        for name, effect in able.items()
+        if (known.admits(effect) if known is not None else not effect.is_of_the_ssf(recording.plan))
+    }
     diagnoser = _Diagnoser(recording, built, known, floor, thorough, rng)
     found = diagnoser.run()
     return found if recording is everything else _of_everything(found, diagnoser.fits, everything)
@@ -249,14 +253,18 @@ class _Diagnoser:
         """
         p_value = global_p_value(problem, self.search.looks(null.found), draws)
         freer = sorted(n for n, names in self.search.candidates if not names and n > null.n_gaussians)
-        rivals = [null, *(self.search.candidates[n, ()] for n in freer)]
-        asked = [*((c, c.found) for c in rivals[1:]), (rivals[-1], with_fine_structure(rivals[-1].found, self.usable))]
-        for rival, found in asked:
+        rivals = [self.search.candidates[n, ()] for n in freer]
+        freest = (rivals or [null])[-1]
+        # What is known of a sensor is not forgotten: that it was turned, or edges are soft, shows by that alone.
+        finer = [freest] if self.sensor is None else []
+        for rival, fine in [*((rival, False) for rival in rivals), *((rival, True) for rival in finer)]:
             if p_value > _NO_ALARM:
                 break
-            problem = Linearised.of(found, rival.evidence[noise].law)
+            found = rival.found
+            beside = fine_structure(found.model, found.z, self.usable) if fine else None
+            problem = Linearised.of(found, rival.evidence[noise].law, beside)
             own = problem.draws(N_DRAWS, rng=self.rng)
-            p_value = max(p_value, global_p_value(problem, self.search.looks(rival.found), own))
+            p_value = max(p_value, global_p_value(problem, self.search.looks(found), own))
         return p_value
 
     def _most_probable_noise(

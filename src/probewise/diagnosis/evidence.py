@@ -165,17 +165,20 @@ class Linearised:
     n_points: int
 
     @classmethod
-    def of(cls, found: Fit, law: NoiseLaw) -> Linearised:
-        """Linearise about a fit."""
-        n_points, p = found.slopes.shape
+    def of(cls, found: Fit, law: NoiseLaw, beside: FloatArray | None = None) -> Linearised:
+        """Linearise about a fit; `beside` are slopes (n_points, k) by coordinates that it has not, taken to be 0."""
+        slopes, z = found.slopes, found.z
+        if beside is not None:
+            slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
+        n_points, p = slopes.shape
         whitened = law(found.residuals)[:, None]
-        turned, sigma = law(found.slopes), law.scale(whitened)
+        turned, sigma = law(slopes), law.scale(whitened)
         sigma = np.where(sigma > 0, sigma, found.sd)
         free = degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
         sigma = sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
-        augmented = np.concatenate([law.pseudo(whitened, sigma)[:, 0] / sd, -found.z])
+        augmented = np.concatenate([law.pseudo(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
         if law.flat:
             # The noise is known; what says less than its readings should, flat at the top, does not make it smaller.

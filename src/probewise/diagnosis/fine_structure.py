@@ -8,17 +8,15 @@ asks whether its alarm outlasts them.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration import mixture_moments
 from probewise.diagnosis.coordinates import CalibratedSensor, known_scene
-from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.fit import Model
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
-__all__ = ["with_fine_structure"]
+__all__ = ["fine_structure"]
 
 # In sds of the SSF, in its own metric.
 _REACH = 2.4
@@ -27,22 +25,26 @@ _WIDTH = 0.35
 _SHARE = 0.03  # prior sd of each, of the mass
 
 
-def with_fine_structure(found: Fit, usable: IntArray) -> Fit:
-    """Give a null's fit the slopes of fine structure too, each a coordinate at 0 of standard normal prior.
-
-    The fit of a model that has no SSF of its own, or what it looks at is not known, stays as it is.
+def fine_structure(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
+    """Differentiate readings by fine structure about an SSF, in coordinates of standard normal prior, all 0 there.
 
     Parameters
     ----------
-    found
-        The fit, no effects in its model.
+    model
+        A sensor that is calibrated from the recording, no effects in its model.
+    z
+        Its coordinates, (n_params,).
     usable
-        Rows of the plan that it was fitted to.
+        Rows of the plan to look at.
+
+    Returns
+    -------
+    Slopes, (n_usable, n_places), in reading units; nothing where the model has no SSF of its own.
     """
-    model, sensor = found.model, found.model.sensor
+    sensor = model.sensor
     if not isinstance(sensor, CalibratedSensor):
-        return found
-    theta = sensor.theta(found.z[None, :])
+        return np.zeros((len(usable), 0))
+    theta = sensor.theta(z[None, :])
     of_all = {name: float(values[0]) for name, values in mixture_moments(theta, sensor.n_gaussians).items()}
     sd_u, sd_v = (np.exp(of_all[f"log width along {axis}"]) for axis in ("x'", "y'"))
     cov = of_all["correlation of x' and y'"] * sd_u * sd_v
@@ -53,9 +55,8 @@ def with_fine_structure(found: Fit, usable: IntArray) -> Fit:
     levels = theta[0, 6 * sensor.n_gaussians :]
     narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
     chain = Chain(FreeMixture(1), FreeLevels(), known_scene(model.plan), (), n_nodes=FAST_NODES)
-    change = chain.predict(narrow, model.plan)[:, usable] - found.predicted  # in place of as much of the whole
-    slopes = np.concatenate([found.slopes, _SHARE * change.T], axis=1)
-    return replace(found, slopes=slopes, z=np.concatenate([found.z, np.zeros(len(places))]))
+    whole = model.predict(z[None, :])[0]  # of which as much gives way
+    return np.asarray(_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
 
 
 def _hexagons() -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -55,7 +56,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
             renamed.append(names.index(own))
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
-        scan_names += [f"{s} ({number + 1})" if s in scan_names else s for s in plan.scan_names]
+        scan_names += [_unused(s, scan_names) for s in plan.scan_names]
     plans = [r.plan for r in recordings]
     shared = set.intersection(*({*p.covariates, *COMMANDED} for p in plans)) & {k for p in plans for k in p.covariates}
     joined = Plan(
@@ -76,3 +77,9 @@ def join(recordings: Sequence[Recording]) -> Recording:
     readings = np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings])
     joined_recording = Recording(joined, readings, first.source, tuple(n for r in recordings for n in r.notes))
     return replace(joined_recording, source=" + ".join(r.source for r in recordings if r.source))
+
+
+def _unused(name: str, taken: Sequence[str]) -> str:
+    """Count up until a name is free."""
+    numbered = (f"{name} ({k})" for k in itertools.count(2))
+    return next(n for n in itertools.chain([name], numbered) if n not in taken)

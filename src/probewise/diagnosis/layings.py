@@ -14,7 +14,6 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.commands import (
-    MOST_READINGS,
     Command,
     distinct_scans,
     excerpts,
@@ -49,17 +48,16 @@ def layings(plan: Plan) -> list[Command]:
         flat = _scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
         out.append(Command("lay", f"scan a plain {colour} surface", _over(flat, f"plain_{colour}", Uniform(albedo))))
     name = plan.scan_names[int(plan.scan[first[0]])]
-    across = _on_other_axis(_scan(plan, first[:MOST_READINGS], "across"))
-    out.append(Command("across", f"scan across scan {name}, along the other axis", across))
-    for scan in scans:
-        edge = _pattern_under(plan, scan)
-        if isinstance(edge, HalfPlane):
-            return [*out, *_laid_otherwise(plan, scan, edge)]
-    return out
+    for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
+        across = _turned(_scan(plan, part.rows, f"across{part.suffix}"))
+        out.append(Command("across", f"scan across scan {name}, along the other axis{part.words}", across))
+    edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
+    laid = (_laid_otherwise(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
+    return [*out, *next(filter(None, laid), [])]
 
 
 def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command]:
-    """Turn the sheet of an edge on it, half round or by a quarter; move it; lay stripes."""
+    """Turn the sheet of an edge, half round or by a quarter; move it; lay stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
     length = float(np.ptp(_beyond(plan, scan, edge)))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
@@ -67,12 +65,13 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command
     once = _scan(plan, scan, name)
     half_round = replace(edge, normal_rad=edge.normal_rad + math.pi, offset_mm=-edge.offset_mm)
     laid = [
-        (f"{name}_half_round", f"{name}, turned half round on its edge", once, half_round),
-        (f"{name}_quarter", f"{name}, turned by a quarter, along the other axis", *_mirrored(once, edge)),
+        (f"{name}_half_round", f"{name}, turned half round about where its edge should be", once, half_round),
+        (f"{name}_quarter", f"{name}, turned by a quarter with the scan", *_both_turned(once, edge)),
     ]
     middle_mm = float(_beyond(plan, scan, edge).mean())
     for end in (-1.0, 1.0):
-        aside_mm = float(np.round(middle_mm + end * _ASIDE * length))
+        exactly_mm = middle_mm + end * _ASIDE * length
+        aside_mm = float(np.round(exactly_mm)) or exactly_mm
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
         laid.append((f"{name}_by_{aside_mm:g}_mm", f"{name}, moved by {aside_mm:g} mm along its normal", once, moved))
     out = []
@@ -101,24 +100,29 @@ def _scan(plan: Plan, rows: IntArray, name: str) -> Plan:
 
 
 def _over(scan: Plan, name: str, pattern: Pattern) -> Plan:
-    """Lay a pattern under all of a scan."""
-    names = (*scan.pattern_names, name)
-    number = np.full(len(scan), len(names) - 1)
+    """Lay a pattern under all of a scan; a name that is taken stands for something else."""
+    while name in scan.pattern_names and scan.patterns.get(name) != pattern:
+        name += "_new"
+    names = tuple(dict.fromkeys((*scan.pattern_names, name)))
+    number = np.full(len(scan), names.index(name))
     return replace(scan, pattern=number, pattern_names=names, patterns={**scan.patterns, name: pattern})
 
 
-def _on_other_axis(scan: Plan) -> Plan:
-    """Mirror a scan's places on the diagonal through their middle."""
+def _turned(scan: Plan) -> Plan:
+    """Turn a scan's places by a quarter about their middle, anticlockwise."""
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
-    return replace(scan, x_mm=x_mm + (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
+    return replace(scan, x_mm=x_mm - (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
 
 
-def _mirrored(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
-    """Mirror a scan and the edge under it."""
-    c, s = math.cos(edge.normal_rad), math.sin(edge.normal_rad)
-    turned = math.pi / 2 - edge.normal_rad  # its normal has cosine and sine swapped
-    offset_mm = edge.offset_mm + (s - c) * (scan.x_mm.mean() - scan.y_mm.mean())
-    return _on_other_axis(scan), replace(edge, normal_rad=turned, offset_mm=float(offset_mm))
+def _both_turned(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
+    """Turn a scan and the edge under it, which stays as far from the scan's middle."""
+    normal_rad = edge.normal_rad + math.pi / 2
+    x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
+    moved_mm = sum(
+        sign * (x_mm * math.cos(angle) + y_mm * math.sin(angle))
+        for sign, angle in ((1, normal_rad), (-1, edge.normal_rad))
+    )
+    return _turned(scan), replace(edge, normal_rad=normal_rad, offset_mm=float(edge.offset_mm + moved_mm))
 
 
 def _beyond(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:

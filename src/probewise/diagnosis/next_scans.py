@@ -113,7 +113,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
                 gains[k] = mutual_information([outlook.take(together) for outlook in outlooks], weights) - told
-        gains[gains < (_WORTHWHILE if chosen else _ANYTHING) * uncertain] = 0.0
+        gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also where a model fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
             break

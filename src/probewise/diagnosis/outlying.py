@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import betaln
+from scipy.special import betaln, expit
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.covariates import Covariate
@@ -29,9 +29,8 @@ def outlying(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
     """Probability of each reading to be in the tail of a law, (n_points,)."""
     whitened = law(residuals)
     z2 = (whitened / law.scale(whitened[:, None])[0]) ** 2
-    narrow = (1 - law.share) * np.exp(-0.5 * z2)
-    wide = law.share / law.times * np.exp(-0.5 * z2 / law.times**2)
-    return np.asarray(wide / np.maximum(narrow + wide, 1e-300))
+    log_odds = np.log(law.share / (1 - law.share) / law.times) + 0.5 * z2 * (1 - law.times**-2)
+    return np.asarray(expit(log_odds))
 
 
 def score_together(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:

@@ -24,18 +24,20 @@ def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
-    rivals: list[Rival] = []
+    found: list[Candidate] = []
     for names in ranked:
         candidate = search.best(names, search.certain) if names else null
-        if candidate is not None and (len(rivals) < 2 or probabilities[names] >= _LEAST_PROBABILITY):
-            rivals.append(_as_rival(candidate, probabilities[names]))
-        if len(rivals) == _MOST_RIVALS:
+        # Of what is named the next is a rival however improbable; of nothing, something that could be there.
+        second = len(found) == 1 and bool(found[0].names)
+        if candidate is not None and (not found or second or probabilities[names] >= _LEAST_PROBABILITY):
+            found.append(candidate)
+        if len(found) == _MOST_RIVALS:
             break
-    sd, plan = null.found.sd, search.recording.plan
+    sd, plan = found[0].found.sd, search.recording.plan
+    rivals = [_as_rival(candidate, probabilities[candidate.names]) for candidate in found]
     if len(rivals) > 1:
         return next_scans(rivals, sd, plan)
-    felt = {name for rival in rivals for name in rival.model.names}
-    others = dict.fromkeys(n for names in ranked for n in names if n in search.effects and n not in felt)
+    others = dict.fromkeys(n for names in ranked for n in names if n in search.effects)
     wanted = (next_scans([*rivals, _imagined(search, null, n)], sd, plan) for n in list(others)[:_TRIED])
     return next((asked for asked in wanted if asked is not None), None)
 

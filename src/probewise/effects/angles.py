@@ -46,6 +46,10 @@ class OrientationError(NamedEffect[Poses]):
         """Turn the poses."""
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta))
 
+    def is_of_the_ssf(self, plan: Plan) -> bool:
+        """Tell that it is: a sensor that is turned has a turned SSF."""
+        return True
+
     def bank(self) -> FloatArray:
         """One setting: linear in a small angle."""
         return np.full((1, 1, 1), self.typical_deg)

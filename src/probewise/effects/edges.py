@@ -18,6 +18,7 @@ from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan
+from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Footprint, Stage, View
 
 __all__ = ["EdgeBlur", "EdgeShadow", "Halo"]
@@ -52,6 +53,11 @@ class EdgeBlur(NamedEffect[Footprint]):
         """Widen the footprint."""
         wider = theta[:, :, None] ** 2
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
+
+    def is_of_the_ssf(self, plan: Plan) -> bool:
+        """Tell that it is, a blurred SSF, but where heights differ: a footprint grows with them, a blur does not."""
+        ratio = height_ratio(plan)
+        return ratio is None or float(np.ptp(ratio)) == 0.0
 
     def bank(self) -> FloatArray:
         """One setting: the change goes with the square of the width."""

@@ -68,6 +68,13 @@ class NamedEffect(Effect[V], Protocol[V]):
         """
         ...
 
+    def is_of_the_ssf(self, plan: Plan) -> bool:
+        """Tell whether an SSF of which nothing is known takes it up whole, by this plan: then it is no effect.
+
+        By default it does not.
+        """
+        return False
+
     def bank(self) -> FloatArray:
         """Lay out settings to look for it with, shape (n_bank, n_columns, n_params).
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.challenge.estimates import Estimate, mean, resampled, share
-from probewise.challenge.ideal import ideal_set_size, most_often_located, most_often_right
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     NOISE,
@@ -26,6 +25,7 @@ from probewise.challenge.scoring import (
     on_mean,
     stated,
 )
+from probewise.challenge.yardstick import covariate_by_likeness, name_by_likeness, set_size_by_likeness
 
 __all__ = ["Decision", "Row", "by_effect", "score"]
 
@@ -128,9 +128,9 @@ def _naming(done: list[Result]) -> list[Row]:
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
     for size, least in targets.items():
-        best = [most_often_right(r["hidden"][0]) for r in _on_mean(_singles(done, size))]
+        like = [name_by_likeness(r["hidden"][0]) for r in _singles(done, size)]
         rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
-        rows.append(Row(f"  who knows all but the name, at most, lambda {size:g}", mean(best)))
+        rows.append(Row(f"  by likeness to the hardest rival, lambda {size:g}", mean(like)))
     return [
         *rows,
         Row("right name first, largest fall as lambda grows", worst, most=0.0),
@@ -150,7 +150,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
         singles = _singles(done, size)
-        best = [ideal_set_size(r["hidden"][0]) for r in _on_mean(singles)]
+        like = [set_size_by_likeness(r["hidden"][0]) for r in singles]
         rows += [
             Row(
                 f"size of the credible set, lambda {size:g}",
@@ -158,7 +158,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
                 most=most,
             ),
             Row(f"  the truth and its aliases as one, lambda {size:g}", mean([_merged_size(r) for r in singles])),
-            Row(f"  who knows all but the name, aliases as one, lambda {size:g}", mean(best)),
+            Row(f"  by likeness, aliases as one, lambda {size:g}", mean(like)),
         ]
     return [
         Row("95 % credible set holds the truth", share(covered), 0.95),
@@ -182,7 +182,7 @@ def _places(done: list[Result]) -> list[Row]:
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
         Row("right covariate first, lambda 8", share(first), 0.98),
-        Row("  who knows all but the name, at most", mean([most_often_located(r["hidden"][0]) for r in shown])),
+        Row("  by likeness to the hardest rival", mean([covariate_by_likeness(r["hidden"][0]) for r in shown])),
     ]
 
 

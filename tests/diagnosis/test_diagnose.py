@@ -350,3 +350,37 @@ def test_a_sensor_that_is_known_shows_that_it_was_turned():
     found = diagnose(turned, sensor=earlier, rng=rng)
     assert (found.verdict, found.combination) == ("named", ("orientation_error",))
     assert found.p_value < 1e-6
+
+
+def asked_about(monkeypatch, of: Recording) -> tuple[list, float, Diagnosis]:
+    """Diagnose, and tell which rivals the next readings were to part, and in what noise."""
+    seen: list = []
+
+    def next_scans(rivals, sd, plan):
+        seen.append((list(rivals), sd))
+
+    monkeypatch.setattr("probewise.diagnosis.rivals.next_scans", next_scans)
+    found = diagnose(of, rng=np.random.default_rng(0))
+    return *seen[0], found
+
+
+def test_all_that_is_likely_is_a_rival_in_the_noise_of_the_first(monkeypatch):
+    """One way only, backlash is an edge that lies elsewhere is a tilt; of a large one the null makes noise."""
+    rivals, sd, found = asked_about(monkeypatch, recording("paper", hidden.Backlash(1.2), seed=2))
+    names = {rival.model.names for rival in rivals}
+    assert {("backlash",), ("edge_misplacement",), ("sensor_tilt",)} <= names
+    assert 3 <= len(rivals) <= 5
+    likely = [h for h in found.hypotheses if h.probability >= 0.011 and h.effects != ("unknown",)]
+    assert len(rivals) >= min(len(likely), 5)
+    assert sd == pytest.approx(NOISE_SD, rel=0.1)
+    assert np.std(found.residuals_before) > 1.2 * NOISE_SD
+
+
+def test_where_nothing_is_found_a_rival_is_imagined_that_would_have_been_seen_here(monkeypatch):
+    (null, imagined), _, found = asked_about(monkeypatch, recording("paper", seed=2))
+    assert found.verdict == "clean"
+    assert null.model.names == ()
+    assert len(imagined.model.names) == 1
+    assert imagined.probability == 0.0
+    apart = (imagined.model.predict(imagined.z[None, :]) - null.model.predict(null.z[None, :]))[0] / NOISE_SD
+    assert 1.5 < np.linalg.norm(apart) < 6.0

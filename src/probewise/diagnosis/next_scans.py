@@ -2,8 +2,8 @@
 
 The index of the true hypothesis and the readings have a mutual information; between hypotheses whose predictions are
 normal it has a lower bound in closed form, from the Bhattacharyya distance of each two (Kolchinsky & Tracey 2017,
-"Estimating mixture entropy with pairwise distances", Entropy 19, 361, eq. 10 with alpha = 1/2). Scans are added
-greedily, each for what it tells a minute, as long as there is something left to tell.
+"Estimating mixture entropy with pairwise distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2). Scans are
+added greedily, each for what it tells a minute, as long as there is something left to tell.
 """
 
 from __future__ import annotations

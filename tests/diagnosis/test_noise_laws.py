@@ -31,7 +31,7 @@ def heavy(share: float, times: float, n: int = 50) -> NoiseLaw:
 def found_with(noise: np.ndarray, slope: np.ndarray | None = None) -> tuple[Fit, Recording]:
     """Make a fit of one parameter at its prior's centre."""
     slopes = np.zeros((N, 1)) if slope is None else slope[:, None]
-    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(log_multiplicity=0.0)))
+    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(exchangeable=False)))
     return Fit(model, np.zeros(1), MEAN, noise, slopes, SD, 0.0), Recording(PLAN, MEAN + noise)
 
 

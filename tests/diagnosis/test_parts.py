@@ -423,7 +423,7 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
 )
 def test_verdicts_follow_the_probabilities(probability, verdict, combination):
     aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
-    assert decide(hypotheses(**probability), NOISE, aliases) == (verdict, combination)
+    assert decide(hypotheses(**probability), NOISE, aliases, lambda _: frozenset()) == (verdict, combination)
 
 
 @pytest.mark.parametrize(

@@ -99,21 +99,6 @@ def test_memory_stays_within_a_scan():
     np.testing.assert_allclose(found, wanted, atol=0.02)
 
 
-@pytest.mark.parametrize("name", NOISES)
-def test_a_statistic_tells_its_noise_from_white_noise(name):
-    """Of 200 white recordings none comes as high as the middle one of 41 with the effect."""
-    rng = np.random.default_rng(7)
-    predicted = CHAIN.predict(np.zeros((1, 0)), PLAN)
-    steps = np.concatenate([[0], (np.diff(PLAN.scan) == 0).astype(np.int64)])
-    rows = NoiseRows(predicted[0], (predicted[0] - 10) / 50, SD, steps)
-    drawn = draw_readings(level_of(name), np.repeat(predicted, 41, axis=0), PLAN.scan, rng=rng)
-    effect = NOISES[name][0]
-    with_it = effect.statistic(((drawn - predicted) / SD).T, rows)
-    without = effect.statistic(rng.standard_normal((N, 200)), rows)
-    assert with_it.shape == (41,)
-    assert without.max() < np.median(with_it)
-
-
 def test_the_step_of_a_lattice_is_found():
     rng = np.random.default_rng(2)
     values = rng.normal(30, 8, 300)
@@ -138,8 +123,8 @@ def test_a_lattice_shows_through_printing(digits):
 
 
 def test_a_printing_lattice_and_a_declared_one_are_no_effect():
-    rows = NoiseRows(np.zeros(300), np.zeros(300), SD, np.zeros(300, dtype=np.int64))
+    rows = NoiseRows(np.zeros(300), SD)
     printed = np.round(np.random.default_rng(2).normal(0, 1, (300, 2)) * SD, 2) / SD
-    np.testing.assert_array_equal(Quantisation().statistic(printed, rows), 0.0)
+    assert Quantisation().nodes(printed[:, 0], rows).shape == (0, 1)
     declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))
     assert Quantisation.for_extent(Extent(10.0, 60.0, declared)) is None

@@ -85,11 +85,6 @@ class CalibratedSensor(ABC):
         """Whether its Gaussians can trade names."""
         return False
 
-    @property
-    def log_multiplicity(self) -> float:
-        """Log of the number of equal peaks of the posterior."""
-        return math.lgamma(self.n_gaussians + 1) if self.exchangeable else 0.0
-
     @abstractmethod
     def from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""

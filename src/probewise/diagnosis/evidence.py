@@ -13,6 +13,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, degrees_of_freedom
 from probewise.diagnosis.noise import NoiseLaw, forms
 from probewise.diagnosis.noise_models import LaidOut, NoiseModel
+from probewise.diagnosis.null import log_multiplicity
 
 __all__ = [
     "LEAST_VISIBLE",
@@ -95,7 +96,7 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     for nodes in tailed.values():
         out[nodes] = _of_tails(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
     out += [law.log_extra for law in laid_out.laws]
-    out += laid_out.log_weights + found.model.sensor.log_multiplicity
+    out += laid_out.log_weights + log_multiplicity(found.model.sensor)
     return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, laid_out)
 
 

@@ -84,7 +84,7 @@ class NoiseModel:
         sd = float(np.median(np.abs(residuals))) / 0.6745 or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
-        rows = NoiseRows(predicted, seen, sd, self._steps)
+        rows = NoiseRows(predicted, sd)
         banks = [self._nodes(effect, residuals / sd, rows) for effect in self.effects]
         settings, log_weight = np.zeros((1, 0)), 0.0
         for bank, log_each in banks:

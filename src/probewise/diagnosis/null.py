@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -10,7 +11,7 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 from probewise.sensor import AnyEffect
 
-__all__ = ["Null", "Predictor"]
+__all__ = ["Null", "Predictor", "log_multiplicity"]
 
 
 class Predictor(Protocol):
@@ -75,11 +76,6 @@ class Null(Protocol):
         ...
 
     @property
-    def log_multiplicity(self) -> float:
-        """Log of the number of equal peaks of the posterior."""
-        ...
-
-    @property
     def starts(self) -> FloatArray:
         """Coordinates to fit from, (n_starts, n_params)."""
         ...
@@ -105,3 +101,8 @@ class Null(Protocol):
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Predictor:
         """Build the model of a plan's readings, with effects; `n_nodes` over curved edges, as `sensor.Chain` has it."""
         ...
+
+
+def log_multiplicity(null: Null) -> float:
+    """Log of the number of equal peaks of the posterior: how often Gaussians can trade names."""
+    return math.lgamma(null.n_gaussians + 1) if null.exchangeable else 0.0

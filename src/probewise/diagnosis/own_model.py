@@ -75,11 +75,6 @@ class OwnModel:
         return False
 
     @property
-    def log_multiplicity(self) -> float:
-        """One peak is expected."""
-        return 0.0
-
-    @property
     def nuisance(self) -> tuple[str, ...]:
         """Nothing: its parameters are what is asked for."""
         return ()

@@ -89,11 +89,6 @@ class SensorAndShape:
         return self.sensor.exchangeable
 
     @property
-    def log_multiplicity(self) -> float:
-        """The sensor's."""
-        return self.sensor.log_multiplicity
-
-    @property
     def nuisance(self) -> tuple[str, ...]:
         """The shape's parameters."""
         return self.shape.prior.names

@@ -192,7 +192,7 @@ def decide(
     hypotheses: tuple[Hypothesis, ...],
     noise_names: frozenset[str],
     aliases: tuple[Alias, ...],
-    alike: Callable[[tuple[str, ...]], frozenset[tuple[str, ...]]] = lambda _: frozenset(),
+    alike: Callable[[tuple[str, ...]], frozenset[tuple[str, ...]]],
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Turn probabilities into a verdict and the combination it names.
 

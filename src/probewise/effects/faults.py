@@ -19,7 +19,6 @@ from probewise.sensor.stages import NoiseLevel, Stage
 __all__ = ["Dropouts", "Outliers"]
 
 _FAR = 4.0  # noise sd beyond which a reading may be lost rather than noisy
-_RIVAL = (0.02, 6.0)  # share and size of the heavy tail that the test of it is sharpest for
 
 
 @dataclass(frozen=True)
@@ -50,16 +49,6 @@ class Outliers(NoiseEffect):
         """Equally weighted nodes of the prior, four of each parameter."""
         u = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) + 0.5) / 4
         return self.prior.from_unit_cube(u)[:, None, :]
-
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Log likelihood ratio of one tail to none: residuals (n_points, n_draws) -> (n_draws,).
-
-        The sd is taken from the middle half, which the tail leaves alone.
-        """
-        z = residuals / np.maximum(np.median(np.abs(residuals), axis=0) / 0.6745, 1e-300)
-        share, size = _RIVAL
-        wide = np.exp(np.minimum(0.5 * z * z * (1 - size**-2), 600.0)) / size
-        return np.asarray(np.sum(np.log1p(share * (wide - 1)), axis=0))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how many readings are far off, and how far."""
@@ -111,15 +100,6 @@ class Dropouts(NoiseEffect):
         value = far[int(np.argmax(same.sum(axis=0)))]
         shares = LogUniform(2e-3, 0.2).from_unit((np.arange(12) + 0.5) / 12)
         return np.stack([shares, np.full(12, value)], axis=1)
-
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Count the readings far from their prediction that are all equal: (n_points, n_draws) -> (n_draws,)."""
-        readings = rows.predicted[:, None] + rows.sd * residuals
-        counts = []
-        for reading, z in zip(readings.T, residuals.T, strict=True):
-            far = np.round(reading[np.abs(z) > _FAR] / (1e-6 * rows.sd))
-            counts.append(max(np.unique(far, return_counts=True)[1], default=0))
-        return np.array(counts, dtype=np.float64)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how many readings are lost, and to which value."""

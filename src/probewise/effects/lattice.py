@@ -60,12 +60,6 @@ class Quantisation(NoiseEffect):
         step = lattice_step(rows.predicted + rows.sd * residuals)
         return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Step of the readings' lattice in noise sd, 0 where it is too fine to matter: -> (n_draws,)."""
-        readings = rows.predicted[:, None] + rows.sd * residuals
-        steps = np.array([lattice_step(column) for column in readings.T]) / rows.sd
-        return np.where(steps > self.seen_above, steps, 0.0)
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how coarse the readings are."""
         return f"the readings come in steps of {give_or_take(mean[0], sd[0])}, which nobody declared: they are rounded"

@@ -10,7 +10,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_law import NoiseRows
 from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -47,15 +46,6 @@ class CorrelatedNoise(NoiseEffect):
         """Set the correlation; the sd of one reading stays."""
         return replace(value, rho=theta[:, :1])
 
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Correlation of neighbours, of either sign: residuals (n_points, n_draws) -> (n_draws,)."""
-        later = np.flatnonzero(rows.steps == 1)
-        if later.size == 0:
-            return np.zeros(residuals.shape[1])
-        return np.asarray(
-            np.abs(np.mean(residuals[later] * residuals[later - 1], axis=0)) / np.mean(residuals**2, axis=0)
-        )
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how alike neighbours are."""
         return (
@@ -90,11 +80,6 @@ class SignalDependentNoise(NoiseEffect):
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
         """Widen the noise of each reading by what it sees."""
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
-
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Correlation of the squares with what is seen: residuals (n_points, n_draws) -> (n_draws,)."""
-        tilt = rows.seen - rows.seen.mean()
-        return np.asarray(tilt @ residuals**2 / np.mean(residuals**2, axis=0) / max(np.linalg.norm(tilt), 1e-300))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much louder white is than black."""
@@ -134,11 +119,6 @@ class DriftingNoise(NoiseEffect):
         """Scale the noise of each reading by its time."""
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
         return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
-
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Correlation of the squares with the order of taking: residuals (n_points, n_draws) -> (n_draws,)."""
-        tilt = np.arange(len(residuals)) - 0.5 * (len(residuals) - 1)
-        return np.asarray(np.abs(tilt @ residuals**2) / np.mean(residuals**2, axis=0) / np.linalg.norm(tilt))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how the noise has changed."""

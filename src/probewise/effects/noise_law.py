@@ -17,16 +17,10 @@ _NARROW = 1e-3  # of the noise sd: how exactly a lost reading holds its value wh
 
 @dataclass(frozen=True, eq=False)
 class NoiseRows:
-    """What statistics of the noise ask of the rows, each (n_points,).
-
-    `predicted` readings and `seen` white fraction of the fit, the noise `sd`, and `steps`: rows back to
-    the previous reading of the same scan, 0 for none.
-    """
+    """What the nodes of an effect on the noise ask of a fit: `predicted` readings (n_points,), and the noise `sd`."""
 
     predicted: FloatArray
-    seen: FloatArray
     sd: float
-    steps: IntArray
 
 
 def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) -> FloatArray:

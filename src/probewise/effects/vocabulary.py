@@ -148,10 +148,6 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
         """
         return self.bank()[:, 0, :]
 
-    def statistic(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Measure it: residuals (n_points, n_draws) in units of the noise sd -> (n_draws,), large where it shows."""
-        ...
-
 
 def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:
     """Write mean ± sd with as many digits as the sd deserves."""

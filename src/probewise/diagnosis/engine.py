@@ -178,6 +178,10 @@ class _Diagnoser:
         if verdict == "unknown" and best is not null:
             share = max(1 - self.search.by_mean[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
             written = ensemble.averaged(best, {best.names: 1 - share, (): share})
+        elif verdict == "unknown":  # to the plain sensor what has no name; what has one may still be it
+            by_mean = self.search.by_mean
+            named = {names: by_mean[names] for names in ensemble.likely(best) if names}
+            written = ensemble.averaged(best, {**named, (): 1 - sum(named.values())})
         elif verdict in ("named", "cannot_tell") and best.names:
             written = ensemble.averaged(best, ensemble.likely(best))
         null_samples = samples if best is null else ensemble.of(null)

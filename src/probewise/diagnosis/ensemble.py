@@ -19,8 +19,8 @@ __all__ = ["Ensemble"]
 Names = tuple[str, ...]
 
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
-_LEAST_OF_A_RIVAL = 0.05  # probability of a hypothesis, below which the model does without it
-_MOST = 4  # hypotheses in one model
+_LEAST_OF_A_RIVAL = 0.02  # probability of a hypothesis, below which the model does without it
+_MOST = 6  # hypotheses in one model
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,6 +40,12 @@ def test_too_little_to_say_anything_is_a_verdict_of_its_own(harm, said, recordin
     found = json.loads((out / "diagnosis.json").read_text())
     assert found["verdict"] == "cannot_tell"
     assert found["combination"] == []
+    # What is believed of anything is what was believed before.
+    assert found["hypotheses"][0]["effects"] == []
+    assert 0.5 < found["clean_probability"] < 0.7
+    assert 0.03 < found["unknown_probability"] < 0.1
+    assert all(0.005 < effect["probability"] < 0.03 for effect in found["effects"])
+    assert len(found["credible_set"]) > 10
     assert said in found["reason"]
     assert said in (out / "report.html").read_text()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -11,12 +12,15 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
+from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence import weigh
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.noise import NoiseLaw, Tail, white
 from probewise.diagnosis.noise_models import NoiseModel, rough_sd
 from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
-from probewise.recordings import Recording, paper_plan
+from probewise.recordings import Recording, paper_plan, two_way_plan
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
 
 PLAN = paper_plan()
 N = len(PLAN)
@@ -153,3 +157,20 @@ def test_a_law_of_some_scans_is_that_of_the_whole():
 def test_the_rough_sd_needs_no_model():
     _, recording = found_with(SD * np.random.default_rng(8).normal(size=N))
     assert rough_sd(recording) == pytest.approx(SD, rel=0.2)
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_lost_readings_are_found_among_rounded_ones(declared):
+    """Where most readings are just as rounded predictions are, their spread is nothing, and still not all are far."""
+    plan = two_way_plan()
+    instrumentation = replace(plan.instrumentation, step=1.0 if declared else None)
+    plan = replace(plan, instrumentation=instrumentation)
+    world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
+    rng = np.random.default_rng(3)
+    readings = np.round(world.expected(plan) + 0.45 * rng.standard_normal(len(plan)))
+    readings[rng.choice(len(plan), 16, replace=False)] = 3.0
+    found = diagnose(Recording(plan, readings), rng=rng)
+    assert found.verdict == "noise"
+    assert "dropouts" in found.combination
+    lost = next(effect for effect in found.effects if effect.name == "dropouts")
+    assert lost.parameters[1].mean == pytest.approx(3.0, abs=0.01)

@@ -222,12 +222,13 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     plan = recording.plan
     usable = recording.usable
     readings = recording.readings[usable]
+    named = recording.source or "recording"
     if readings.size == 0:
-        raise ParameterError("recording", f"{len(recording)} rows, none usable", "readings present and within min..max")
+        raise ParameterError(named, f"{len(recording)} rows, none usable", "readings present and within min..max")
     low, high = float(readings.min()), float(readings.max())
     if not low < high:
         raise ParameterError(
-            "recording", f"all {readings.size} usable readings equal {low:g}", "readings that differ: scan an edge"
+            named, f"all {readings.size} usable readings equal {low:g}", "readings that differ: scan an edge"
         )
     place = np.stack([plan.x_mm, plan.y_mm], axis=-1)
     moves: list[FloatArray] = []

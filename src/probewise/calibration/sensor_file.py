@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     SSFField,
+    Stage,
     footprint_of,
     is_free_form,
     mean_mixture,
@@ -247,7 +248,7 @@ class FittedSensor(ShowsItself):
             "effects": list(self.effects),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
             "noise": {
-                "model": "independent Gaussian, one sd pooled over scans; one value a sample",
+                "model": self._noise_in_words(),
                 "mean": float(self.noise_sd.mean()),
                 "scans": [asdict(scan) for scan in self.scan_noise],
                 "sd": self.noise_sd.tolist(),
@@ -267,6 +268,11 @@ class FittedSensor(ShowsItself):
             "samples": self.samples.tolist(),
         }
         return json.dumps(document, allow_nan=False) + "\n"
+
+    def _noise_in_words(self) -> str:
+        known = [name.replace("_", " ") for name in self.effects if cast(Stage, EFFECTS[name].stage) == Stage.NOISE]
+        plain = "Gaussian, one sd pooled over scans; one value a sample"
+        return f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}"
 
     @classmethod
     def from_json(cls, text: str, path: object = "sensor.json") -> FittedSensor:

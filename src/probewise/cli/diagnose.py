@@ -85,6 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         write_results(diagnosis, drawn, stage, rng=files_rng)
         page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
         (stage / "report.html").write_text(page, encoding="utf-8")
+    for note in joined.notes:
+        say(f"note: {note}", quiet=arguments.quiet)
     if diagnosis.next_measurement is None:
         for name in ("next_plan.csv", "next_plan.json"):  # of an earlier run: nobody asks for it now
             (out / name).unlink(missing_ok=True)

@@ -34,9 +34,11 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"{len(plan)} readings predicted: {out}", quiet=arguments.quiet)
     scored = np.isfinite(prediction.log_density)
     if readings is not None and scored.any():
+        n_left = len(plan) - int(scored.sum())
+        left_out = f" ({n_left} missing or out of range, left out)" if n_left else ""
         z = (readings[scored] - prediction.mean[scored]) / prediction.sd[scored]
         say(
-            f"of {int(scored.sum())} recorded: chi-square a reading {float(np.mean(z**2)):.3f}, "
+            f"of {int(scored.sum())} recorded{left_out}: chi-square a reading {float(np.mean(z**2)):.3f}, "
             f"log density a reading {float(prediction.log_density[scored].mean()):.3f}",
             quiet=arguments.quiet,
         )

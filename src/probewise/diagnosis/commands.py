@@ -237,10 +237,12 @@ def one_after_another(scans: Sequence[Command], after: Plan) -> tuple[Plan, list
 
 
 def in_turn(scans: Sequence[Command]) -> Plan:
-    """Take scans one after the other, with a break before each."""
+    """Take scans one after the other, with a break before each, a longer one where something has to be laid."""
     out: list[Command] = []
     for scan in scans:
-        out.append(put_off(scan, out[-1].plan) if out else scan)
+        later = put_off(scan, out[-1].plan) if out else scan
+        laid_s = later.plan.time_s + (LAY_S if scan.kind == "lay" else 0.0)
+        out.append(replace(later, plan=replace(later.plan, time_s=laid_s)))
     return _joined(out)
 
 

@@ -138,6 +138,10 @@ class _Diagnoser:
         if self.thorough is not None and not few:
             self.search, weighings = self.thorough(self.search)
         self.noise_names = frozenset(k for k, e in self.built.items() if e.stage is Stage.NOISE)
+        if few:  # they say nothing, whatever the evidence makes of them
+            on_mean = [k for k, e in self.built.items() if e.stage is not Stage.NOISE and k not in UNNAMED]
+            believed = self.search.prior.alone(on_mean, self.search.certain)
+            self.search = replace(self.search, probabilities=believed)
         probabilities = self.search.probabilities
         hypotheses = _hypotheses(probabilities)
         noise = self._most_probable_noise(probabilities)

@@ -81,7 +81,8 @@ class NoiseModel:
     def laws(self, predicted: FloatArray) -> LaidOut:
         """Lay out every combination of the effects' nodes about predictions of the usable rows, (n_usable,)."""
         residuals = self._readings - predicted
-        sd = float(np.median(np.abs(residuals))) / 0.6745 or 1.0
+        # Rounded readings can all be as predicted; what rounding alone leaves is not far.
+        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._lattice / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
         rows = NoiseRows(predicted, sd)
@@ -152,7 +153,12 @@ class NoiseModel:
     @cached_property
     def _cell(self) -> float:
         """Width of what a lost reading is known to, in reading units."""
-        return lattice_step(self._readings) or _FINE * rough_sd(self.recording) or 1e-12
+        return self._lattice or _FINE * rough_sd(self.recording) or 1e-12
+
+    @cached_property
+    def _lattice(self) -> float:
+        """Step of a lattice that all readings are on, 0 where there is none."""
+        return lattice_step(self._readings)
 
 
 def rough_sd(recording: Recording) -> float:

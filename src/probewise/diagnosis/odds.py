@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -65,6 +65,22 @@ class PriorOdds:
         if names:
             return self.log_mean(names) + math.log(self.unknown_beside)
         return math.log(self.unknown * (1 - self.foreseen if self.n_unnamed else 1.0))
+
+    def alone(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
+        """Give what is believed of clean, unknown and single effects on the mean where no reading says anything.
+
+        Parameters
+        ----------
+        names
+            Of the effects on the mean in the vocabulary.
+        noise
+            What is certain of the noise.
+        """
+        each = self.by_size[0] / self.n_named
+        believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
+        believed |= {(name,): each for name in names}
+        total = sum(believed.values())
+        return {(mean, noise): p / total for mean, p in believed.items()}
 
     def log_noise(self, names: Names) -> float:
         """Log prior of a noise model; `names` are those of its effects that may be absent."""

@@ -163,7 +163,7 @@ class _Diagnoser:
         mean_names = tuple(name for name in combination if name in self.built and name not in self.noise_names)
         foreseen = self._foreseen()
         if verdict == "unknown":
-            mean_names = foreseen or self.search.beside(noise)
+            mean_names = foreseen
         noise_of = noise
         if verdict in ("named", "noise", "clean"):
             stated = tuple(name for name in combination if name in self.noise_names)
@@ -171,6 +171,8 @@ class _Diagnoser:
                 {key: p for key, p in probabilities.items() if in_vocabulary(key[1]) == stated}
             )
         best = self.search.best(mean_names, noise_of) or null
+        if verdict == "unknown" and not foreseen:
+            best = self.search.beside(noise) or null
         after, improvement = self._judged(null, best, noise_of, p_value)
         fails = verdict == "named" and improvement.heldout_log_density_per_reading < _RUIN
         if fails:  # what explains these readings alone is no repair

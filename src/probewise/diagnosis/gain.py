@@ -16,10 +16,11 @@ from probewise.diagnosis.fit import Fit, degrees_of_freedom, fit
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["HeldOut", "compare_scans", "held_out_gain", "parts_kept_back"]
+__all__ = ["HeldOut", "blocks_kept_back", "compare_scans", "held_out_gain", "parts_kept_back"]
 
 _LEAST_ROWS = 8
 _MOST_SCANS = 10
+_BLOCKS = 5
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,16 @@ def parts_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
                 f"{plan.pattern_names[int(code)]}, {np.degrees(turn):.0f} degrees" for code, turn in kinds.T
             )
     return scan, plan.scan_names
+
+
+def blocks_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
+    """Divide usable readings into blocks of eight that follow each other, every fifth of which is kept back together.
+
+    What is local in time tells nothing of another scan; of readings between those that are known it does, and a block
+    is long enough that its middle is no neighbour of theirs.
+    """
+    block = np.arange(int(recording.usable.sum())) // _LEAST_ROWS
+    return block % _BLOCKS, tuple(f"every fifth block of {_LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
 def compare_scans(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:

@@ -9,10 +9,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.gain import held_out_gain, parts_kept_back
+from probewise.diagnosis.gain import blocks_kept_back, held_out_gain, parts_kept_back
 from probewise.diagnosis.locate import global_p_value
 from probewise.diagnosis.unknown import correct
-from probewise.diagnosis.verdict import Improvement
+from probewise.diagnosis.verdict import ALARM, Improvement
 from probewise.diagnosis.weighed import Candidate, Search
 
 __all__ = ["corrected", "improvement_of"]
@@ -20,6 +20,7 @@ __all__ = ["corrected", "improvement_of"]
 Names = tuple[str, ...]
 
 _N_DRAWS = 499
+_MOST_BASES = 6
 
 
 def improvement_of(
@@ -69,34 +70,45 @@ def corrected(
 ) -> tuple[Improvement, FloatArray]:
     """Repair what the named effects leave by bases without a name, where that predicts scans kept back.
 
+    One basis at a time, the most telling, until nothing more is missing or the next gains nothing. Where the first
+    gains nothing on other scans, blocks within scans are kept back instead: of what is local in time.
+
     Returns
     -------
     improvement, change
         `plain` with what the correction adds, and the correction of the usable readings, (n_usable,).
     """
-    bases = search.unknown_bases
     parts, part_names = parts_kept_back(search.recording)
-    fixed = correct(best.found, problem, bases, parts)
-    if fixed.held_out.by_scan and fixed.held_out.per_reading <= 0:
-        return plain, np.zeros(len(fixed.change))
-    wider = replace(
-        best.found,
-        residuals=best.found.residuals - fixed.change,
-        slopes=np.concatenate([best.found.slopes, fixed.columns], axis=1),
-        z=np.concatenate([best.found.z, np.zeros(fixed.columns.shape[1])]),
-    )
-    after = Linearised.of(wider, problem.law)
-    p_after = global_p_value(after, search.looks(best.found), after.draws(_N_DRAWS, rng=rng))
+    found, gain = best.found, plain
+    if correct(found, problem, search.unknown_bases, parts).gains_nothing:
+        parts, part_names = blocks_kept_back(search.recording)
+        gain = replace(plain, heldout_by_scan=())
+    change = np.zeros(len(found.residuals))
     plain_z = null.evidence[noise].log_z
-    named = dict(plain.heldout_by_scan)
-    by_scan = ((part_names[int(k)], gained) for k, gained in fixed.held_out.by_scan)
-    gain = replace(
-        plain,
-        log_evidence=search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,
-        heldout_log_density_per_reading=plain.heldout_log_density_per_reading + fixed.held_out.per_reading,
-        heldout_sd=math.hypot(plain.heldout_sd, fixed.held_out.sd),
-        heldout_by_scan=tuple((name, gained + named.get(name, 0.0)) for name, gained in by_scan),
-        rms_after=float(np.sqrt(np.mean(wider.residuals**2))),
-        p_value_after=p_after,
-    )
-    return gain, fixed.change
+    for step in range(_MOST_BASES):
+        fixed = correct(found, problem, search.unknown_bases, parts)
+        held = fixed.held_out
+        if fixed.gains_nothing or (step and held.per_reading <= held.sd):
+            break
+        found = replace(
+            found,
+            residuals=found.residuals - fixed.change,
+            slopes=np.concatenate([found.slopes, fixed.columns], axis=1),
+            z=np.concatenate([found.z, np.zeros(fixed.columns.shape[1])]),
+        )
+        change = change + fixed.change
+        problem = Linearised.of(found, problem.law)
+        before = dict(gain.heldout_by_scan)
+        by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
+        gain = replace(
+            gain,
+            log_evidence=search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,
+            heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
+            heldout_sd=math.hypot(gain.heldout_sd, held.sd),
+            heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
+            rms_after=float(np.sqrt(np.mean(found.residuals**2))),
+            p_value_after=global_p_value(problem, search.looks(best.found), problem.draws(_N_DRAWS, rng=rng)),
+        )
+        if gain.p_value_after >= ALARM or not held.by_scan:
+            break
+    return (gain, change) if change.any() else (plain, change)

@@ -75,7 +75,8 @@ def reason_of(
             covariate = family.removesuffix(FAR_OUT).replace("_", " ")
             return f"The readings that are far out lie together in {covariate}: something is missing there, not noise."
         place = f" It shows most in {where[0].covariate}." if where else ""
-        known = " and ".join(name.replace("_", " ") for name in search.beside(noise))
+        found = search.beside(noise)
+        known = " and ".join(name.replace("_", " ") for name in found.names) if found else ""
         beside = f", beside {known}" if known else ""
         return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
     if fails:

@@ -31,6 +31,11 @@ class Correction:
     columns: FloatArray
     held_out: HeldOut
 
+    @property
+    def gains_nothing(self) -> bool:
+        """Whether readings kept back, where there are any, speak against it."""
+        return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
+
 
 def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Correction:
     """Correct a fit by the most telling basis.

@@ -144,14 +144,14 @@ class Search:
             out[mean] = out.get(mean, 0.0) + p
         return out
 
-    def beside(self, noise: Names) -> Names:
-        """Name the effects on the mean beside which something unknown most probably is; () for none."""
+    def beside(self, noise: Names) -> Candidate | None:
+        """Give the fit beside which something unknown most probably is; None where nothing unknown was weighed."""
         scores = {
-            names: value + self.prior.log_unknown(names)
-            for (_, names, own), value in self.unknown.items()
+            (n, names): value + self.prior.log_unknown(names)
+            for (n, names, own), value in self.unknown.items()
             if own == noise
         }
-        return max(scores, key=lambda names: scores[names], default=())
+        return self.candidates[max(scores, key=lambda key: scores[key])] if scores else None
 
     def looks(self, found: Fit) -> list[Bank]:
         """List every template that a test looks at about a fit: of the effects that it lacks, and the unknown.

@@ -2,7 +2,16 @@
 
 import pytest
 
-from probewise.challenge.scoring import accepted, answers, extras, fits, is_outside, leading_name_right, stated
+from probewise.challenge.scoring import (
+    accepted,
+    answers,
+    extras,
+    fits,
+    is_outside,
+    is_physics,
+    leading_name_right,
+    stated,
+)
 
 
 def test_what_fewer_than_three_nats_tell_apart_is_the_same(make):
@@ -63,3 +72,19 @@ def test_a_probability_is_held_against_the_exact_truth(make):
     assert stated(make.single(hide=alias, p=0.8)) == (0.8, True)
     assert stated(make.single(hide=alias, said=["backlash"], p=0.8)) == (0.8, False)
     assert stated(make.case(p=0.6)) == (0.6, True)
+
+
+def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
+    """A skirt about a Gaussian spot is a second Gaussian: lambda 8, rho .999 leaves .06 nats; .9 leaves six."""
+    like, unlike = (make.hidden("halo", cosines={"halo": 1.0, "ssf_order": rho}) for rho in (0.999, 0.9))
+    for hide, free in ((like, True), (unlike, False)):
+        found = make.single("halo", hide=hide)
+        assert is_physics(found) != free
+        assert fits((), answers(found, merged=True)) == free
+        assert fits(("halo",), answers(found, merged=True))
+        assert not fits((), answers(found, merged=False))
+    both = make.case("pair", 12.0, truth=["halo", "lag"], hides=[like, make.hidden("lag", 12.0)], said=["lag"])
+    assert leading_name_right(both)
+    assert is_physics(both)
+    assert not fits(("halo",), answers(both, merged=True))
+    assert not fits(("lag", "glint"), answers(both, merged=True))

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.challenge import NullRefit
+from probewise.challenge import NullRefit, score
 from probewise.challenge.likeness import cosines
 from probewise.effects import VOCABULARY
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
-from probewise.world.concealed import AmbientStep
+from probewise.world.concealed import AmbientStep, Halo
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -74,3 +74,18 @@ def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
     assert 0.3 < found["offset_drift"] < 0.95
     assert found["backlash"] < 0.3
     assert "correlated_noise" not in found
+
+
+def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, clean):
+    """And a change of the light is not: it is not even asked."""
+    skirt = replace(world, concealed=(Halo(0.08, 12.0),)).simulate(plan, rng=None)
+    assert cosines(refit, clean, skirt)["ssf_order"] > 0.99
+    step = replace(world, concealed=(AmbientStep(0.4, 300.0),)).simulate(plan, rng=None)
+    assert "ssf_order" not in cosines(refit, clean, step)
+
+
+def test_an_alarm_is_due_on_physics_alone(make):
+    like = make.hidden("halo", cosines={"halo": 1.0, "ssf_order": 0.999})
+    results = [make.single("halo", hide=like, p_value=0.7), make.single("lag", p_value=1e-5)]
+    (found,) = (row for row in score(results) if row.name == "detection, alpha .01, lambda 8")
+    assert (found.found.value, found.found.n) == (1.0, 1)

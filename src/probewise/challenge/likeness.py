@@ -20,6 +20,7 @@ from probewise.sensor import Stage
 __all__ = ["cosines"]
 
 _WORTH_A_REFIT = 0.8
+_LIKE_AN_SSF = ("halo", "edge_blur")  # what looks like these may be an SSF of one Gaussian more
 
 
 def cosines(
@@ -43,7 +44,8 @@ def cosines(
     Returns
     -------
     For each name rho: the square root of the share of the surviving sum of squares that the effect of that name
-    takes up together with the null. Those that take up most of it are refitted in full, the others linearised.
+    takes up together with the null. Those that take up most of it are refitted in full, the others linearised. Where
+    what survives is like a skirt or a blur, "ssf_order" too: one Gaussian more, and no physics left out.
     """
     found = refit.refit(clean, changed)
     usable = np.flatnonzero(clean.usable)
@@ -66,6 +68,10 @@ def cosines(
             z = found.z + problem.absorbed(found, columns @ amount)
             rho = _refitted(found, templates.variant(best), start, z, refit.exact(clean, changed))
         out[name] = rho
+    if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
+        left = refit.refit_with_one_more(clean, changed).residuals
+        share = float(left @ left) / float(found.residuals @ found.residuals)
+        out["ssf_order"] = float(np.sqrt(np.clip(1 - share, 0.0, 1.0)))
     return out
 
 

@@ -15,6 +15,7 @@ __all__ = [
     "extras",
     "fits",
     "is_outside",
+    "is_physics",
     "leading",
     "leading_name_right",
     "names_of",
@@ -59,9 +60,14 @@ def answers(result: Result, *, merged: bool, noise: bool = True) -> list[frozens
 
 
 def fits(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
-    """Tell whether names stand one to one for what is wanted."""
-    return len(names) == len(wanted) and any(
-        all(name in right for name, right in zip(order, wanted, strict=True)) for order in itertools.permutations(names)
+    """Tell whether names stand one to one for what is wanted; what is no physics need not be named."""
+    needed = [right for right in wanted if not right & NO_PHYSICS]
+    optional = [right for right in wanted if right & NO_PHYSICS]
+    n_more = len(names) - len(needed)
+    return 0 <= n_more <= len(optional) and any(
+        all(name in right for name, right in zip(order, [*needed, *more], strict=True))
+        for more in itertools.combinations(optional, n_more)
+        for order in itertools.permutations(names)
     )
 
 
@@ -72,6 +78,11 @@ def extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
         for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
     )
     return len(names) - most
+
+
+def is_physics(result: Result) -> bool:
+    """Tell whether something is concealed that is no mere Gaussian more of the SSF, as far as so many readings tell."""
+    return any(not right & NO_PHYSICS for right in answers(result, merged=True))
 
 
 def is_outside(result: Result) -> bool:

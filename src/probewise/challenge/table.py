@@ -19,6 +19,7 @@ from probewise.challenge.scoring import (
     extras,
     fits,
     is_outside,
+    is_physics,
     leading,
     leading_name_right,
     names_of,
@@ -113,10 +114,10 @@ def _clean(done: list[Result]) -> list[Row]:
 def _detection(done: list[Result]) -> list[Row]:
     targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
     rows = [
-        Row(f"detection, alpha .01, lambda {size:g}", _alarms(_on_mean(_singles(done, size)), 0.01), least)
+        Row(f"detection, alpha .01, lambda {size:g}", _alarms(_seen_as_physics(_singles(done, size)), 0.01), least)
         for size, least in targets.items()
     ]
-    each = [detected for detected, _ in by_effect(_on_mean(done)).values()]
+    each = [detected for detected, _ in by_effect(_seen_as_physics(done)).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=share([]))
     return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
 
@@ -287,6 +288,11 @@ def _time(done: list[Result]) -> list[Row]:
 
 def _singles(done: Sequence[Result], size: float) -> list[Result]:
     return [r for r in done if r["kind"] == "single" and r["size"] == size]
+
+
+def _seen_as_physics(results: Sequence[Result]) -> list[Result]:
+    """Keep what an alarm is due on: not what one Gaussian more of the SSF takes up."""
+    return [r for r in _on_mean(results) if is_physics(r)]
 
 
 def _on_mean(results: Sequence[Result]) -> list[Result]:

@@ -35,7 +35,9 @@ def name_by_likeness(hidden: Hidden) -> float:
 def covariate_by_likeness(hidden: Hidden) -> float:
     """Expect how often the right covariate comes before the hardest rival that shows in none of the right ones."""
     shown = set(hidden["shows_in"])
-    covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in hidden["cosines"]}
+    named = [name for name in hidden["cosines"] if name in VOCABULARY]
+    covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in named}
+    covariates["ssf_order"] = ("edge_distance",)
     return _against_the_hardest(hidden, {name for name, own in covariates.items() if shown & set(own)})
 
 

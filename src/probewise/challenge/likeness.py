@@ -69,9 +69,7 @@ def cosines(
             rho = _refitted(found, templates.variant(best), start, z, refit.exact(clean, changed))
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
-        left = refit.refit_with_one_more(clean, changed).residuals
-        share = float(left @ left) / float(found.residuals @ found.residuals)
-        out["ssf_order"] = float(np.sqrt(np.clip(1 - share, 0.0, 1.0)))
+        out["ssf_order"] = _taken_up(found, refit.with_one_more(found, clean, changed))
     return out
 
 
@@ -82,4 +80,10 @@ def _refitted(found: Fit, effect: NamedEffect[Any], start: FloatArray, z: FloatA
     # As floor of the sd a tenth of what survives: far enough below it to be seen, and no exact fit is asked for.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))
     with_effect = fit(model, exact, start_z, white(len(found.residuals)), sd_floor=floor, tolerance=0.02)
-    return float(np.sqrt(np.clip(1 - float(with_effect.residuals @ with_effect.residuals) / rss, 0.0, 1.0)))
+    return _taken_up(found, with_effect)
+
+
+def _taken_up(found: Fit, by: Fit) -> float:
+    """Square root of the share of what a fit leaves that another takes up."""
+    left = float(by.residuals @ by.residuals) / float(found.residuals @ found.residuals)
+    return float(np.sqrt(np.clip(1 - left, 0.0, 1.0)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from probewise._arrays import FloatArray
@@ -39,13 +41,9 @@ class NullRefit:
         null = self.null(clean)
         return _fit(null.model, self.exact(clean, changed), null.z)
 
-    def refit_with_one_more(self, clean: Recording, changed: Recording) -> Fit:
-        """Refit a null whose SSF has one Gaussian more, which is no physics, to the same readings."""
-        found, null = self.refit(clean, changed), self.null(clean)
-        wanted = default_sensor(Extent.of(clean), null.model.sensor.n_gaussians + 1)
-        starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
-        exact = self.exact(clean, changed)
-        fits = (_fit(Model(wanted, (), clean.plan), exact, z) for z in starts)
+    def with_one_more(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
+        """Refit with one Gaussian more than `refit` gave, which is no physics, to the same readings."""
+        fits = _with_one_more(found, self.exact(clean, changed), Extent.of(clean))
         return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
 
     def exact(self, clean: Recording, changed: Recording) -> Recording:
@@ -69,16 +67,21 @@ def _best_order(clean: Recording) -> Fit:
         key=lambda f: f.objective,
     )
     best, best_log_z = found, weigh(found, noise, sd_floor=_NOISE_SD).log_z
-    for n in range(2, _MOST_GAUSSIANS + 1):
-        wanted = default_sensor(extent, n)
-        starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
-        found = min((_fit(Model(wanted, (), clean.plan), clean, z) for z in starts), key=lambda f: f.objective)
+    for _ in range(_MOST_GAUSSIANS - 1):
+        found = min(_with_one_more(found, clean, extent), key=lambda f: f.objective)
         log_z = weigh(found, noise, sd_floor=_NOISE_SD).log_z
         if log_z > best_log_z:
             best, best_log_z = found, log_z
         elif log_z < best_log_z - _BEHIND:
             break
     return best
+
+
+def _with_one_more(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
+    """Fit with one Gaussian more, from every way to split the heaviest."""
+    wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
+    for z in start_with_more_gaussians(found.model.sensor, found.z, wanted):
+        yield _fit(Model(wanted, (), recording.plan), recording, z)
 
 
 def _fit(model: Model, recording: Recording, start: FloatArray) -> Fit:

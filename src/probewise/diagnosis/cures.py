@@ -40,11 +40,11 @@ def cures_of(
     ailing
         Names of the effects that are not fine under the plan.
     """
+    every = [*commands(plan, strides=_STRIDES), *layings(plan)]
     chosen: list[Command] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
         taken = {command.plan.scan_names for command in chosen}
-        every = [*commands(plan, strides=_STRIDES), *layings(plan)]
         offered = [c for c in every if c.plan.scan_names not in taken]
         options = [put_off(command, current) for command in offered]
         if not options:

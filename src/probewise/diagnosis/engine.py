@@ -162,17 +162,16 @@ class _Diagnoser:
 
         mean_names = tuple(name for name in combination if name in self.built and name not in self.noise_names)
         foreseen = self._foreseen()
-        if verdict == "unknown":
-            mean_names = foreseen
         noise_of = noise
         if verdict in ("named", "noise", "clean"):
             stated = tuple(name for name in combination if name in self.noise_names)
             noise_of = self._most_probable_noise(
                 {key: p for key, p in probabilities.items() if in_vocabulary(key[1]) == stated}
             )
-        best = self.search.best(mean_names, noise_of) or null
-        if verdict == "unknown" and not foreseen:
-            best = self.search.beside(noise) or null
+        if verdict == "unknown":
+            best = (self.search.best(foreseen, noise) if foreseen else self.search.beside(noise)) or null
+        else:
+            best = self.search.best(mean_names, noise_of) or null
         after, improvement = self._judged(null, best, noise_of, p_value)
         fails = verdict == "named" and improvement.heldout_log_density_per_reading < _RUIN
         if fails:  # what explains these readings alone is no repair
@@ -264,10 +263,10 @@ class _Diagnoser:
         p_value = global_p_value(problem, self.search.looks(null.found), draws)
         freer = sorted(n for n, names in self.search.candidates if not names and n > null.n_gaussians)
         rivals = [self.search.candidates[n, ()] for n in freer]
-        freest = (rivals or [null])[-1]
-        # What is known of a sensor is not forgotten: that it was turned, or edges are soft, shows by that alone.
-        finer = [freest] if self.sensor is None else []
-        for rival, fine in [*((rival, False) for rival in rivals), *((rival, True) for rival in finer)]:
+        asked = [(rival, False) for rival in rivals]
+        if self.sensor is None:  # what is known is not forgotten: that it was turned shows by that alone
+            asked.append(((rivals or [null])[-1], True))
+        for rival, fine in asked:
             if p_value > _NO_ALARM:
                 break
             found = rival.found

@@ -59,7 +59,8 @@ def layings(plan: Plan) -> list[Command]:
 def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command]:
     """Turn the sheet of an edge, half round or by a quarter; move it; lay stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
-    length = float(np.ptp(_beyond(plan, scan, edge)))
+    beyond = _beyond(plan, scan, edge)
+    length = float(np.ptp(beyond))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
         return []
     once = _scan(plan, scan, name)
@@ -68,7 +69,7 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command
         (f"{name}_half_round", f"{name}, turned half round about where its edge should be", once, half_round),
         (f"{name}_quarter", f"{name}, turned by a quarter with the scan", *_both_turned(once, edge)),
     ]
-    middle_mm = float(_beyond(plan, scan, edge).mean())
+    middle_mm = float(beyond.mean())
     for end in (-1.0, 1.0):
         exactly_mm = middle_mm + end * _ASIDE * length
         aside_mm = float(np.round(exactly_mm)) or exactly_mm

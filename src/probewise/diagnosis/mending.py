@@ -79,16 +79,22 @@ def corrected(
         `plain` with what the correction adds, and the correction of the usable readings, (n_usable,).
     """
     parts, part_names = parts_kept_back(search.recording)
-    found, gain = best.found, plain
-    if correct(found, problem, search.unknown_bases, parts).gains_nothing:
+    fixed = correct(best.found, problem, search.unknown_bases, parts)
+    gain = plain
+    if fixed.gains_nothing:
         parts, part_names = blocks_kept_back(search.recording)
+        fixed = correct(best.found, problem, search.unknown_bases, parts)
         gain = replace(plain, heldout_by_scan=())
-    change = np.zeros(len(found.residuals))
+    if fixed.gains_nothing:
+        return plain, np.zeros(len(fixed.change))
     plain_z = null.evidence[noise].log_z
+    log_evidence = search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z
+    found, change = best.found, np.zeros(len(fixed.change))
     for step in range(_MOST_BASES):
-        fixed = correct(found, problem, search.unknown_bases, parts)
+        if step:
+            fixed = correct(found, problem, search.unknown_bases, parts)
         held = fixed.held_out
-        if fixed.gains_nothing or (step and held.per_reading <= held.sd):
+        if step and held.per_reading <= held.sd:
             break
         found = replace(
             found,
@@ -102,7 +108,7 @@ def corrected(
         by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
         gain = replace(
             gain,
-            log_evidence=search.unknown.get((best.n_gaussians, best.names, noise), plain_z) - plain_z,
+            log_evidence=log_evidence,
             heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
             heldout_sd=math.hypot(gain.heldout_sd, held.sd),
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
@@ -111,4 +117,4 @@ def corrected(
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
             break
-    return (gain, change) if change.any() else (plain, change)
+    return gain, change

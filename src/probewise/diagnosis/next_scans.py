@@ -168,15 +168,16 @@ def _promising(rivals: Sequence[Rival], sd: float, offered: Sequence[Command], p
 
 def _expected_log_bayes_factor(outlooks: Sequence[Outlook], weights: FloatArray) -> float:
     """Average, over which hypothesis is true, the log Bayes factor to be expected over the hardest of its rivals."""
-    inverse = [np.linalg.inv(outlook.covariance) for outlook in outlooks]
-    log_dets = [np.linalg.slogdet(outlook.covariance)[1] for outlook in outlooks]
+    covariances = [outlook.covariance for outlook in outlooks]
+    inverse = [np.linalg.inv(covariance) for covariance in covariances]
+    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
     hardest = []
     for a, true in enumerate(outlooks):
         divergences = []
         for b, other in enumerate(outlooks):
             if a != b:
                 apart = true.mean - other.mean
-                trace = float(np.sum(inverse[b] * true.covariance)) - len(apart)
+                trace = float(np.sum(inverse[b] * covariances[a])) - len(apart)
                 divergences.append(0.5 * (trace + log_dets[b] - log_dets[a] + apart @ inverse[b] @ apart))
         hardest.append(min(divergences))
     return max(float(weights @ hardest), 0.0)

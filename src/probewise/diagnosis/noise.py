@@ -227,9 +227,13 @@ class Tail:
     def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Give minus the second derivative of the log likelihood by log sigma, (k,)."""
         squares = (whitened / sigma) ** 2
-        wide = expit(self._log_odds(squares))
+        wide = self.wide(squares)
         less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
         return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
+
+    def wide(self, squares: FloatArray) -> FloatArray:
+        """Probability that a residual is a wide one, by its square in units of sigma^2."""
+        return np.asarray(expit(self._log_odds(squares)))
 
     def _log_odds(self, squares: FloatArray) -> FloatArray:
         """Log odds that a residual is a wide one, by its square in units of sigma^2."""
@@ -238,7 +242,7 @@ class Tail:
 
     def _weights(self, squares: FloatArray) -> FloatArray:
         """Expect the precision of each residual, 1 for those of the narrow part."""
-        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * expit(self._log_odds(squares)))
+        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide(squares))
 
 
 def forms(laws: Sequence[NoiseLaw]) -> Tail | Flat:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import betaln, expit
+from scipy.special import betaln
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.covariates import Covariate
 from probewise.diagnosis.locate import windows
-from probewise.diagnosis.noise import NoiseLaw
+from probewise.diagnosis.noise import NoiseLaw, Tail
 from probewise.diagnosis.screening import log_mean
 
 __all__ = ["FAR_OUT", "outlying", "score_together"]
@@ -28,9 +28,7 @@ _A = 0.5  # of the share of readings that are far out, a beta distribution of bo
 def outlying(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
     """Probability of each reading to be in the tail of a law, (n_points,)."""
     whitened = law(residuals)
-    z2 = (whitened / law.scale(whitened[:, None])[0]) ** 2
-    log_odds = np.log(law.share / (1 - law.share) / law.times) + 0.5 * z2 * (1 - law.times**-2)
-    return np.asarray(expit(log_odds))
+    return Tail(law.share, law.times).wide((whitened / law.scale(whitened[:, None])[0]) ** 2)
 
 
 def score_together(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:

@@ -37,17 +37,19 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     if showing and len(showing) == len(case.truth.hidden):
         with suppress(ParameterError):  # readings are lost at times, and of these none was
             models["right"] = model_with(case.recording, showing, rng=fitting)
-    sensors = {
-        name: samples.fitted_sensor(diagnosis.recording, rng=child)
-        for (name, samples), child in zip(models.items(), drawing, strict=False)
+    scans = kept_back(case)
+    scores: dict[str, dict[str, float]] = {}
+    for (name, samples), child in zip(models.items(), drawing, strict=False):
+        if name == "repaired" and samples is diagnosis.null:  # nothing was left out
+            scores[name] = scores["null"]
+            continue
+        sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
+        scores[name] = {scan: _scored(sensor, recording) for scan, recording in scans.items()}
+    scores["true"] = {
+        scan: _truly(case.world.expected(recording.plan), case.world.noise_sd, recording)
+        for scan, recording in scans.items()
     }
-    return {
-        scan: {
-            **{name: _scored(sensor, recording) for name, sensor in sensors.items()},
-            "true": _truly(case.world.expected(recording.plan), case.world.noise_sd, recording),
-        }
-        for scan, recording in kept_back(case).items()
-    }
+    return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
 
 
 def _scored(sensor: FittedSensor, recording: Recording) -> float:

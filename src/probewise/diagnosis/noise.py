@@ -107,7 +107,12 @@ class NoiseLaw:
         y = y * (self.kept / self.sd)[:, None]
         if np.any(self.carry):
             carry = self.carry[1:, None]
-            y = np.concatenate([y[:1], (y[1:] - carry * y[:-1]) / np.sqrt(1 - carry**2)])
+            innovation = np.empty_like(y)
+            innovation[0] = y[0]
+            np.multiply(carry, y[:-1], out=innovation[1:])
+            np.subtract(y[1:], innovation[1:], out=innovation[1:])
+            innovation[1:] /= np.sqrt(1 - carry**2)
+            y = innovation
         return y[:, 0] if flat else y
 
     def log_det(self) -> float:

@@ -83,6 +83,11 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
         assert fits((), answers(found, merged=True)) == free
         assert fits(("halo",), answers(found, merged=True))
         assert not fits((), answers(found, merged=False))
+    # A hundredth for a name behind a clean verdict is no name that comes first, unless a name is due.
+    hypotheses = [[[], 0.9], [["lag"], 0.07], [["halo"], 0.03]]
+    assert leading_name_right(make.single("halo", hide=like, said=[], hypotheses=hypotheses))
+    assert not leading_name_right(make.single("halo", hide=unlike, said=[], hypotheses=hypotheses))
+    assert not leading_name_right(make.single("halo", hide=like, said=["lag"], hypotheses=[[["lag"], 0.9], [[], 0.1]]))
     both = make.case("pair", 12.0, truth=["halo", "lag"], hides=[like, make.hidden("lag", 12.0)], said=["lag"])
     assert leading_name_right(both)
     assert is_physics(both)

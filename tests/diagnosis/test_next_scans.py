@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.commands import MOST_READINGS, commands, excerpts, one_after_another
+from probewise.diagnosis.commands import MOST_READINGS, commands, excerpts, in_turn, one_after_another, put_off
 from probewise.diagnosis.coordinates import default_sensor
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.layings import layings
@@ -188,6 +188,13 @@ def test_a_scan_over_a_new_sheet_takes_longer():
     again = next(c for c in commands(plan, strides=(4,)) if c.kind == "repeat")
     new = next(c for c in layings(plan) if c.plan.scan_names == ("boundary_half_round_4",))
     assert new.minutes == pytest.approx(again.minutes + 1.0)
+    # In turn, or behind a plan: what the minutes say passes before the first reading.
+    end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
+    later = put_off(new, plan).plan
+    assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
+    both = in_turn([again, new])
+    assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
+    assert both.time_s[-1] - both.time_s[len(again.plan)] == pytest.approx(lasts_s)
 
 
 def test_a_battery_is_expected_to_stay_as_it_was():

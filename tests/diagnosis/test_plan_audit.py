@@ -153,6 +153,9 @@ def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_c
     assert np.isnan(both.covariates["led"][: len(plan)]).all()
     assert (both.covariates["led"][len(plan) :] == 0).all()
     assert both.scan_names[-1] == dark.scan_names[0]
+    gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
+    both = behind(replace(able, covariates={"battery_mv": gone}), [dark])
+    assert (both.covariates["battery_mv"][len(plan) :] == gone[-2]).all()
 
 
 def test_a_plan_over_other_patterns_keeps_them_behind_another():

@@ -206,7 +206,7 @@ BAD_DESCRIPTIONS = {
     ),
     "image missing": (
         described(a={"kind": "image", "file": "x.png", "pixel_mm": 1, "origin_mm": [0, 0]}),
-        ["x.png", "no such file"],
+        ["patterns.a.file", "x.png", "same folder"],
     ),
     "range": (with_white(reading={"min": 5, "max": 5}), ["reading.max is 5", "greater than reading.min"]),
     "step": (with_white(reading={"step": 0}), ["reading.step is 0", "greater than 0"]),

@@ -104,14 +104,16 @@ def leading(result: Result, *, clean: bool) -> tuple[Names, float]:
 def leading_name_right(result: Result) -> bool:
     """Tell whether the right names come first of all that are not clean, aliases merged.
 
-    Where the mean is changed, what is said of the noise beside it is left out.
+    Where the mean is changed, what is said of the noise beside it is left out. Where one Gaussian more takes all of it
+    up, clean is right too.
     """
     if not on_mean(result):
         return fits(leading(result, clean=False)[0], answers(result, merged=True))
+    due = is_physics(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
         key = tuple(name for name in names if name not in NOISE)
-        if key:
+        if key or not due:
             joined[key] = joined.get(key, 0.0) + p
     first = max(joined, key=lambda key: joined[key], default=())
     return fits(first, answers(result, merged=True, noise=False))

@@ -54,7 +54,12 @@ class Command:
     @property
     def minutes(self) -> float:
         """How long it takes, with the break before it."""
-        return minutes_of(self.plan) + (LAY_S / 60.0 if self.kind == "lay" else 0.0)
+        return minutes_of(self.plan) + self.lay_s / 60.0
+
+    @property
+    def lay_s(self) -> float:
+        """How much longer the break before it is, to lay something."""
+        return LAY_S if self.kind == "lay" else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +151,7 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
 def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
     """Set plans behind a plan; a pattern of one name is one pattern.
 
-    A covariate that the others lack keeps its last value there, such as a battery's; what is commanded
+    A covariate that the others lack keeps its last known value there, such as a battery's; what is commanded
     (the LED, the height) is as at calibration where a plan does not say.
     """
     plans = [plan, *more]
@@ -207,8 +212,13 @@ def _covariate(plan: Plan, name: str, first: Plan) -> FloatArray:
     if known is not None:
         return known
     # Where nothing is commanded the sensor is as it was calibrated, which NaN says.
-    last = np.nan if name in COMMANDED else first.covariates[name][-1]
-    return np.full(len(plan), last)
+    return np.full(len(plan), np.nan if name in COMMANDED else _last(first, name))
+
+
+def _last(plan: Plan, name: str) -> float:
+    """Give the last value of a covariate that is known; NaN where none is."""
+    known = plan.covariates[name][np.isfinite(plan.covariates[name])]
+    return float(known[-1]) if known.size else float("nan")
 
 
 def distinct_scans(plan: Plan) -> list[IntArray]:
@@ -231,8 +241,8 @@ def one_after_another(scans: Sequence[Command], after: Plan) -> tuple[Plan, list
     ends = np.cumsum([len(scan.plan) for scan in scans])
     rows = [np.arange(end - len(scan.plan), end) for end, scan in zip(ends.tolist(), scans, strict=True)]
     plan = _joined(scans)
-    read = {name: values[np.isfinite(values)] for name, values in after.covariates.items() if name not in COMMANDED}
-    kept = {name: np.full(len(plan), values[-1]) for name, values in read.items() if values.size}
+    read = {name: _last(after, name) for name in after.covariates if name not in COMMANDED}
+    kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates}), rows
 
 
@@ -240,9 +250,7 @@ def in_turn(scans: Sequence[Command]) -> Plan:
     """Take scans one after the other, with a break before each, a longer one where something has to be laid."""
     out: list[Command] = []
     for scan in scans:
-        later = put_off(scan, out[-1].plan) if out else scan
-        laid_s = later.plan.time_s + (LAY_S if scan.kind == "lay" else 0.0)
-        out.append(replace(later, plan=replace(later.plan, time_s=laid_s)))
+        out.append(_from(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
     return _joined(out)
 
 
@@ -251,8 +259,13 @@ def _joined(scans: Sequence[Command]) -> Plan:
 
 
 def put_off(scan: Command, plan: Plan) -> Command:
-    """Put a scan off until a plan is over."""
-    delay_s = start_after(plan) - float(scan.plan.time_s[0])
+    """Put a scan off until a plan is over, and what has to be laid for it is laid."""
+    return _from(scan, start_after(plan))
+
+
+def _from(scan: Command, start_s: float) -> Command:
+    """Begin a scan at a time, or later by what it takes to lay something."""
+    delay_s = start_s + scan.lay_s - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))
 
 

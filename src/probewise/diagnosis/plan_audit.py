@@ -207,8 +207,8 @@ def audit_plan(
     for command in chosen:
         current = behind(current, [command.plan])
         steps.append(_judged(LaidOut.of(expected, current, effects), effects)[0])
-    cured = _cured_at(steps)
-    n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
+    n_kept = max(_cured_at(steps).values(), default=0)  # no scan that was to help a next one that never came
+    cured = _cured_at(steps[: n_kept + 1])
     cures = tuple(
         Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
         for k, c in enumerate(chosen[:n_kept], start=1)

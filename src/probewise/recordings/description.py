@@ -159,7 +159,10 @@ def _image(f: _Fields) -> Pattern:
     # A recording must not make its reader open files anywhere else on the disk.
     if not name or name in (".", "..") or PurePosixPath(name).name != name or PureWindowsPath(name).name != name:
         raise f.fail("file", name, "the name of a PNG or .npy file in the same folder, without a path")
-    return Image(read_image(f.path.parent / name), f.positive("pixel_mm"), f.pair("origin_mm"), name)
+    picture = f.path.parent / name
+    if not picture.is_file():  # said of the JSON that asks for it, not of a file that nobody named
+        raise f.fail("file", name, "the name of a PNG or .npy file that lies in the same folder")
+    return Image(read_image(picture), f.positive("pixel_mm"), f.pair("origin_mm"), name)
 
 
 _KINDS: dict[str, Callable[[_Fields], Pattern]] = {

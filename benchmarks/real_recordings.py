@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.fit import Model, fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.free_form import FreeForm
-from probewise.diagnosis.noise import white
+from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.fitting.fit import Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.noise.law import white
 from probewise.effects import VOCABULARY, Extent
 from probewise.inference import sd_floor
 from probewise.recordings import Recording, read_recording

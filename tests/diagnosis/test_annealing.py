@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis.annealing import anneal, by_weight
+from probewise.diagnosis.repair.annealing import anneal, by_weight
 
 
 def normal(center, factor, n, rng):

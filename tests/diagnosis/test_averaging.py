@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.averaging import over_hypotheses, over_orders, side_by_side
-from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.repaired import ModelSamples
+from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
+from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import ACCURATE_NODES

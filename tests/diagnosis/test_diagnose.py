@@ -359,7 +359,7 @@ def asked_about(monkeypatch, of: Recording) -> tuple[list, float, Diagnosis]:
     def next_scans(rivals, sd, plan):
         seen.append((list(rivals), sd))
 
-    monkeypatch.setattr("probewise.diagnosis.rivals.next_scans", next_scans)
+    monkeypatch.setattr("probewise.diagnosis.advice.rivals.next_scans", next_scans)
     found = diagnose(of, rng=np.random.default_rng(0))
     return *seen[0], found
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis.coordinates import default_sensor, known_scene
-from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.fine_structure import fine_structure
-from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.free_form import FreeForm
-from probewise.diagnosis.noise import white
-from probewise.diagnosis.own_model import OwnModel
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.fitting.coordinates import default_sensor, known_scene
+from probewise.diagnosis.fitting.fit import Fit, Model, fit
+from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.own_model import OwnModel
+from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.residuals.fine_structure import fine_structure
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import LogUniform, Product
 from probewise.recordings import Recording, paper_plan, two_way_plan

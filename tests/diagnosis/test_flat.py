@@ -10,10 +10,10 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.flat import Flat
-from probewise.diagnosis.noise import NoiseLaw, forms
-from probewise.diagnosis.noises import Noises
-from probewise.diagnosis.odds import PriorOdds
+from probewise.diagnosis.noise.flat import Flat
+from probewise.diagnosis.noise.law import NoiseLaw, forms
+from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.odds import PriorOdds
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise.diagnosis.gain import compare_scans, parts_kept_back
+from probewise.diagnosis.evidence.gain import compare_scans, parts_kept_back
 from probewise.recordings import Recording, paper_plan
 
 PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))

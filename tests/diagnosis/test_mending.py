@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.gain import blocks_kept_back
+from probewise.diagnosis.evidence.gain import blocks_kept_back
 from probewise.recordings import Recording, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.commands import MOST_READINGS, commands, excerpts, in_turn, one_after_another, put_off
-from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.fit import Model
-from probewise.diagnosis.layings import layings
-from probewise.diagnosis.next_scans import Outlook, Rival, mutual_information, next_scans
+from probewise.diagnosis.advice.commands import MOST_READINGS, commands, excerpts, in_turn, one_after_another, put_off
+from probewise.diagnosis.advice.layings import layings
+from probewise.diagnosis.advice.next_scans import Outlook, Rival, mutual_information, next_scans
+from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.fitting.fit import Model
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene

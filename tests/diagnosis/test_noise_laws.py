@@ -13,10 +13,10 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.evidence import weigh
-from probewise.diagnosis.fit import Fit
-from probewise.diagnosis.noise import NoiseLaw, Tail, white
-from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.diagnosis.evidence.laplace import weigh
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.noise.law import NoiseLaw, Tail, white
+from probewise.diagnosis.noise.models import NoiseModel, rough_sd
 from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import betabinom
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.covariates import Covariate
-from probewise.diagnosis.locate import windows
-from probewise.diagnosis.noise import NoiseLaw
-from probewise.diagnosis.outlying import outlying, score_together
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.locate import windows
+from probewise.diagnosis.residuals.outlying import outlying, score_together
 from probewise.recordings import Recording, paper_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World

@@ -10,25 +10,32 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.aliases import Alias, surviving_cosine
-from probewise.diagnosis.bank import Bank
-from probewise.diagnosis.coordinates import (
+from probewise.diagnosis.advice.aliases import Alias, surviving_cosine
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.laplace import (
+    LEAST_VISIBLE,
+    SCALES,
+    Blocks,
+    Linearised,
+    block_log_bayes_factors,
+    mix_scales,
+)
+from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
+from probewise.diagnosis.fitting.coordinates import (
     default_sensor,
     effect_scores,
     effect_values,
     theta_to_natural,
 )
-from probewise.diagnosis.covariates import Covariate
-from probewise.diagnosis.earlier import sensor_from_posterior
-from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Blocks, Linearised, block_log_bayes_factors, mix_scales
-from probewise.diagnosis.fit import Fit, Model
-from probewise.diagnosis.free_form import FreeForm
+from probewise.diagnosis.fitting.earlier import sensor_from_posterior
+from probewise.diagnosis.fitting.fit import Fit, Model
+from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.locate import places, places_of_effect, windows
-from probewise.diagnosis.noise import NoiseLaw, noise_statistics, steps_within_scans, white
-from probewise.diagnosis.noise_models import NoiseModel
-from probewise.diagnosis.templates import EffectTemplates, effect_templates
-from probewise.diagnosis.verdict import Hypothesis, credible_set, decide
+from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_within_scans, white
+from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.locate import places, places_of_effect, windows
+from probewise.diagnosis.statement.verdict import Hypothesis, credible_set, decide
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
@@ -122,7 +129,7 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
     found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
     effect = VOCABULARY[name].for_extent(EXTENT).coarse()
     whole = effect_templates(found, effect, usable)
-    monkeypatch.setattr("probewise.diagnosis.templates._AT_ONCE", 5 * len(plan))
+    monkeypatch.setattr("probewise.diagnosis.evidence.templates._AT_ONCE", 5 * len(plan))
     few = effect_templates(found, effect, usable, most=7)
     assert (len(few.columns), len(few.choice)) == (7, 7)
     at = np.linspace(0, len(whole.columns) - 1, 7).round().astype(int)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import audit_plan, join
-from probewise.diagnosis.commands import behind, commands
-from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.sights import Expected, LaidOut, Survivors
+from probewise.diagnosis.advice.commands import behind, commands
+from probewise.diagnosis.audit.sights import Expected, LaidOut, Survivors
+from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.effects import Backlash, EdgeMisplacement, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.diagnosis.joint import log_likelihood_of_whitened
-from probewise.diagnosis.noise import NoiseLaw
-from probewise.diagnosis.quadratic import Quadratic
-from probewise.diagnosis.surrogate import Surrogate
+from probewise.diagnosis.evidence.joint import log_likelihood_of_whitened
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.repair.quadratic import Quadratic
+from probewise.diagnosis.repair.surrogate import Surrogate
 
 CENTER = np.array([0.3, -0.2, 1.0])
 STEPS = np.array([[0.4, 0.1, 0.0], [0.0, 0.3, -0.2], [0.0, 0.0, 0.5]])

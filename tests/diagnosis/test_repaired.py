@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from probewise.calibration import FittedSensor
-from probewise.diagnosis.coordinates import FARTHEST, SensorCoordinates, default_sensor
-from probewise.diagnosis.evidence import weigh
-from probewise.diagnosis.fit import Model, fit
-from probewise.diagnosis.free_form import FreeForm
-from probewise.diagnosis.noise import white
-from probewise.diagnosis.noise_models import NoiseModel
-from probewise.diagnosis.repaired import ModelSamples, sample_model
+from probewise.diagnosis.evidence.laplace import weigh
+from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, default_sensor
+from probewise.diagnosis.fitting.fit import Model, fit
+from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
 from probewise.effects import Extent
 from probewise.recordings import Recording, two_way_plan
 from probewise.sensor import total_variation

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, thorough, weigh_thoroughly
-from probewise.diagnosis.search import search
-from probewise.diagnosis.weighing import Weighing, with_agreement
+from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, weigh_thoroughly
+from probewise.diagnosis.search import thorough
+from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search.weighing import Weighing, with_agreement
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import Normal, Product
 from probewise.recordings import Plan, Recording, paper_plan

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.special import log_ndtr
 
-from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.evidence import LEAST_VISIBLE
-from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.noise import white
-from probewise.diagnosis.visible import log_visible
+from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
+from probewise.diagnosis.evidence.visible import log_visible
+from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.fitting.fit import Fit, Model, fit
+from probewise.diagnosis.noise.law import white
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.challenge.surviving import NullRefit
-from probewise.diagnosis.evidence import Blocks, Linearised
-from probewise.diagnosis.fit import Fit, fit
-from probewise.diagnosis.noise import white
-from probewise.diagnosis.templates import effect_templates
+from probewise.diagnosis.evidence.laplace import Blocks, Linearised
+from probewise.diagnosis.evidence.templates import effect_templates
+from probewise.diagnosis.fitting.fit import Fit, fit
+from probewise.diagnosis.noise.law import white
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage

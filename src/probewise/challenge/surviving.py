@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.coordinates import default_sensor
-from probewise.diagnosis.evidence import weigh
-from probewise.diagnosis.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.noise import white
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.evidence.laplace import weigh
+from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.fitting.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.models import NoiseModel
 from probewise.effects import Extent
 from probewise.recordings.plan import Recording
 

@@ -5,23 +5,23 @@ how a poor likelihood is found out: its residuals are tested, located, explained
 the gain is shown on readings kept back.
 """
 
-from probewise.diagnosis.aliases import Alias
-from probewise.diagnosis.audit_document import CURE_PLAN, audit_json
-from probewise.diagnosis.chosen import model_with
-from probewise.diagnosis.document import diagnosis_json, diagnosis_schema
-from probewise.diagnosis.earlier import SensorPrior
+from probewise.diagnosis.advice.aliases import Alias
+from probewise.diagnosis.advice.next_scans import NextMeasurement
+from probewise.diagnosis.audit.document import CURE_PLAN, audit_json
+from probewise.diagnosis.audit.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
 from probewise.diagnosis.engine import Thorough, diagnose
+from probewise.diagnosis.fitting.earlier import SensorPrior
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.fitting.own_model import OwnModel, Parameters
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.locate import Place
-from probewise.diagnosis.next_scans import NextMeasurement
-from probewise.diagnosis.null import Null
-from probewise.diagnosis.odds import PriorOdds
-from probewise.diagnosis.own_model import OwnModel, Parameters
-from probewise.diagnosis.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
-from probewise.diagnosis.repaired import ModelSamples
-from probewise.diagnosis.thorough import weigh_thoroughly
-from probewise.diagnosis.unknown_shape import SensorAndShape
-from probewise.diagnosis.verdict import (
+from probewise.diagnosis.repair.chosen import model_with
+from probewise.diagnosis.repair.repaired import ModelSamples
+from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.search.odds import PriorOdds
+from probewise.diagnosis.search.thorough import weigh_thoroughly
+from probewise.diagnosis.search.weighing import Weighing
+from probewise.diagnosis.statement.document import diagnosis_json, diagnosis_schema
+from probewise.diagnosis.statement.verdict import (
     Diagnosis,
     EffectFound,
     Hypothesis,
@@ -30,7 +30,7 @@ from probewise.diagnosis.verdict import (
     ParameterFound,
     Verdict,
 )
-from probewise.diagnosis.weighing import Weighing
+from probewise.diagnosis.unknown_shape import SensorAndShape
 
 __all__ = [
     "CURE_PLAN",

@@ -9,26 +9,34 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.aliases import Alias, aliases, settle
-from probewise.diagnosis.convergence import require_converged
-from probewise.diagnosis.coordinates import LEAST_READINGS
-from probewise.diagnosis.earlier import SensorPrior, sensor_of
-from probewise.diagnosis.ensemble import Ensemble
-from probewise.diagnosis.evidence import Blocks, Linearised
-from probewise.diagnosis.fine_structure import fine_structure
-from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.advice.aliases import Alias, aliases, settle
+from probewise.diagnosis.advice.rivals import next_readings
+from probewise.diagnosis.evidence.convergence import require_converged
+from probewise.diagnosis.evidence.laplace import Blocks, Linearised
+from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
+from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.locate import Place, global_p_value, places, places_of_effect
-from probewise.diagnosis.mending import corrected, improvement_of
-from probewise.diagnosis.null import Null
-from probewise.diagnosis.reasons import reason_of
-from probewise.diagnosis.rivals import next_readings
-from probewise.diagnosis.search import search
-from probewise.diagnosis.stating import effects_found, noise_found
+from probewise.diagnosis.repair.ensemble import Ensemble
+from probewise.diagnosis.residuals.fine_structure import fine_structure
+from probewise.diagnosis.residuals.locate import Place, global_p_value, places, places_of_effect
+from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, outside
+from probewise.diagnosis.search.weighing import Weighing, with_agreement
+from probewise.diagnosis.statement.mending import corrected, improvement_of
+from probewise.diagnosis.statement.reasons import reason_of
+from probewise.diagnosis.statement.stating import effects_found, noise_found
+from probewise.diagnosis.statement.verdict import (
+    ALARM,
+    Diagnosis,
+    EffectFound,
+    Hypothesis,
+    Improvement,
+    credible_set,
+    decide,
+)
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.diagnosis.verdict import ALARM, Diagnosis, EffectFound, Hypothesis, Improvement, credible_set, decide
-from probewise.diagnosis.weighed import Candidate, Search, in_vocabulary, outside
-from probewise.diagnosis.weighing import Weighing, with_agreement
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.inference import sd_floor

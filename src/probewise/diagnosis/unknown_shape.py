@@ -10,9 +10,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.coordinates import FARTHEST, CalibratedSensor, known_scene
-from probewise.diagnosis.earlier import SensorPrior, sensor_of
-from probewise.diagnosis.verdict import Diagnosis
+from probewise.diagnosis.fitting.coordinates import FARTHEST, CalibratedSensor, known_scene
+from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.statement.verdict import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.priors import Prior

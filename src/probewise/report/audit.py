@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from probewise.diagnosis import PlanAudit
-from probewise.diagnosis.sights import ALIAS
+from probewise.diagnosis.audit.sights import ALIAS
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import audit_matrix, png

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.covariates import covariates_of, slope_along_the_move
+from probewise.diagnosis.residuals.covariates import covariates_of, slope_along_the_move
 from probewise.report.words import unit_name
 
 __all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words"]

@@ -1,0 +1,100 @@
+"""Which effects leave the same trace in these readings, and which others would part them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.advice.commands import MOST_READINGS, commands, one_after_another
+from probewise.diagnosis.advice.layings import layings
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.effects import NamedEffect
+
+__all__ = ["Alias", "aliases", "settle", "surviving_cosine"]
+
+ALIAS_COSINE = 0.9
+
+
+@dataclass(frozen=True)
+class Alias:
+    """Effects whose surviving parts look alike under this plan, and what would tell them apart."""
+
+    effects: tuple[str, str]
+    cosine: float
+    settle_by: str
+    readings: int
+
+
+def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
+    """Largest principal cosine of what survives of two templates, each (n_points, k)."""
+    bases = []
+    for columns in (first, second):
+        raw = np.linalg.norm(problem.law(columns)) / problem.sd
+        projected = problem.project(columns)
+        # What the fit absorbs to within a thousandth is not there to be compared.
+        if np.linalg.norm(projected) <= 1e-3 * raw:
+            return 0.0
+        u, lengths, _ = np.linalg.svd(projected, full_matrices=False)
+        bases.append(u[:, lengths > 1e-3 * lengths[0]])
+    return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
+
+
+def aliases(problem: Linearised, templates: Mapping[str, FloatArray]) -> list[Alias]:
+    """List pairs of effects whose surviving templates have a cosine of 0.9 or more; `settle` says what would part them.
+
+    Parameters
+    ----------
+    problem
+        The null fit.
+    templates
+        For each effect its most telling columns (n_points, k).
+    """
+    out = []
+    for pair in itertools.combinations(sorted(templates), 2):
+        cosine = surviving_cosine(problem, templates[pair[0]], templates[pair[1]])
+        if cosine >= ALIAS_COSINE:
+            out.append(Alias(pair, cosine, "no reading that this apparatus can take tells them apart", 0))
+    return sorted(out, key=lambda alias: -alias.cosine)
+
+
+def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float) -> list[Alias]:
+    """Say which candidate plan tells aliased effects apart, pair by pair, and by how many readings.
+
+    Each effect is taken at the size at which 400 readings would show it at lambda 8; the plan of the
+    most expected nats a reading is advised, as many readings of it as three nats take.
+    """
+    names = sorted({name for pair in pairs for name in pair.effects})
+    null = found.model.predict(found.z[None, :])[0]
+    shapes = {}
+    for name in names:
+        model = found.model.with_effect(effects[name])
+        z = np.concatenate([found.z, model.scores_of(effects[name].bank()[0][:1])[0]])
+        here = model.predict(z[None, :])[0] - null
+        shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
+    best = {pair.effects: (0.0, pair) for pair in pairs}
+    scans = [*commands(found.model.plan, level=null), *layings(found.model.plan)]
+    if not (best and scans):
+        return list(pairs)
+    everywhere, rows_of = one_after_another(scans, found.model.plan)
+    null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
+    there = {
+        name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale
+        for name, (model, z, _, scale) in shapes.items()
+    }
+    for scan, rows in zip(scans, rows_of, strict=True):
+        for first, second in best:
+            sign = np.sign(float(shapes[first][2] @ shapes[second][2])) or 1.0
+            apart = there[first][rows] - sign * there[second][rows]
+            per_reading = 0.5 * float(np.sum(apart**2)) / sd**2 / len(rows)
+            if per_reading > best[first, second][0]:
+                readings = min(max(math.ceil(3.0 / per_reading), 1), MOST_READINGS)
+                advised = replace(best[first, second][1], settle_by=scan.description, readings=readings)
+                best[first, second] = (per_reading, advised)
+    return [alias for _, alias in best.values()]

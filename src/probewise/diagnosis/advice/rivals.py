@@ -1,0 +1,73 @@
+"""Which hypotheses the next readings are to tell apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.fitting.fit import Fit, degrees_of_freedom
+from probewise.diagnosis.search.weighed import Candidate, Search
+
+__all__ = ["next_readings"]
+
+_LEAST_PROBABILITY = 0.01
+_MOST_RIVALS = 5
+_TRIED = 3  # effects that are not felt, as a rival, until some reading tells of one
+
+
+def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
+    """Ask for the readings that tell the leading refitted hypotheses about the mean apart."""
+    by_mean = search.by_mean
+    # What has no name at all predicts no more than the null does.
+    probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
+    probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
+    ranked = sorted(probabilities, key=lambda names: -probabilities[names])
+    found: list[Candidate] = []
+    for names in ranked:
+        candidate = search.best(names, search.certain) if names else null
+        # Of what is named the next is a rival however improbable; of nothing, something that could be there.
+        second = len(found) == 1 and bool(found[0].names)
+        if candidate is not None and (not found or second or probabilities[names] >= _LEAST_PROBABILITY):
+            found.append(candidate)
+        if len(found) == _MOST_RIVALS:
+            break
+    sd, plan = found[0].found.sd, search.recording.plan
+    rivals = [_as_rival(candidate, probabilities[candidate.names]) for candidate in found]
+    if len(rivals) > 1:
+        return next_scans(rivals, sd, plan)
+    others = dict.fromkeys(n for names in ranked for n in names if n in search.effects)
+    wanted = (next_scans([*rivals, _imagined(search, null, n)], sd, plan) for n in list(others)[:_TRIED])
+    return next((asked for asked in wanted if asked is not None), None)
+
+
+def _as_rival(candidate: Candidate, probability: float) -> Rival:
+    return Rival(candidate.found.model, candidate.found.z, _root_of(candidate.found), probability)
+
+
+def _imagined(search: Search, null: Candidate, name: str) -> Rival:
+    """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here."""
+    effect, found = search.effects[name], null.found
+    best = max(null.evidence.values(), key=lambda e: e.log_z)
+    problem = Linearised.of(found, best.law)
+    templates = search.templates.of(found, effect)
+    sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
+    at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / 3.0))))
+    setting = templates.settings[at][0].copy()
+    for k in effect.amplitudes:
+        setting[k] *= min(3.0 / max(sizes[at], 1e-9), 50.0)
+    model = found.model.with_effect(templates.variant(at))
+    z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
+    change = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
+    z[: len(found.z)] += problem.absorbed(found, change)  # the sensor as it would then have been fitted
+    root = np.zeros((len(z), len(z)))  # of that size, and no other
+    root[: len(found.z), : len(found.z)] = _root_of(found)
+    return Rival(model, z, root, 0.0)
+
+
+def _root_of(found: Fit) -> FloatArray:
+    """Take the square root of the covariance of a fit's coordinates by Laplace, noise white."""
+    n_points, p = found.slopes.shape
+    variance = found.sd**2 * n_points / degrees_of_freedom(found.slopes, found.sd)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(found.slopes.T @ found.slopes / variance + np.eye(p))).T)

@@ -1,0 +1,79 @@
+"""The fewest extra readings that cure a plan: greedily, scan by scan, over what arm and hand can do."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise.diagnosis.advice.commands import Command, behind, commands, put_off
+from probewise.diagnosis.advice.layings import layings
+from probewise.diagnosis.audit.sights import LEAST_NATS, LEAST_SHARE, Expected, LaidOut, Survivors, nats_between
+from probewise.effects import NamedEffect
+from probewise.recordings.plan import Plan
+
+__all__ = ["cures_of"]
+
+_MOST_SETTINGS = 48  # of an effect's bank: a hundred scans are tried at every step
+_MOST_SCANS = 5
+_WORTHWHILE = 0.15  # of one effect's trouble: the least that an added scan must take away
+_WORTHWHILE_EACH = 0.005  # and for each of its readings: 200 readings may be spent on one effect, no more
+_STRIDES = (1, 4)
+
+
+def cures_of(
+    plan: Plan, expected: Expected, effects: Mapping[str, type[NamedEffect[Any]]], ailing: Sequence[str]
+) -> list[Command]:
+    """Choose scans to add, one at a time, each for the trouble of the ailing effects that a reading of it takes away.
+
+    Parameters
+    ----------
+    plan
+        What is to be measured.
+    expected
+        The sensor.
+    effects
+        The vocabulary, by name.
+    ailing
+        Names of the effects that are not fine under the plan.
+    """
+    every = [*commands(plan, strides=_STRIDES), *layings(plan)]
+    chosen: list[Command] = []
+    current = plan
+    while len(chosen) < _MOST_SCANS:
+        taken = {command.plan.scan_names for command in chosen}
+        offered = [c for c in every if c.plan.scan_names not in taken]
+        options = [put_off(command, current) for command in offered]
+        if not options:
+            break
+        together = behind(current, [option.plan for option in options])
+        laid = LaidOut.of(expected, together, effects, most=_MOST_SETTINGS)
+        now = np.arange(len(current))
+        trouble = _trouble(laid, now, ailing)
+        worth = []
+        for start, end in itertools.pairwise(np.cumsum([len(current), *(len(o.plan) for o in options)]).tolist()):
+            gained = trouble - _trouble(laid, np.concatenate([now, np.arange(start, end)]), ailing)
+            readings = end - start
+            worth.append(gained / readings if gained >= max(_WORTHWHILE, _WORTHWHILE_EACH * readings) else 0.0)
+        best = int(np.argmax(worth))
+        if worth[best] == 0.0:
+            break
+        chosen.append(options[best])
+        current = behind(current, [options[best].plan])
+    return chosen
+
+
+def _trouble(laid: LaidOut, rows: IntArray, ailing: Sequence[str]) -> float:
+    """Add up how far effects are from being fine: 0 fine, up to 1 aliased, 1 to 2 invisible."""
+    sights = Survivors.of(laid, rows).sights(ailing)
+    total = 0.0
+    for name in ailing:
+        share, like = sights.get(name, (0.0, {}))
+        if share < LEAST_SHARE:
+            total += 2.0 - share / LEAST_SHARE
+        else:
+            total += max(1.0 - nats_between(max(like.values(), default=0.0)) / LEAST_NATS, 0.0)
+    return total

@@ -1,0 +1,55 @@
+"""audit.json: what `probewise audit` found, strict JSON, format "audit/1"."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit
+
+__all__ = ["CURE_PLAN", "audit_json"]
+
+CURE_PLAN = "cure_plan.csv"
+
+
+def audit_json(audit: PlanAudit) -> dict[str, Any]:
+    """Lay an audit out as audit.json: finite numbers, texts, lists, null where there is no number."""
+    plan = audit.cure_plan
+    return {
+        "format": "audit/1",
+        "readings": len(audit.plan),
+        "assumed": audit.assumed,
+        "effects": _effects(audit.effects),
+        "cure": None
+        if plan is None
+        else {
+            "plan": CURE_PLAN,
+            "readings": len(plan),
+            "minutes": audit.extra_minutes,
+            "scans": [
+                {
+                    "kind": cure.kind,
+                    "description": cure.description,
+                    "scan": cure.plan.scan_names[0],
+                    "readings": len(cure.plan),
+                    "cures": list(cure.cured),
+                }
+                for cure in audit.cures
+            ],
+        },
+        "after": _effects(audit.after),
+    }
+
+
+def _effects(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": effect.name,
+            "sight": effect.sight,
+            "surviving_share": effect.share,
+            "alike": [{"effect": name, "cosine": cosine} for name, cosine in effect.alike],
+            "smallest": [{"parameter": s.parameter, "unit": s.unit, "amount": s.amount} for s in effect.smallest],
+            "reason": effect.reason,
+        }
+        for effect in effects
+    ]

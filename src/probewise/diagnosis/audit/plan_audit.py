@@ -1,0 +1,319 @@
+"""Audit a plan before any data: which effects it cannot see, which it cannot tell apart, what would cure that.
+
+About a typical sensor (or a calibrated one) every effect of the vocabulary is laid out as templates, and what
+the sensor's own parameters would absorb is projected out. What survives says how well an effect is seen;
+the cosine between two survivors, how well they are told apart: by lambda^2 (1 - cosine^2) / 2 nats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen
+from probewise._display import ShowsItself
+from probewise.diagnosis.advice.commands import behind
+from probewise.diagnosis.audit.cures import cures_of
+from probewise.diagnosis.audit.sights import ALIAS, LEAST_SHARE, Expected, LaidOut, Survivors
+from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
+from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.statement.verdict import Diagnosis
+from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.errors import ParameterError
+from probewise.recordings.plan import Plan
+from probewise.sensor import Stage, is_free_form
+
+__all__ = ["Cure", "EffectAudit", "PlanAudit", "Sight", "Smallest", "audit_plan", "audit_recorded"]
+
+Sight: TypeAlias = Literal["invisible", "aliased", "fine"]
+
+_MOST_READINGS = 4000  # of a recording that are looked at; of a longer one every second, every third, ...
+_SETTINGS = 48  # of an effect's bank, beside a diagnosis
+_LEVELS = (0.1, 0.9)  # of the range of a reading, black and white, where no sensor is known
+_NOISE = 0.01  # of the span between the levels, likewise
+# Two Gaussians, a core and a fainter skirt, off the centre and not round: nothing is invisible by symmetry alone.
+_TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.2, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Smallest:
+    """The size of one parameter at which an effect leaves lambda 8 behind; None where none does."""
+
+    parameter: str
+    unit: str
+    amount: float | None
+
+
+@dataclass(frozen=True)
+class EffectAudit:
+    """How a plan sees one effect.
+
+    Attributes
+    ----------
+    name, sight
+        The effect, and whether it is invisible, aliased or fine.
+    share
+        Surviving share of its trace, the median over its settings; 0 where it cannot show at all.
+    alike
+        Effects that a typical setting of this one looks like, each with the cosine, most alike first.
+    smallest
+        The size at which it is seen, for each amplitude.
+    reason
+        Why it is invisible, or "".
+    """
+
+    name: str
+    sight: Sight
+    share: float
+    alike: tuple[tuple[str, float], ...] = ()
+    smallest: tuple[Smallest, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Cure:
+    """One scan to add: its kind (`Command`), in words, readings, time, and the effects that are fine from then on."""
+
+    kind: str
+    description: str
+    plan: Plan
+    minutes: float
+    cured: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanAudit(ShowsItself):
+    """What a plan can and cannot tell.
+
+    Attributes
+    ----------
+    plan
+        The plan.
+    assumed
+        What was taken for the sensor, in words.
+    effects, after
+        Every effect, under the plan and under the plan with all cures.
+    cosines
+        How well each effect (row) is imitated by each other (column), (n_effects, n_effects), in the order of
+        `effects`; on the diagonal the surviving share.
+    cures
+        Scans to add, the most telling first.
+    """
+
+    plan: Plan
+    assumed: str
+    effects: tuple[EffectAudit, ...]
+    cosines: FloatArray
+    cures: tuple[Cure, ...]
+    after: tuple[EffectAudit, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cosines", frozen(self.cosines))
+
+    def seen_as(self, sight: Sight, *, after: bool = False) -> tuple[EffectAudit, ...]:
+        """Select the effects that are seen this way."""
+        return tuple(effect for effect in (self.after if after else self.effects) if effect.sight == sight)
+
+    @property
+    def cure_plan(self) -> Plan | None:
+        """All cures as one plan to carry out, one after the other; None where there is none."""
+        if not self.cures:
+            return None
+        first, *more = (cure.plan for cure in self.cures)
+        return behind(first, more)
+
+    @property
+    def extra_readings(self) -> int:
+        """Number of readings that the cures take."""
+        return sum(len(cure.plan) for cure in self.cures)
+
+    @property
+    def extra_minutes(self) -> float:
+        """How long the cures take, with the breaks before each scan."""
+        return sum(cure.minutes for cure in self.cures)
+
+    def summary(self) -> str:
+        """Say it on one screen."""
+        lines = [f"{len(self.plan)} readings in {len(self.plan.scan_names)} scans; {self.assumed}"]
+        lines += _listed("fine", [e.name for e in self.seen_as("fine")])
+        lines += _listed("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
+        lines += _listed("invisible", [e.name for e in self.seen_as("invisible")])
+        if not self.cures:
+            cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else "no scan of this arm helps"
+            return "\n".join([*lines, f"cure       {cured}"])
+        lines.append(f"cure       {self.extra_readings} more readings, about {self.extra_minutes:.0f} minutes:")
+        for k, cure in enumerate(self.cures, start=1):
+            so_that = ", ".join(cure.cured) or "helps the next"
+            lines.append(f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}")
+        left = [e.name for e in self.after if e.sight != "fine"]
+        return "\n".join([*lines, *_listed("left", left or ["nothing"])])
+
+
+def _with_aliases(effect: EffectAudit) -> str:
+    return f"{effect.name} (as {effect.alike[0][0]}, {effect.alike[0][1]:.2f})"
+
+
+def _listed(label: str, names: Sequence[str], width: int = 100) -> list[str]:
+    """Wrap names behind a label."""
+    lines, line = [], f"{label:<10} "
+    for k, name in enumerate(names):
+        piece = name + (", " if k + 1 < len(names) else "")
+        if len(line) + len(piece) > width:
+            lines.append(line.rstrip())
+            line = " " * 11
+        line += piece
+    return [*lines, line.rstrip()] if names else []
+
+
+def audit_plan(
+    plan: Plan,
+    *,
+    sensor: SensorPrior | None = None,
+    noise_sd: float | None = None,
+    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+) -> PlanAudit:
+    """Say of each effect whether a plan sees it and tells it from the others, and what readings would cure it.
+
+    Parameters
+    ----------
+    plan
+        What is to be measured.
+    sensor
+        A calibrated sensor, whose posterior becomes the prior; None: a typical one.
+    noise_sd
+        Noise of one reading, in its unit; None: a hundredth of the span between black and white.
+    effects
+        The vocabulary, by name.
+
+    Raises
+    ------
+    ParameterError
+        If the plan has no row, or a pattern that its description lacks.
+    """
+    if len(plan) == 0:
+        raise ParameterError("plan", "no row", "at least one")
+    lacking = sorted({name for name, _ in plan.rows_by_pattern()} - set(plan.patterns))
+    if lacking:
+        raise ParameterError("pattern", lacking[0], f"one that is described: {', '.join(plan.patterns) or 'none'}")
+    expected, said = _expected(plan, sensor, noise_sd)
+    before, cosines = _judged(LaidOut.of(expected, plan, effects), effects)
+    ailing = [effect.name for effect in before if effect.sight != "fine"]
+    chosen = cures_of(plan, expected, effects, ailing)
+    steps, current = [before], plan
+    for command in chosen:
+        current = behind(current, [command.plan])
+        steps.append(_judged(LaidOut.of(expected, current, effects), effects)[0])
+    n_kept = max(_cured_at(steps).values(), default=0)  # no scan that was to help a next one that never came
+    cured = _cured_at(steps[: n_kept + 1])
+    cures = tuple(
+        Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
+        for k, c in enumerate(chosen[:n_kept], start=1)
+    )
+    return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])
+
+
+def _cured_at(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
+    """Say of each effect that is fine at the last step, but not at the first, from which step on it is."""
+    fine = [{effect.name for effect in step if effect.sight == "fine"} for step in steps]
+    names = [effect.name for effect in steps[0] if effect.name in fine[-1] - fine[0]]
+    return {name: max(k for k, known in enumerate(fine) if name not in known) + 1 for name in names}
+
+
+def audit_recorded(
+    diagnosis: Diagnosis,
+    *,
+    sensor: SensorPrior | None = None,
+    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+) -> PlanAudit:
+    """Audit the readings of a diagnosis about the sensor that it calibrated; cures are its next measurement's part.
+
+    Parameters
+    ----------
+    diagnosis
+        Of a light sensor over known patterns.
+    sensor
+        The earlier sensor that it was given, if any.
+    effects
+        The vocabulary, by name.
+    """
+    known, usable = diagnosis.null, np.flatnonzero(diagnosis.recording.usable)
+    plan = diagnosis.recording.plan.take(usable[:: -(-len(usable) // _MOST_READINGS)])
+    names, mean = list(known.chain.names), known.theta.mean(axis=0)
+    low, high = (float(mean[names.index(name)]) for name in ("I_min", "I_max"))
+    low, high = min(low, high), max(low, high, low + 1e-9)
+    extent = Extent.of(diagnosis.recording)
+    own = mean[None, : 6 * known.n_gaussians + 2]
+    null: CalibratedSensor
+    if sensor is not None:
+        null = sensor_of(sensor)
+    elif is_free_form(own[:, :-2]):
+        null = FreeForm.about(default_sensor(extent, 1))
+    else:
+        null = default_sensor(extent, known.n_gaussians)
+    z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
+    expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
+    judged, cosines = _judged(LaidOut.of(expected, plan, effects, most=_SETTINGS), effects)
+    return PlanAudit(plan, "the sensor as calibrated from these readings", judged, cosines, (), judged)
+
+
+def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:
+    """Say what is expected of the sensor, and in words."""
+    if sensor is not None:
+        mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
+        null = sensor_of(sensor)
+        z = np.zeros(null.n_params)
+        low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
+        said = "the sensor as calibrated"
+    else:
+        inst = plan.instrumentation
+        bottom, top = (0.0 if inst.min is None else inst.min), (100.0 if inst.max is None else inst.max)
+        low, high = (bottom + share * max(top - bottom, 1e-6) for share in _LEVELS)
+        null = default_sensor(Extent(low, high, plan), 2)
+        z = _TYPICAL.copy()
+        said = f"a typical sensor of {low:g} to {high:g}"
+    sd = _NOISE * (high - low) if noise_sd is None else noise_sd
+    if not sd > 0:
+        raise ParameterError("noise_sd", sd, "greater than 0")
+    return Expected(null, z, (low, high), sd), f"{said}, noise {sd:.3g} {plan.instrumentation.unit}".rstrip()
+
+
+def _judged(laid: LaidOut, effects: Mapping[str, type[NamedEffect[Any]]]) -> tuple[tuple[EffectAudit, ...], FloatArray]:
+    """Judge every effect, and how well each (row) is imitated by each other (column)."""
+    seen = Survivors.of(laid, np.arange(len(laid.slopes)))
+    sights = seen.sights()
+    names = list(effects)
+    cosines = np.zeros((len(names), len(names)))
+    out = []
+    for own, name in enumerate(names):
+        effect = laid.built.get(name)
+        if effect is None:
+            out.append(EffectAudit(name, "invisible", 0.0, reason="what it shows in does not vary here"))
+        elif effect.stage is Stage.NOISE:
+            enough = seen.n_points >= LEAST_READINGS
+            reason = "" if enough else f"{seen.n_points} readings show no scatter; {LEAST_READINGS} do"
+            out.append(EffectAudit(name, "fine" if enough else "invisible", float(enough), reason=reason))
+        else:
+            share, like = sights[name]
+            for other, cosine in like.items():
+                cosines[own, names.index(other)] = cosine
+            out.append(_seen(effect, share, like, seen.smallest(effect)))
+        cosines[own, own] = out[-1].share
+    return tuple(out), cosines
+
+
+def _seen(
+    effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...]
+) -> EffectAudit:
+    if share < LEAST_SHARE:
+        reason = "the sensor's own parameters absorb it" if share > 0 else "it leaves no trace here"
+        return EffectAudit(effect.name, "invisible", share, reason=reason)
+    alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
+    smallest = tuple(
+        Smallest(effect.prior.names[k], effect.units[k], amount)
+        for k, amount in zip(effect.amplitudes, amounts, strict=True)
+    )
+    return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)

@@ -1,0 +1,203 @@
+"""How a plan sees the effects of a vocabulary: what survives of their traces, and how alike survivors are.
+
+Everything is linear algebra about one expected sensor, before any reading: templates of every setting of
+every effect, the sensor's own parameters projected out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence.laplace import orthonormal
+from probewise.diagnosis.evidence.templates import effect_templates
+from probewise.diagnosis.fitting.fit import Fit, Model
+from probewise.diagnosis.fitting.null import Null
+from probewise.effects import Extent, NamedEffect
+from probewise.recordings.plan import Plan
+from probewise.sensor import Stage
+
+__all__ = ["ALIAS", "LAMBDA", "LEAST_NATS", "LEAST_SHARE", "Expected", "LaidOut", "Survivors", "nats_between"]
+
+LAMBDA = 8.0  # size of an effect at which a plan is judged
+LEAST_NATS = 3.0  # least that tells two effects apart
+ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which they leave no more
+LEAST_SHARE = 0.05  # of an effect's trace; less is lost in what the sensor's parameters absorb
+_MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank; beyond it the bank is thinned
+
+
+def nats_between(cosine: float) -> float:
+    """Expect the log Bayes factor between two effects of lambda 8 whose surviving traces have this cosine."""
+    return 0.5 * LAMBDA**2 * (1 - cosine**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """The sensor that is expected: its prior, the point `z` (n_params,) about which to look, levels, noise sd."""
+
+    null: Null
+    z: FloatArray
+    levels: tuple[float, float]
+    sd: float
+
+
+@dataclass(frozen=True, eq=False)
+class LaidOut:
+    """The templates of one plan, in units of the noise sd.
+
+    `columns` (n_points, n_columns) come in entries, the settings of an effect's bank; `entry` (n_columns,)
+    numbers them, `owner` (n_entries,) says which effect of `names` each belongs to, `settings` what was set.
+    `slopes` (n_points, n_params) are the sensor's own. Effects that cannot show here at all are not in `built`.
+    """
+
+    slopes: FloatArray
+    columns: FloatArray
+    entry: IntArray
+    owner: IntArray
+    names: tuple[str, ...]
+    built: Mapping[str, NamedEffect[Any]]
+    settings: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(
+        cls,
+        expected: Expected,
+        plan: Plan,
+        effects: Mapping[str, type[NamedEffect[Any]]],
+        *,
+        most: int | None = None,
+    ) -> Self:
+        """Lay out every effect on the mean, at most `most` settings of each, spread evenly.
+
+        Without `most` all of them, but for plans of thousands of readings.
+        """
+        most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
+        model = Model(expected.null, (), plan)
+        predicted, slopes = model.jacobian(expected.z)
+        found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, expected.sd, 0.0)
+        extent = Extent(*expected.levels, plan)
+        maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
+        built = {name: effect for name, effect in maybe.items() if effect is not None}
+        columns = [np.zeros((len(plan), 0))]
+        settings: list[FloatArray] = []
+        owner: list[int] = []
+        for at, effect in enumerate(built.values()):
+            if effect.stage is Stage.NOISE:
+                continue
+            templates = effect_templates(found, effect, np.arange(len(plan)), most=most)
+            columns += templates.columns
+            settings += templates.settings
+            owner += [at] * len(templates.columns)
+        entry = np.repeat(np.arange(len(settings)), [c.shape[1] for c in columns[1:]])
+        return cls(
+            slopes / expected.sd,
+            np.concatenate(columns, axis=1) / expected.sd,
+            entry,
+            np.array(owner, dtype=np.int64),
+            tuple(built),
+            built,
+            tuple(settings),
+        )
+
+    def norms(self, columns: FloatArray) -> FloatArray:
+        """Norm of each entry's columns together, (n_entries,)."""
+        return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
+
+
+@dataclass(frozen=True, eq=False)
+class Survivors:
+    """What survives of every entry's columns on some rows, in noise sds: `left` (n_rows, n_columns).
+
+    `basis` holds each entry's columns made orthonormal; `raw` and `kept` (n_entries,) are the entries'
+    norms before and after.
+    """
+
+    laid: LaidOut
+    left: FloatArray
+    basis: FloatArray
+    raw: FloatArray
+    kept: FloatArray
+    n_points: int
+
+    @classmethod
+    def of(cls, laid: LaidOut, rows: IntArray) -> Self:
+        """Project the sensor's parameters, with their prior, out of the templates of these rows."""
+        slopes, columns = laid.slopes[rows], laid.columns[rows]
+        n_points, n_params = slopes.shape
+        own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
+        left = -own @ (own[:n_points].T @ columns)
+        left[:n_points] += columns
+        return cls(laid, left, _orthonormal(left, laid.entry), laid.norms(columns), laid.norms(left), n_points)
+
+    def sights(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
+        """Give the surviving share of each effect that is asked about, and its cosine to every visible other one.
+
+        Both are medians over the effect's settings: what is true of a typical one. The cosine is to the
+        setting of the other that imitates best.
+        """
+        laid = self.laid
+        present = {name: self._present(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
+        shares = {
+            name: float(np.median(self.kept[mine] / self.raw[mine])) if mine.size else 0.0
+            for name, mine in present.items()
+        }
+        visible = [name for name, share in shares.items() if share >= LEAST_SHARE]
+        wanted = [name for name in (visible if asked is None else asked) if name in visible]
+        out: dict[str, tuple[float, dict[str, float]]] = {name: (share, {}) for name, share in shares.items()}
+        if not wanted:
+            return out
+        mine = np.concatenate([present[name] for name in wanted])
+        columns = np.flatnonzero(np.isin(laid.entry, mine))
+        onto = (self.basis.T @ self.left[:, columns]) ** 2  # of each column, on every direction of the others
+        onto = np.add.reduceat(onto, _starts(laid.entry), axis=0)
+        onto = np.add.reduceat(onto, _starts(laid.entry[columns]), axis=1)
+        mine = np.unique(laid.entry[columns])
+        best = np.maximum.reduceat(onto, _starts(laid.owner), axis=0) / np.maximum(self.kept[mine] ** 2, 1e-300)
+        cosines = np.sqrt(np.minimum(best, 1.0))
+        owners = [laid.names[k] for k in laid.owner[_starts(laid.owner)]]
+        for name in wanted:
+            typical = np.median(cosines[:, laid.owner[mine] == laid.names.index(name)], axis=1)
+            like = dict(zip(owners, typical.tolist(), strict=True))
+            out[name] = (shares[name], {other: like[other] for other in visible if other != name})
+        return out
+
+    def _present(self, effect: int) -> IntArray:
+        """Entries of an effect that act on these rows at all."""
+        mine = np.flatnonzero(self.laid.owner == effect)
+        return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
+
+    def smallest(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
+        """Size of each amplitude at which lambda 8 is left of it, the median over settings; None where nothing is."""
+        at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
+        columns = np.flatnonzero(np.isin(self.laid.entry, at))
+        settings = np.concatenate([self.laid.settings[k] for k in at])
+        lengths = np.linalg.norm(self.left[:, columns], axis=0)
+        out: list[float | None] = []
+        for k in effect.amplitudes:
+            felt = (settings[:, k] != 0) & (lengths > 1e-3)
+            sizes = np.abs(settings[felt, k]) * LAMBDA / lengths[felt]
+            out.append(float(np.median(sizes)) if sizes.size else None)
+        return tuple(out)
+
+
+def _starts(codes: IntArray) -> IntArray:
+    """Give the first place of each run of equal codes."""
+    return np.flatnonzero(np.diff(codes, prepend=-1))
+
+
+def _orthonormal(columns: FloatArray, entry: IntArray) -> FloatArray:
+    """Make each entry's columns orthonormal.
+
+    What is shorter than a thousandth of the longest is not there: its column is 0.
+    """
+    out = np.zeros_like(columns)
+    widths = np.bincount(entry)
+    for width in np.unique(widths):  # all entries of one width at a time
+        mine = np.flatnonzero(widths[entry] == width)
+        out[:, mine], _ = orthonormal(columns[:, mine], int(width), least=1e-18, share=1e-6)
+    return out

@@ -1,0 +1,143 @@
+"""Many templates at once: what can be known of them before a fit, and their Bayes factors about any fit.
+
+A fit takes a part out of each template; the products that tell how much need the templates themselves only
+once for each law of the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence.laplace import Linearised, mix_scales
+from probewise.diagnosis.noise.law import NoiseLaw
+
+__all__ = ["Bank"]
+
+_ABSENT = 1e-9  # share of a template's sum of squares, below which what a fit leaves of it is rounding
+_REMEMBERED = 5  # laws, those asked for last, as long as they take no more than so many bytes
+_MOST_BYTES = 2**28
+
+
+@dataclass(eq=False)
+class Bank:
+    """Templates side by side.
+
+    Parameters
+    ----------
+    columns
+        All of them, (n_points, n_columns).
+    widths
+        Columns of each template, (n_templates,).
+    labels
+        What each is, n_templates.
+    """
+
+    columns: FloatArray
+    widths: IntArray
+    labels: tuple[str, ...]
+    _whitened: dict[tuple[bytes, bytes, bytes], _Whitened] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> Bank:
+        """Set templates, each (n_points, k), side by side."""
+        widths = np.array([t.shape[1] for t in templates], dtype=np.int64)
+        return cls(np.concatenate([np.zeros((n_points, 0)), *templates], axis=1), widths, tuple(labels))
+
+    def __getitem__(self, at: int) -> FloatArray:
+        """Give one template, (n_points, k)."""
+        first = int(self._starts[at])
+        return self.columns[:, first : first + int(self.widths[at])]
+
+    @cached_property
+    def _starts(self) -> IntArray:
+        """First column of each template, (n_templates,)."""
+        return np.cumsum(self.widths) - self.widths
+
+    @cached_property
+    def members(self) -> dict[str, IntArray]:
+        """Numbers of the templates of each label."""
+        labels = np.array(self.labels)
+        return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
+
+    def take(self, members: IntArray) -> Bank:
+        """Keep these templates."""
+        at = [self._starts[k] + np.arange(self.widths[k]) for k in members]
+        columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
+        return Bank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
+
+    def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
+        """Weigh each template against a fit, as `block_log_bayes_factors` does.
+
+        Parameters
+        ----------
+        problem
+            The fit.
+        residuals
+            Projected residuals, (n_rows, n_draws); the fit's own by default.
+
+        Returns
+        -------
+        (n_templates, n_draws).
+        """
+        own = problem.residual[:, None] if residuals is None else residuals
+        n = problem.n_points
+        whitened = self._under(problem.law)
+        taken = problem.basis[:n].T @ whitened.templates  # what the fit takes up, (n_params, n_columns)
+        along = whitened.templates.T @ own[:n]
+        total = np.maximum(np.sum(own**2, axis=0), 1e-300)
+        out = np.empty((len(self.widths), own.shape[1]))
+        for width, products in whitened.products.items():  # all templates of one width at a time
+            members, at = self._of_width(width)
+            absorbed = taken[:, at].transpose(1, 0, 2)
+            left = products - absorbed.transpose(0, 2, 1) @ absorbed
+            gain, axes = np.linalg.eigh(left)
+            gain = np.where(gain > _ABSENT * n, gain, 0.0)
+            turned = axes.transpose(0, 2, 1) @ along[at]
+            explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
+            out[members] = mix_scales(explained, gain, n)
+        return out
+
+    def surviving(self, problem: Linearised) -> FloatArray:
+        """Share of each template that a fit leaves, (n_templates,): 0 where its parameters take all of it up."""
+        templates = self._under(problem.law).templates
+        taken = problem.basis[: problem.n_points].T @ templates
+        whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._starts) for a in (templates, taken))
+        return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
+
+    def _of_width(self, width: int) -> tuple[IntArray, IntArray]:
+        """Give the numbers of the templates of one width, (n,), and of their columns, (n, width)."""
+        members = np.flatnonzero(self.widths == width)
+        return members, self._starts[members, None] + np.arange(width)
+
+    def _under(self, law: NoiseLaw) -> _Whitened:
+        """Whiten all templates and scale each to unit rms."""
+        key = law.linear
+        if key in self._whitened:
+            self._whitened[key] = self._whitened.pop(key)
+        else:
+            room = min(max(_MOST_BYTES // max(self.columns.nbytes, 1), 1), _REMEMBERED)
+            while len(self._whitened) >= room:
+                self._whitened.pop(next(iter(self._whitened)))
+            whitened = law(self.columns)
+            norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+            per_column = np.repeat(self.widths, self.widths)
+            whitened *= np.sqrt(len(whitened) / per_column) / np.where(norms > 0, norms, 1.0)
+            products = {}
+            for width in map(int, np.unique(self.widths)):
+                blocks = whitened[:, self._of_width(width)[1]].transpose(1, 0, 2)
+                products[width] = blocks.transpose(0, 2, 1) @ blocks
+            self._whitened[key] = _Whitened(whitened, products)
+        return self._whitened[key]
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """All templates under one law, (n_points, n_columns), and by width each one's products, (n, width, width)."""
+
+    templates: FloatArray
+    products: dict[int, FloatArray]

@@ -1,0 +1,46 @@
+"""Has a fit arrived? One that has not is no ground for a verdict."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.fitting.coordinates import FARTHEST
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.errors import NotConvergedError
+
+__all__ = ["require_converged", "require_finite"]
+
+_FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
+
+
+def require_finite(found: Fit) -> Fit:
+    """Return a fit whose predictions are numbers.
+
+    Raises
+    ------
+    NotConvergedError
+        If they are not, with the fit as its `partial`.
+    """
+    if not np.isfinite(found.objective):
+        raise NotConvergedError("the model predicts readings that are no finite numbers; check it and its prior", found)
+    return found
+
+
+def require_converged(found: Fit, problem: Linearised) -> None:
+    """Refuse a fit that one more step would still improve by much, unless it rests against the bounds of its prior.
+
+    Raises
+    ------
+    NotConvergedError
+        With the fit as its `partial`.
+    """
+    shift = problem.absorbed(found, np.zeros(len(found.residuals)))
+    slopes = problem.law(found.slopes) / problem.sd
+    left = 0.5 * float(np.sum((slopes @ shift) ** 2) + shift @ shift)
+    if left > _FAR and np.abs(found.z).max() < FARTHEST - 0.1:
+        raise NotConvergedError(
+            f"the fit of the model did not converge: one more step would still gain about {left:.0f} nats; "
+            "a narrower prior or readings that tell more would help",
+            found,
+        )

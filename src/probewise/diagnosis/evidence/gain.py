@@ -1,0 +1,135 @@
+"""Does the repaired model predict readings kept back? Leave one scan out; rows left out at random would leak.
+
+So would one of many scans that lie side by side: of those all over one pattern the same way are left out together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.fitting.fit import Fit, degrees_of_freedom, fit
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.recordings.plan import Recording
+
+__all__ = ["HeldOut", "blocks_kept_back", "compare_scans", "held_out_gain", "parts_kept_back"]
+
+_LEAST_ROWS = 8
+_MOST_SCANS = 10
+_BLOCKS = 5
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Gain of a model over the null on readings kept back, nats a reading, and the sd of that mean."""
+
+    per_reading: float
+    sd: float
+    n_readings: int
+    by_scan: tuple[tuple[str, float], ...]
+
+
+def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, *, sd_floor: float) -> HeldOut:
+    """Refit both models without one scan at a time and compare how they predict it, reading by reading.
+
+    Each reading counts by itself, as the law of the noise has it. Scans of fewer than eight readings stay
+    in; of more than ten longer ones see `parts_kept_back`.
+    """
+    plan, usable = recording.plan, recording.usable
+    parts, names = parts_kept_back(recording)
+
+    def gain(out: BoolArray) -> FloatArray:
+        rows = np.zeros(len(plan), dtype=np.bool_)
+        rows[np.flatnonzero(usable)[out]] = True
+        repaired_one, null_one = (_log_density(f, recording, rows, law, out, sd_floor) for f in (repaired, null))
+        return repaired_one - null_one
+
+    return compare_scans(parts, gain, names)
+
+
+def parts_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
+    """Divide usable readings into the parts that are kept back in turn: their numbers (n_usable,), and their names.
+
+    Its scans; where more than ten are long enough, all those over one pattern in one orientation together, if there are
+    several such parts.
+    """
+    plan, usable = recording.plan, recording.usable
+    scan = plan.scan[usable]
+    if np.sum(np.bincount(scan) >= _LEAST_ROWS) > _MOST_SCANS:
+        views = np.stack([plan.pattern[usable].astype(np.float64), np.round(plan.orientation_rad[usable], 6)])
+        kinds, part = np.unique(views, axis=1, return_inverse=True)
+        if kinds.shape[1] > 1:
+            return part.reshape(-1), tuple(
+                f"{plan.pattern_names[int(code)]}, {np.degrees(turn):.0f} degrees" for code, turn in kinds.T
+            )
+    return scan, plan.scan_names
+
+
+def blocks_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
+    """Divide usable readings into blocks of eight that follow each other, every fifth of which is kept back together.
+
+    What is local in time tells nothing of another scan; of readings between those that are known it does, and a block
+    is long enough that its middle is no neighbour of theirs.
+    """
+    block = np.arange(int(recording.usable.sum())) // _LEAST_ROWS
+    return block % _BLOCKS, tuple(f"every fifth block of {_LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
+
+
+def compare_scans(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
+    """Keep one scan back at a time and gather the gains of its readings.
+
+    Parameters
+    ----------
+    scan
+        Scan of each usable reading, (n_usable,).
+    gain
+        For a mask of the readings kept back (n_usable,), the gain of each of them, in nats.
+    scan_names
+        Names of the scans; without, their numbers.
+    """
+    long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= _LEAST_ROWS]
+    if len(long_enough) < 2:
+        return HeldOut(0.0, 0.0, 0, ())
+    if len(long_enough) > _MOST_SCANS:
+        long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, _MOST_SCANS).round()]
+    gains = [gain(np.asarray(scan == k)) for k in long_enough]
+    by_scan = tuple(
+        (scan_names[k] if scan_names else str(k), float(g.mean())) for k, g in zip(long_enough, gains, strict=True)
+    )
+    joined = np.concatenate(gains)
+    sd = float(joined.std(ddof=1)) / math.sqrt(len(joined))
+    return HeldOut(float(joined.mean()), sd, len(joined), by_scan)
+
+
+def _log_density(
+    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray, sd_floor: float
+) -> FloatArray:
+    """Log predictive density of each reading kept back, by itself, by a refit to the others.
+
+    `rows` (n_points,) and `out` (n_usable,) are the same readings. What a law says of lost readings is the
+    same for every model of the mean, and left out.
+    """
+    kept = Recording(recording.plan, np.where(rows, np.nan, recording.readings), recording.source)
+    rest, own = law.take(~out), law.take(out)
+    without = fit(found.model, kept, found.z, rest, sd_floor=sd_floor, max_steps=4, tolerance=0.05)
+    asked = np.flatnonzero(rows & recording.usable)
+    predicted, slopes = (part[asked] for part in found.model.jacobian(without.z))
+    turned = rest(without.slopes)
+    free = degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
+    sigma_2 = without.sd**2 * rest.n_points / free
+    curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
+    spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
+    miss = recording.readings[asked] - predicted
+    narrow, wide = (
+        _log_normal(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
+        for times, share in ((law.widening, 1 - law.share), (law.times, law.share))
+    )
+    return np.asarray(np.logaddexp(narrow, wide) * own.kept)
+
+
+def _log_normal(miss: FloatArray, variance: FloatArray) -> FloatArray:
+    return np.asarray(-0.5 * np.log(2 * np.pi * variance) - 0.5 * miss**2 / variance)

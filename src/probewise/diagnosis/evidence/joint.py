@@ -1,0 +1,114 @@
+"""A hypothesis as a problem of inference, as `probewise.nested` asks: a model in its coordinates, and a recording."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp, ndtr, ndtri
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.laplace import NoiseEvidence
+from probewise.diagnosis.fitting.coordinates import FARTHEST
+from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.recordings.plan import Recording
+
+__all__ = ["JointProblem", "StandardNormal", "log_likelihood_of_whitened"]
+
+_HELD = 0.999  # of the evidence by the nodes of the noise that are kept; the rest is made up for
+
+
+@dataclass(frozen=True)
+class StandardNormal:
+    """The prior of a model's coordinates: independent, standard normal, and chains step in them as they are."""
+
+    n_params: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """z_1, z_2, ..."""
+        return tuple(f"z_{k + 1}" for k in range(self.n_params))
+
+    @property
+    def coordinates(self) -> StandardNormal:
+        """Its own."""
+        return self
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map the unit cube to normal scores, (n_samples, n_params) both ways."""
+        return np.asarray(ndtri(u))
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Map normal scores to the unit cube."""
+        return np.asarray(ndtr(theta))
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Log density, (n_samples,)."""
+        return np.asarray(-0.5 * np.sum(theta**2 + math.log(2 * math.pi), axis=1))
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        """Leave parameters as they are."""
+        return theta
+
+    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Leave coordinates as they are, and give their log density."""
+        return x, self.log_prob(x)
+
+
+@dataclass(frozen=True, eq=False)
+class JointProblem:
+    """A model in its coordinates against a recording, the noise's sd and the nodes of its law summed out.
+
+    Parameters
+    ----------
+    model, recording
+        What predicts and what was read.
+    noise
+        The evidence of a fit under the noise model: its nodes, of which those that matter are kept.
+    sd_floor
+        Least believable sd of a reading's noise.
+    """
+
+    model: Model
+    recording: Recording
+    noise: NoiseEvidence
+    sd_floor: float
+
+    @cached_property
+    def prior(self) -> StandardNormal:
+        """The prior of the model's coordinates."""
+        return StandardNormal(self.model.n_params)
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Predict all readings and weigh the usable ones under each law kept: (n_samples, n_params) -> (n_samples,)."""
+        usable = self.recording.usable
+        predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
+        residuals = (self.recording.readings[usable] - predicted).T
+        laid_out, kept = self.noise.laid_out, self._kept
+        laws, log_share = [laid_out.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
+        terms = [
+            log_weight + log_likelihood_of_whitened(law, law(residuals), self.sd_floor)
+            for log_weight, law in zip(laid_out.log_weights[kept], laws, strict=True)
+        ]
+        out = np.asarray(logsumexp(terms, axis=0)) + log_share
+        return np.where(np.isfinite(out), out, -np.inf)
+
+    @cached_property
+    def _kept(self) -> list[int]:
+        """The fewest nodes of the noise that hold what matters."""
+        order = np.argsort(-self.noise.weights)
+        n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
+        kept: list[int] = order[:n_kept].tolist()
+        return kept
+
+
+def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray, sd_floor: float) -> FloatArray:
+    """Log likelihood of whitened residuals (n_points, n_samples) under one law, log sd integrated out: (n_samples,)."""
+    n_points = law.n_points
+    sigma = law.scale(whitened, floor=sd_floor)
+    curvature = law.tail.scale_curvature(whitened, sigma, n_points) if not law.tail.is_normal else 2.0 * n_points
+    peak = -law.misfit(whitened, sigma, floor=sd_floor) - 0.5 * n_points * math.log(2 * math.pi)
+    return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.log_det() + law.log_extra)

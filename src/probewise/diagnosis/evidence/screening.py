@@ -1,0 +1,77 @@
+"""Score what could be added to a fit, by templates in closed form: many at once, no refits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.laplace import Blocks, Linearised, block_log_bayes_factors, project_scaled
+from probewise.diagnosis.evidence.templates import EffectTemplates
+
+__all__ = ["log_mean", "score_effects", "score_pairs", "score_unknown"]
+
+Names = tuple[str, ...]
+
+_BEST_ENTRIES = 2  # of each effect's bank, for pairs
+
+
+def log_mean(scores: FloatArray) -> float:
+    """Average Bayes factors, given and returned as logs."""
+    top = float(scores.max())  # thousands of short lists: a library's care for every case takes ten times as long
+    return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
+
+
+def score_effects(problem: Linearised, bank: Bank) -> dict[str, FloatArray]:
+    """Weigh each entry of each effect's bank, labelled by its name: name -> log Bayes factors (n_entries,)."""
+    scores = bank.log_bayes_factors(problem)[:, 0]
+    return {name: scores[members] for name, members in bank.members.items()}
+
+
+def score_unknown(problem: Linearised, bases: Bank) -> dict[str, float]:
+    """Weigh what has no name against the fit, by the family of the bases: log Bayes factors."""
+    return {family: log_mean(own) for family, own in score_effects(problem, bases).items()}
+
+
+def score_pairs(
+    problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
+) -> dict[Names, float]:
+    """Weigh pairs: as if each effect stood alone, and what their best entries gain or lose together."""
+    best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
+    entries = [(name, int(i)) for name in templates for i in best[name]]
+    pairs = list(combinations(sorted(templates), 2))
+    if not pairs:
+        return {}
+    columns = [templates[name].columns[i] for name, i in entries]
+    widths = [c.shape[1] for c in columns]
+    # In the axes of the space that all of them span, with one more for the rest of the residual.
+    axes, turned = np.linalg.qr(project_scaled(problem, columns))
+    along = axes.T @ problem.residual
+    rest = math.sqrt(max(float(problem.residual @ problem.residual - along @ along), 0.0))
+    turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
+    own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
+    asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
+    both = [_side_by_side(own[first], own[second]) for first, second in asked]
+    blocks = Blocks.of_projected(np.concatenate(both, axis=1), [c.shape[1] for c in both], [""] * len(both), problem)
+    together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_points)[:, 0]
+    apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
+    out: dict[Names, float] = {}
+    at = 0
+    for a, b in pairs:
+        block = slice(at, at + len(best[a]) * len(best[b]))
+        at = block.stop
+        gained = float(logsumexp(together[block]) - logsumexp(apart[block]))
+        out[a, b] = log_mean(singles[a]) + log_mean(singles[b]) + gained
+    return out
+
+
+def _side_by_side(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Join two templates of unit rms into one of unit rms."""
+    widths = first.shape[1], second.shape[1]
+    scaled = [t * math.sqrt(w / sum(widths)) for t, w in zip((first, second), widths, strict=True)]
+    return np.concatenate(scaled, axis=1)

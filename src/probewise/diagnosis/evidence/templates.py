@@ -1,0 +1,131 @@
+"""What could be added to a fit: the vocabulary's effects.
+
+A template is a set of columns (n_usable, k), the change of the readings that an amplitude of one makes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.fitting.coordinates import effect_values
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.effects import NamedEffect, in_scans
+from probewise.sensor import Stage
+
+__all__ = ["EffectTemplates", "TemplateMemory", "effect_templates", "subsets"]
+
+_ROUNDING = 1e-9  # of the largest prediction; what changes by less is not changed
+_AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class EffectTemplates:
+    """An effect's bank about a fit, all its variants': for each entry its columns, the setting and the variant."""
+
+    columns: tuple[FloatArray, ...]  # each (n_usable, n_columns)
+    settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
+    variants: tuple[NamedEffect[Any], ...]
+    choice: IntArray  # number of each entry's variant, (n_entries,)
+
+    def variant(self, at: int) -> NamedEffect[Any]:
+        """Give the variant of one entry."""
+        variant: NamedEffect[Any] = self.variants[self.choice[at]]
+        return variant
+
+    def weights(self, scores: FloatArray) -> FloatArray:
+        """Posterior probability of each variant, (n_variants,), by the log Bayes factors of the entries."""
+        shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants))
+        return np.asarray(shares / shares.sum())
+
+
+@dataclass(eq=False)
+class TemplateMemory:
+    """The templates of effects about fits, each laid out once."""
+
+    usable: IntArray
+    known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
+    banks: dict[tuple[Fit, tuple[str, ...]], Bank] = field(default_factory=dict)
+
+    def bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> Bank:
+        """Give the coarse templates of several effects about one fit, side by side, labelled by their names."""
+        key = found, tuple(effect.name for effect in effects)
+        if key not in self.banks:
+            own = [(effect.name, t) for effect in effects for t in self.of(found, effect.coarse()).columns]
+            self.banks[key] = Bank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
+        return self.banks[key]
+
+    def of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
+        """Give the templates of one effect about one fit."""
+        key = found, effect
+        if key not in self.known:
+            self.known[key] = effect_templates(found, effect, self.usable)
+        return self.known[key]
+
+
+def effect_templates(
+    found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
+) -> EffectTemplates:
+    """Difference the chain with and without each variant of the effect, of `most` entries spread evenly."""
+    variants = effect.variants()
+    banks = [variant.bank() for variant in variants]
+    choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
+    entries = np.concatenate(banks)
+    if most is not None and most < len(entries):
+        kept = np.linspace(0, len(entries) - 1, most).round().astype(np.int64)
+        choice, entries = choice[kept], entries[kept]
+    gates = effect.gates(found.model.plan)
+    if gates is not None:
+        (everywhere,) = _columns(found, effect, gates.always[None, :, :], usable)
+        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
+    else:
+        # Variants bound to the same scans and patterns differ in their priors alone: one prediction does for them.
+        columns = []
+        for _, group in itertools.groupby(range(len(choice)), key=lambda at: _bound_to(variants[choice[at]])):
+            at = list(group)
+            columns += _columns(found, variants[choice[at[0]]], entries[at], usable)
+    return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
+
+
+def _bound_to(variant: NamedEffect[Any]) -> tuple[object, object]:
+    return variant.scans, variant.patterns
+
+
+def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
+    """Predict the settings of a bank, in the scans that the effect is bound to: each (n_usable, n_columns)."""
+    plain, plan = found.model, found.model.plan
+    model = plain.with_effect(effect)
+    n_rows = bank.shape[0] * bank.shape[1]
+    own = {e.name: effect_values(e, found.z[None, plain.columns_of(e.name)]) for e in plain.effects}
+    sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
+    before = np.zeros(len(plan))
+    before[usable] = found.predicted
+    inside = np.flatnonzero(in_scans(plan, effect.scans)) if effect.scans else slice(None)
+    there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
+    # What acts on what has been seen needs no second look.
+    seen = None if effect.stage < Stage.SEEN else plain.chain.look(plain.theta_of(sensor, own), there)
+    change = np.zeros((n_rows, len(plan)))
+    step = max(_AT_ONCE // len(there), 1)
+    for first in range(0, n_rows, step):
+        rows = slice(first, min(first + step, n_rows))
+        n = rows.stop - first
+        each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
+        each[effect.name] = bank.reshape(n_rows, -1)[rows]
+        theta = model.theta_of(np.repeat(sensor, n, axis=0), each)
+        read = model.chain.predict(theta, there) if seen is None else model.chain.read(seen, theta, there)
+        change[rows, inside] = read - before[inside]
+    columns = change[:, usable].T
+    columns[:, np.abs(columns).max(axis=0) < _ROUNDING * np.abs(before).max()] = 0.0
+    return np.split(columns, len(bank), axis=1)
+
+
+def subsets(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
+    """List every combination of up to `most` names, each sorted, the empty one first."""
+    for size in range(most + 1):
+        yield from itertools.combinations(sorted(names), size)

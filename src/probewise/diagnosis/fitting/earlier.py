@@ -1,0 +1,69 @@
+"""An earlier posterior of the sensor, taken as the prior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, theta_to_natural
+from probewise.diagnosis.fitting.free_form import FreeForm, free_form_to_natural
+from probewise.errors import ParameterError
+from probewise.sensor import is_free_form
+
+__all__ = ["SensorPrior", "sensor_from_posterior", "sensor_of"]
+
+
+def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
+    """Take an earlier sensor's posterior, by its mean and covariance, as the prior.
+
+    Only the SSF's and the levels' columns are used; effects of the earlier model are not carried over.
+
+    Raises
+    ------
+    ParameterError
+        If the names are not those of a mixture of Gaussians with two free levels.
+    """
+    names = list(names)
+    n_gaussians = sum(name.startswith("a_") for name in names)
+    wanted = [f"{p}_{n}" for n in range(1, n_gaussians + 1) for p in ("a", "u", "v", "A", "B", "C")]
+    wanted += ["I_min", "I_max"]
+    if n_gaussians == 0 or any(name not in names for name in wanted):
+        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
+    at = [names.index(name) for name in wanted]
+    mean = np.asarray(mean, dtype=np.float64)[at]
+    cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
+    free = is_free_form(mean[None, :-2])
+    to_natural = free_form_to_natural if free else partial(theta_to_natural, n_gaussians=n_gaussians)
+    center = to_natural(mean[None, :])[0]
+    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
+    up = to_natural(mean + np.diag(steps))
+    down = to_natural(mean - np.diag(steps))
+    slope = ((up - down) / (2 * steps[:, None])).T
+    natural_cov = slope @ cov @ slope.T
+    floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
+    factor = np.linalg.cholesky(natural_cov + np.diag(floor))
+    return FreeForm(center, factor) if free else SensorCoordinates(n_gaussians, center, factor, exchangeable=False)
+
+
+class SensorPrior(Protocol):
+    """An earlier posterior of the sensor: a FittedSensor, or anything with its names and samples."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names, one a column."""
+        ...
+
+    @property
+    def samples(self) -> FloatArray:
+        """Posterior samples, (n_samples, n_params)."""
+        ...
+
+
+def sensor_of(sensor: SensorPrior) -> CalibratedSensor:
+    """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`."""
+    samples = np.asarray(sensor.samples, dtype=np.float64)
+    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))

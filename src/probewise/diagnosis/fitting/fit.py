@@ -1,0 +1,235 @@
+"""Fit a model to a recording: bounded Levenberg-Marquardt with every perturbation in one prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, effect_scores, effect_values
+from probewise.diagnosis.fitting.null import Null, Predictor
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.effects import NamedEffect
+from probewise.recordings.plan import Plan, Recording
+from probewise.sensor import FAST_NODES
+
+__all__ = ["Fit", "Model", "degrees_of_freedom", "fit", "start_with_more_gaussians", "starts_of_one_gaussian"]
+
+_STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
+_DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A chain with its effects, in coordinates of standard normal prior.
+
+    Effects on the noise play no part here; they are in its law.
+    """
+
+    sensor: Null
+    effects: tuple[NamedEffect[Any], ...]
+    plan: Plan
+
+    @cached_property
+    def chain(self) -> Predictor:
+        """The sensor model itself."""
+        return self.sensor.chain(self.plan, self.effects, n_nodes=FAST_NODES)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, in their order here."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return self.sensor.n_params + sum(len(effect.prior.names) for effect in self.effects)
+
+    def columns_of(self, name: str) -> slice:
+        """Coordinates of one effect."""
+        at = self.sensor.n_params
+        for effect in self.effects:
+            n_params = len(effect.prior.names)
+            if effect.name == name:
+                return slice(at, at + n_params)
+            at += n_params
+        raise KeyError(name)
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates, (n_samples, n_params), to the chain's parameters."""
+        own = {effect.name: effect_values(effect, z[:, self.columns_of(effect.name)]) for effect in self.effects}
+        return self.theta_of(self.sensor.theta(z[:, : self.sensor.n_params]), own)
+
+    def theta_of(self, sensor: FloatArray, own: Mapping[str, FloatArray]) -> FloatArray:
+        """Join the sensor's columns with each effect's, in the order of the chain: that of the stages."""
+        return np.concatenate([sensor, *(own[effect.name] for effect in self.chain.effects)], axis=1)
+
+    def predict(self, z: FloatArray, plan: Plan | None = None) -> FloatArray:
+        """Noise-free readings of every row of a plan, (n_samples, n_points)."""
+        return self.chain.predict(self.theta(z), self.plan if plan is None else plan)
+
+    def jacobian(self, z: FloatArray, plan: Plan | None = None) -> tuple[FloatArray, FloatArray]:
+        """Predict and differentiate at one point z (n_params,): (n_points,), (n_points, n_params)."""
+        # Steps point inwards, so that no parameter leaves the bounds.
+        steps = np.where(z > 0, -_STEP, _STEP)
+        batch = self.predict(np.concatenate([z[None, :], z + np.diag(steps)]), plan)
+        return batch[0], (batch[1:] - batch[0]).T / steps
+
+    def with_effect(self, effect: NamedEffect[Any]) -> Model:
+        """Add an effect behind the others."""
+        return Model(self.sensor, (*self.effects, effect), self.plan)
+
+    def without(self, name: str) -> tuple[Model, BoolArray]:
+        """Leave an effect out; also which coordinates stay, (n_params,)."""
+        stay = np.ones(self.n_params, dtype=np.bool_)
+        stay[self.columns_of(name)] = False
+        return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
+
+    def scores_of(self, values: FloatArray) -> FloatArray:
+        """Return the last effect's coordinates for its own parameters (n_samples, n_params)."""
+        return effect_scores(self.effects[-1], values)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best point of a model: coordinates `z`, and at it the usable rows' predictions and slopes.
+
+    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` of the noise by maximum likelihood.
+    """
+
+    model: Model
+    z: FloatArray
+    predicted: FloatArray
+    residuals: FloatArray
+    slopes: FloatArray
+    sd: float
+    objective: float
+
+    def change_by(self, name: str, usable: IntArray) -> FloatArray:
+        """Tell what one of its effects does to the usable readings, all else as it is, (n_usable,)."""
+        without, stay = self.model.without(name)
+        return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
+
+
+def fit(
+    model: Model,
+    recording: Recording,
+    start: FloatArray,
+    law: NoiseLaw,
+    *,
+    sd_floor: float,
+    max_steps: int = 30,
+    tolerance: float = 5e-3,
+) -> Fit:
+    """Find the most probable point, the noise sd integrated out.
+
+    Maximises the log likelihood under the law of the noise, less |z|^2 / 2, over the box |z| <= 6.
+    Each step differentiates in one vectorised prediction and tries five dampings in another.
+
+    Parameters
+    ----------
+    model, recording
+        What predicts and what was read.
+    start
+        Coordinates to start from, shape (n_params,).
+    law
+        The law of the noise.
+    sd_floor
+        Least believable sd of a reading's noise.
+    max_steps
+        Bound of the number of steps.
+    tolerance
+        Stop when a step gains less, in nats.
+    """
+    usable = recording.usable
+    readings = recording.readings[usable]
+
+    def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
+        whitened = law((readings - predicted).T)
+        sigma = law.scale(whitened, floor=sd_floor)
+        return np.asarray(law.misfit(whitened, sigma, floor=sd_floor) + 0.5 * np.sum(z**2, axis=1))
+
+    z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
+    eye = np.eye(len(z))
+    predicted, slopes = (part[usable] for part in model.jacobian(z))
+    best = float(objective(predicted[None, :], z[None, :])[0])
+    if not (np.isfinite(best) and np.isfinite(slopes).all()):  # nothing to go down from
+        return Fit(model, z, predicted, readings - predicted, slopes, np.inf, np.inf)
+    for _ in range(max_steps):
+        whitened, turned = law(readings - predicted)[:, None], law(slopes)
+        sigma = law.scale(whitened, floor=sd_floor)
+        variance = float(sigma[0]) ** 2 / law.information
+        curvature = turned.T @ turned / variance + eye
+        downhill = turned.T @ law.as_normal(whitened, sigma)[:, 0] / variance - z
+        scale = np.diag(curvature)
+        tries = np.stack([np.linalg.solve(curvature + np.diag(d * scale), downhill) for d in _DAMPINGS])
+        tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
+        values = objective(model.predict(tries)[:, usable], tries)
+        values = np.where(np.isfinite(values), values, np.inf)
+        at = int(np.argmin(values))
+        gained = best - float(values[at])
+        if gained <= 0:
+            break
+        z, best = tries[at], float(values[at])
+        predicted, slopes = (part[usable] for part in model.jacobian(z))
+        if gained < tolerance:
+            break
+    sd = float(law.scale(law(readings - predicted)[:, None], floor=sd_floor)[0])
+    return Fit(model, z, predicted, readings - predicted, slopes, sd, best)
+
+
+def degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
+    """Count the readings that no parameter takes: n less the number of parameters that they, not the priors, settle.
+
+    Parameters
+    ----------
+    slopes
+        Of the whitened readings by the coordinates, (n_points, n_params).
+    sd
+        Noise of a whitened reading.
+    """
+    squares = np.linalg.svd(slopes / max(sd, 1e-150), compute_uv=False) ** 2
+    return max(len(slopes) - float(np.sum(squares / (1 + squares))), 1.0)
+
+
+def starts_of_one_gaussian(sensor: SensorCoordinates) -> FloatArray:
+    """Lay out starting points for one Gaussian: typical, narrow and wide, shape (3, n_params)."""
+    return np.stack([_set_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
+
+
+def _set_widths(z: FloatArray, step: float) -> FloatArray:
+    z = z.copy()
+    z[2:4] = step
+    return z
+
+
+def start_with_more_gaussians(found: Null, z: FloatArray, wanted: SensorCoordinates) -> FloatArray:
+    """Split the heaviest Gaussian of a fit in several ways, shape (n_starts, wanted.n_params)."""
+    theta = found.theta(z[None, : found.n_params])[0]
+    n = found.n_gaussians
+    blocks = theta[: 6 * n].reshape(n, 6)
+    mass = blocks[:, 0] / np.sqrt(blocks[:, 3] * blocks[:, 4] - blocks[:, 5] ** 2)
+    at = int(np.argmax(mass))
+    sd_u, sd_v = 1 / np.sqrt(2 * blocks[at, 3:5])
+    splits: Sequence[tuple[float, float, float, float]] = (
+        (0.0, 0.0, 0.65, 1.6),  # a core and a skirt
+        (0.8, 0.0, 0.9, 0.9),  # side by side along x'
+        (0.0, 0.8, 0.9, 0.9),
+    )
+    out = []
+    for du, dv, first, second in splits:
+        pair = []
+        for sign, widen in ((1.0, first), (-1.0, second)):
+            part = blocks[at].copy()
+            part[1] += sign * du * sd_u
+            part[2] += sign * dv * sd_v
+            part[3:6] /= widen**2
+            part[0] /= 2 * widen**2  # halves the mass
+            pair.append(part)
+        rest = np.delete(blocks, at, axis=0)
+        out.append(np.concatenate([np.concatenate([rest, np.stack(pair)]).ravel(), theta[-2:]]))
+    return np.clip(wanted.z(np.stack(out)), -FARTHEST + 0.5, FARTHEST - 0.5)

@@ -1,0 +1,80 @@
+"""A sensor whose SSF has any form, as a null.
+
+What a mixture of a few Gaussians leaves of a real SSF looks like physics, and the evidence pays for another Gaussian
+only where it gains ten nats and more. A free form (`probewise.sensor.bent`) takes it up: small shares at many
+places, each with a normal prior, so that the evidence charges for what is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.fitting.coordinates import (
+    CalibratedSensor,
+    SensorCoordinates,
+    natural_to_theta,
+    theta_to_natural,
+)
+from probewise.sensor import N_BENDS, N_FREE_FORM, bends_of, free_form
+
+__all__ = ["FreeForm", "free_form_to_natural"]
+
+_SHARE = 0.1  # prior sd of each bend, of the mass
+
+
+@dataclass(frozen=True, eq=False)
+class FreeForm(CalibratedSensor):
+    """A sensor with a free-form SSF.
+
+    Its natural coordinates are those of one Gaussian and the two levels, then the bends: 7 + N_BENDS.
+    """
+
+    center: FloatArray
+    factor: FloatArray
+    n_gaussians: int = field(default=N_FREE_FORM, init=False)
+
+    @classmethod
+    def about(cls, one: SensorCoordinates) -> Self:
+        """Believe in the place and size of one Gaussian, and in small bends."""
+        factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
+        factor[: one.n_params, : one.n_params] = one.factor
+        return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
+
+    def start_from(self, one: FloatArray) -> FloatArray:
+        """Start unbent from coordinates of the one Gaussian, (7,): (1, n_params)."""
+        return np.pad(one, (0, N_BENDS))[None, :]
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return 7 + N_BENDS
+
+    @property
+    def worth(self) -> int:
+        """As two: from one Gaussian to any form is one step."""
+        return 2
+
+    @property
+    def form(self) -> str:
+        """Free."""
+        return "an SSF of free form"
+
+    def from_natural(self, natural: FloatArray) -> FloatArray:
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
+        one = natural_to_theta(natural[:, :-N_BENDS], 1)
+        return np.concatenate([free_form(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
+
+    def to_natural(self, theta: FloatArray) -> FloatArray:
+        """Invert `from_natural`."""
+        return free_form_to_natural(theta)
+
+
+def free_form_to_natural(theta: FloatArray) -> FloatArray:
+    """Invert what `FreeForm.theta` makes of natural coordinates, (n_samples, 6 N + 2) -> (n_samples, 7 + N_BENDS)."""
+    # The amplitude of the first plays no part in its natural coordinates.
+    one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
+    return np.concatenate([theta_to_natural(one, 1), bends_of(theta[:, :-2])], axis=1)

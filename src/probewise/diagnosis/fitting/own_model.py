@@ -1,0 +1,165 @@
+"""A user's own model, diagnosed like a sensor: any callable of parameters and plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
+from probewise.effects import VOCABULARY, NamedEffect
+from probewise.errors import ParameterError, ShapeError
+from probewise.priors import Prior
+from probewise.recordings.plan import Plan
+from probewise.sensor import AnyEffect, Stage
+
+__all__ = ["OwnModel", "Parameters", "Simulate"]
+
+Parameters: TypeAlias = Mapping[str, FloatArray]
+"""Parameters by name, each (n_samples, 1)."""
+
+Simulate: TypeAlias = Callable[[Parameters, Plan], FloatArray]
+"""Turns parameters and a plan into noise-free readings, (n_samples, n_points)."""
+
+_N_STARTS = 8
+_ON_READINGS = (Stage.OFFSET, Stage.LAG, Stage.SATURATION, Stage.NOISE)
+
+
+@dataclass(frozen=True)
+class OwnModel:
+    """A simulator and what is believed of its parameters: a null model like any other.
+
+    Effects from the stage OFFSET on act on its readings, so half of the vocabulary applies as it is. An effect
+    of the user's own acts at `Stage.SCENE` on the parameters: it adds or changes some, and the simulator reads
+    them (with a default where they are missing, which is the model without the effect).
+
+    Parameters
+    ----------
+    simulate
+        Predicts the readings of a plan.
+    prior
+        Prior of its parameters.
+    """
+
+    simulate: Simulate
+    prior: Prior
+
+    @property
+    def n_params(self) -> int:
+        """Number of parameters."""
+        return len(self.prior.names)
+
+    @property
+    def n_gaussians(self) -> int:
+        """None: it has no SSF."""
+        return 0
+
+    @property
+    def worth(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def form(self) -> str:
+        """Nothing."""
+        return ""
+
+    @property
+    def exchangeable(self) -> bool:
+        """There are none."""
+        return False
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """Nothing: its parameters are what is asked for."""
+        return ()
+
+    @cached_property
+    def starts(self) -> FloatArray:
+        """Start from the middle of the prior and from points spread evenly over it, (8, n_params)."""
+        from scipy.stats import qmc  # here, since it takes a second to import that a sensor's diagnosis does without
+
+        spread = qmc.Halton(self.n_params, scramble=False).random(_N_STARTS)[1:]
+        return np.concatenate([np.zeros((1, self.n_params)), np.asarray(ndtri(spread), dtype=np.float64)])
+
+    @property
+    def least_readings(self) -> int:
+        """Three for each parameter."""
+        return max(LEAST_READINGS, 3 * self.n_params)
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """Only what acts on the readings, and effects of the user's own: there is no footprint, no light."""
+        own = effect.stage is Stage.SCENE and effect.name not in VOCABULARY
+        return own or effect.stage in _ON_READINGS
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map normal scores, (n_samples, n_params), to parameters."""
+        return self.prior.from_unit_cube(ndtr(z))
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnChain:
+        """Add effects; `n_nodes` plays no part.
+
+        Raises
+        ------
+        ParameterError
+            If an effect acts at a stage that only a light sensor has.
+        """
+        wrong = [effect.name for effect in effects if not self.admits(effect)]
+        if wrong:
+            raise ParameterError("effects", wrong, "effects on the readings, or at Stage.SCENE on the parameters")
+        return _OwnChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
+
+
+@dataclass(frozen=True)
+class _OwnChain:
+    """A user's simulator with effects, as a chain: parameters, readings, offsets, lag, saturation."""
+
+    model: OwnModel
+    effects: tuple[AnyEffect, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The model's parameters, then each effect's as "effect.parameter"."""
+        own = (f"{effect.name}.{name}" for effect in self.effects for name in effect.prior.names)
+        return (*self.model.prior.names, *own)
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        return self.read(self.look(theta, plan), theta, plan)
+
+    def look(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Simulate, with the effects on the parameters.
+
+        Raises
+        ------
+        ShapeError
+            If the simulator's readings have another shape than (n_samples, n_points).
+        """
+        parameters: Parameters = {name: theta[:, k : k + 1] for k, name in enumerate(self.model.prior.names)}
+        for effect, columns in self._columns:
+            if effect.stage is Stage.SCENE:
+                parameters = effect.apply(parameters, theta[:, columns], plan)
+        readings = np.asarray(self.model.simulate(parameters, plan), dtype=np.float64)
+        if readings.shape != (len(theta), len(plan)):
+            raise ShapeError(f"simulate gives {readings.shape}; allowed: {(len(theta), len(plan))}, samples x readings")
+        return readings
+
+    def read(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Apply the effects on the readings, in the order of their stages."""
+        for effect, columns in self._columns:
+            if Stage.OFFSET <= effect.stage <= Stage.SATURATION:
+                view = effect.apply(view, theta[:, columns], plan)
+        return view
+
+    @cached_property
+    def _columns(self) -> list[tuple[AnyEffect, slice]]:
+        end, pairs = self.model.n_params, []
+        for effect in self.effects:
+            start, end = end, end + len(effect.prior.names)
+            pairs.append((effect, slice(start, end)))
+        return pairs

@@ -1,0 +1,304 @@
+"""Is it only the noise? The law of a recording's noise, and tests of what is left.
+
+A wrong law makes false alarms by the dozen, and a missed effect of the mean looks like correlated or
+heavy-tailed noise; so every hypothesis about the mean is weighed under white and under each other law.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.special import expit
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.noise.flat import Flat
+from probewise.recordings.plan import Recording
+
+__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white"]
+
+_EM_STEPS = 12
+_LEAST = 1e-150  # of a scale: readings that are all as predicted are no error
+
+
+def steps_within_scans(recording: Recording) -> IntArray:
+    """Count the rows back to the previous usable reading of the same scan, 0 where there is none.
+
+    Shape (n_usable,): a missing reading makes its neighbours two steps apart.
+    """
+    rows = np.flatnonzero(recording.usable)
+    steps = np.diff(rows, prepend=rows[:1])
+    same = np.diff(recording.plan.scan[rows], prepend=-1) == 0
+    return np.where(same, steps, 0).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLaw:
+    """The law of all readings' noise, up to its overall sd.
+
+    Whitening, a linear map, makes residuals independent and of one scale sigma; what is left of each is
+    normal, but with probability `share` `times` as wide: a heavy tail; or rounded, flat at the top. Readings that are
+    lost say nothing.
+
+    Parameters
+    ----------
+    sd
+        Sd of each reading relative to the overall one, (n_points,).
+    carry
+        Correlation with the previous reading, 0 for the first of a scan, (n_points,).
+    lost
+        Readings that hold nothing of what lies under the sensor, (n_points,).
+    share, times
+        The tail; none by default.
+    log_extra
+        What the law says beyond the density of the readings that are not lost: of those that are.
+    flat, sigma
+        What rounding adds, where there is no tail: a uniform part, so many sigma either way; sigma is then known.
+    """
+
+    sd: FloatArray
+    carry: FloatArray
+    lost: BoolArray
+    share: float = 0.0
+    times: float = 1.0
+    log_extra: float = 0.0
+    flat: float = 0.0
+    sigma: float = 1.0
+    kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kept", 1.0 - self.lost)
+
+    @property
+    def n_points(self) -> int:
+        """Readings that are not lost."""
+        return len(self.sd) - int(self.lost.sum())
+
+    @property
+    def linear(self) -> tuple[bytes, bytes, bytes]:
+        """What the whitening depends on: laws of one whitening differ in their tails alone."""
+        return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes()
+
+    def alike(self, other: NoiseLaw) -> bool:
+        """Tell whether another law is as good as the same."""
+        return (
+            (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
+            and np.array_equal(self.lost, other.lost)
+            and np.allclose(self.sd, other.sd, rtol=0.03)
+            and np.allclose(self.carry, other.carry, atol=0.03)
+        )
+
+    @property
+    def information(self) -> float:
+        """Fisher information of one whitened reading about its place, in units of 1 / sigma^2."""
+        return float(self.tail.information)
+
+    def take(self, rows: BoolArray) -> NoiseLaw:
+        """Keep the law of some readings, whole scans of them."""
+        return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows])
+
+    def __call__(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns, shape (n_points,) or (n_points, n_columns); 0 for readings that are lost."""
+        flat = columns.ndim == 1
+        y = columns[:, None] if flat else columns
+        y = y * (self.kept / self.sd)[:, None]
+        if np.any(self.carry):
+            carry = self.carry[1:, None]
+            innovation = np.empty_like(y)
+            innovation[0] = y[0]
+            np.multiply(carry, y[:-1], out=innovation[1:])
+            np.subtract(y[1:], innovation[1:], out=innovation[1:])
+            innovation[1:] /= np.sqrt(1 - carry**2)
+            y = innovation
+        return y[:, 0] if flat else y
+
+    def log_det(self) -> float:
+        """Return half the log determinant of the relative covariance."""
+        kept = ~self.lost
+        return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
+
+    @cached_property
+    def tail(self) -> Tail | Flat:
+        """The form of one whitened reading's density."""
+        return forms([self])
+
+    @property
+    def widening(self) -> float:
+        """Sd of a whitened reading in units of sigma, a tail aside: what rounding adds."""
+        return math.sqrt(1 + self.flat**2 / 3)
+
+    def plain(self) -> NoiseLaw:
+        """Leave normal noise of the same whitening."""
+        return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0)
+
+    def scale(self, whitened: FloatArray, *, floor: float = 0.0) -> FloatArray:
+        """Most likely sigma of whitened residuals, (n_points, k) -> (k,); `floor` is added in quadrature."""
+        return self.tail.scale(whitened, self.n_points, floor=floor)
+
+    def misfit(self, whitened: FloatArray, sigma: FloatArray, *, floor: float = 0.0) -> FloatArray:
+        """Minus log likelihood of whitened residuals (n_points, k) at the sigma (k,) that `scale` gives: (k,).
+
+        Without n/2 log 2 pi.
+        """
+        return self.tail.misfit(whitened, sigma, self.n_points, floor=floor)
+
+    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Turn whitened residuals (n_points, k) into those of normal noise that say as much about the mean."""
+        return self.tail.as_normal(whitened, sigma)
+
+    def pseudo(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Give residuals as `as_normal` does, but none farther than it is.
+
+        Beyond a flat top the density falls faster than on the average, and what would be told by that no change needs.
+        """
+        normal = self.as_normal(whitened, sigma)
+        return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
+
+    def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw residuals as `pseudo` makes them, in units of their sd, (n_points, n_draws)."""
+        eps = rng.standard_normal((len(self.sd), n_draws))
+        if not self.tail.is_normal:
+            eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
+            if self.flat:
+                eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
+            eps = self.pseudo(eps, np.ones(n_draws)) * math.sqrt(self.information)
+        return eps * self.kept[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """Mix two normal densities of one mean: with probability `share` `times` as wide; one tail, or k of them (k,).
+
+    All methods take whitened residuals, (n_points, k) or (n_points, 1).
+    """
+
+    share: float | FloatArray
+    times: float | FloatArray
+
+    @cached_property
+    def is_normal(self) -> bool:
+        """Whether there is none."""
+        return bool(np.all(np.asarray(self.share) == 0))
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
+        return np.asarray(np.vectorize(_information, otypes=[np.float64])(self.share, self.times))
+
+    def scale(
+        self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
+    ) -> FloatArray:
+        """Most likely sigma, (k,), by expectation and maximisation; rows beyond `n_points` are 0 and do not count."""
+        if self.is_normal:
+            return np.asarray(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points + floor**2))
+        squares = whitened**2
+        if start is None:  # from the middle half of what is not lost, which the tail leaves alone
+            middle = len(whitened) - n_points // 2 - 1
+            sigma = np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745 + floor + _LEAST
+        else:
+            sigma = start
+        for _ in range(_EM_STEPS if start is None else 3):
+            weighed = self._weights(squares / sigma**2) * squares
+            sigma = np.sqrt(weighed.sum(axis=0) / n_points + floor**2) + _LEAST
+        return np.asarray(sigma)
+
+    def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int, *, floor: float = 0.0) -> FloatArray:
+        """Minus log likelihood at the most likely sigma (k,), without n/2 log 2 pi: (k,).
+
+        The floor counts as what is always left of each reading, so that laws with and without a tail compare.
+        """
+        if self.is_normal:
+            return np.asarray(n_points * (np.log(sigma) + 0.5))
+        squares = (whitened / sigma) ** 2
+        log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds(squares))
+        at_zero = np.logaddexp(0.0, self._log_odds(np.zeros((1, 1))))[0]
+        of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
+        always = 0.5 * (floor / sigma) ** 2
+        return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share) + always) - of_kept)
+
+    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Turn residuals into those of normal noise that say as much about the mean.
+
+        The score of the density over its information: of sd sigma / sqrt(information), and what lies far
+        out in the tail counts little (Huber 1981, section 6.7: pseudo-observations).
+        """
+        if self.is_normal:
+            return whitened
+        return np.asarray(whitened * self._weights((whitened / sigma) ** 2) / self.information)
+
+    def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+        """Give minus the second derivative of the log likelihood by log sigma, (k,)."""
+        squares = (whitened / sigma) ** 2
+        wide = self.wide(squares)
+        less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
+        return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
+
+    def wide(self, squares: FloatArray) -> FloatArray:
+        """Probability that a residual is a wide one, by its square in units of sigma^2."""
+        return np.asarray(expit(self._log_odds(squares)))
+
+    def _log_odds(self, squares: FloatArray) -> FloatArray:
+        """Log odds that a residual is a wide one, by its square in units of sigma^2."""
+        share, times = np.asarray(self.share), np.asarray(self.times)
+        return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
+
+    def _weights(self, squares: FloatArray) -> FloatArray:
+        """Expect the precision of each residual, 1 for those of the narrow part."""
+        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide(squares))
+
+
+def forms(laws: Sequence[NoiseLaw]) -> Tail | Flat:
+    """Take the densities of laws that all have a tail, or all a flat top, together: one of k."""
+    one = len(laws) == 1
+    if laws[0].flat:
+        if one:
+            return Flat(laws[0].flat, laws[0].sigma)
+        return Flat(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]))
+    if one:
+        return Tail(laws[0].share, laws[0].times)
+    return Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))
+
+
+@lru_cache(maxsize=256)
+def _information(share: float, times: float) -> float:
+    if share == 0:
+        return 1.0
+    # The integrand reaches as far as the wide part does.
+    z = np.linspace(-6 * times, 6 * times, 4001)
+    narrow = (1 - share) * np.exp(-0.5 * z * z)
+    wide = share / times * np.exp(-0.5 * (z / times) ** 2)
+    score = z * (narrow + wide / times**2) / (narrow + wide)
+    return float(np.sum(score**2 * (narrow + wide)) * (z[1] - z[0]) / math.sqrt(2 * math.pi))
+
+
+def white(n_points: int) -> NoiseLaw:
+    """Leave readings as they are."""
+    return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_))
+
+
+def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:
+    """Measure what white normal noise has none of, shape (3, n_draws).
+
+    Parameters
+    ----------
+    residuals
+        Whitened residuals, shape (n_points, n_draws).
+    steps
+        Rows back to the previous reading of the scan, 0 for none, shape (n_points,).
+    level
+        Predicted readings, shape (n_points,).
+
+    Returns
+    -------
+    Correlation of neighbours, excess kurtosis, and correlation of the squares with the level.
+    """
+    r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
+    neighbours = np.flatnonzero(steps == 1)
+    lag_1 = (r[neighbours] * r[neighbours - 1]).mean(axis=0) if neighbours.size else np.zeros(r.shape[1])
+    kurtosis = (r**4).mean(axis=0) - 3
+    tilt = level - level.mean()
+    tilt = tilt / max(float(np.linalg.norm(tilt)), 1e-300)
+    return np.stack([lag_1, kurtosis, tilt @ (r**2)])

@@ -1,0 +1,169 @@
+"""Effects on the noise, laid out as laws that a fit can be weighed under."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
+from probewise.effects import NoiseEffect, NoiseRows, lattice_step
+from probewise.recordings.plan import Recording
+from probewise.sensor.stages import NoiseLevel
+
+__all__ = ["LaidOut", "NoiseModel", "rough_sd"]
+
+_FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
+_MANY = 12  # nodes of one effect that beside another's would be too many
+_APART = 0.3  # of the logarithm, from one node of the noise beside rounding to the next
+_HALF_STEPS = np.exp(_APART * np.arange(-6, 10))  # of rounding, in sd of the noise beside it: 0.17 to 15
+_FINE = 0.01  # noise sd: how exactly a lost reading holds its value where nothing is rounded
+
+
+@dataclass(frozen=True, eq=False)
+class LaidOut:
+    """The laws of a noise model about a fit, one a node, with settings (n_nodes, n_params) and log prior weights."""
+
+    settings: FloatArray
+    laws: tuple[NoiseLaw, ...]
+    log_weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """A set of effects on the noise.
+
+    Parameters
+    ----------
+    effects
+        The effects; none for white noise.
+    recording
+        What was read.
+    likely
+        For some effects by name, the nodes (n_nodes, n_params) that matter, and the log of what each stands for.
+    rounding
+        Step of a lattice that all readings are on, where nothing else is wrong with the noise, or 0.
+    """
+
+    effects: tuple[NoiseEffect, ...]
+    recording: Recording
+    likely: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    rounding: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its effects; () for white noise."""
+        return tuple(effect.name for effect in self.effects)
+
+    def columns_of(self, name: str) -> slice:
+        """Columns of the settings that are one effect's."""
+        at = 0
+        for effect in self.effects:
+            n_params = len(effect.prior.names)
+            if effect.name == name:
+                return slice(at, at + n_params)
+            at += n_params
+        raise KeyError(name)
+
+    def every_third(self) -> dict[str, tuple[FloatArray, float]]:
+        """Thin out the nodes of each effect that has more than twelve to a third, for `likely`."""
+        out = {}
+        for effect in self.effects:
+            nodes = effect.bank()[:, 0, :]
+            if len(nodes) > _MANY and nodes.shape[1] == 1:
+                out[effect.name] = nodes[1::3], -math.log(len(nodes[1::3]))
+        return out
+
+    def laws(self, predicted: FloatArray) -> LaidOut:
+        """Lay out every combination of the effects' nodes about predictions of the usable rows, (n_usable,)."""
+        residuals = self._readings - predicted
+        # Rounded readings can all be as predicted; what rounding alone leaves is not far.
+        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._lattice / math.sqrt(12)) or 1.0
+        span = float(np.ptp(predicted)) or 1.0
+        seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
+        rows = NoiseRows(predicted, sd)
+        banks = [self._nodes(effect, residuals / sd, rows) for effect in self.effects]
+        settings, log_weight = np.zeros((1, 0)), 0.0
+        for bank, log_each in banks:
+            settings = np.concatenate(
+                [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
+            )
+            log_weight += log_each
+        level = self._level(settings, seen)
+        far = np.abs(residuals) > _FAR * sd
+        laws = tuple(self._law(level, k, far) for k in range(len(settings)))
+        if self.rounding:
+            laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for law in laws for x in _HALF_STEPS)
+            # Sigma is integrated out by these nodes, over its logarithm, as it is elsewhere in closed form.
+            settings, log_weight = np.repeat(settings, len(_HALF_STEPS), axis=0), math.log(_APART)
+        return LaidOut(settings, laws, np.full(len(laws), log_weight))
+
+    def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, float]:
+        """Give the nodes of one effect and the log prior weight of each."""
+        if effect.name in self.likely:
+            return self.likely[effect.name]
+        nodes = effect.nodes(residuals, rows)
+        return nodes, -math.log(max(len(nodes), 1))
+
+    def _level(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
+        """Apply the effects with all settings at once, to the usable rows."""
+        plan, usable = self.recording.plan, self.recording.usable
+        everywhere = np.zeros((1, len(plan)))
+        everywhere[0, usable] = seen
+        level = NoiseLevel(sd=np.ones((1, len(plan))), rho=np.zeros((1, 1)), seen=everywhere)
+        at = 0
+        for effect in self.effects:
+            n_params = len(effect.prior.names)
+            level = effect.apply(level, settings[:, at : at + n_params], plan)
+            at += n_params
+        return level
+
+    def _law(self, level: NoiseLevel, node: int, far: BoolArray) -> NoiseLaw:
+        def at(values: FloatArray) -> float:
+            return float(values[min(node, len(values) - 1), 0])
+
+        sd = level.sd[min(node, len(level.sd) - 1)]
+        sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
+        lost_share = at(level.lost_share)
+        value = at(level.lost_value)
+        lost = far & (np.abs(self._readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
+        carry = np.where(self._steps > 0, at(level.rho) ** np.maximum(self._steps, 1), 0.0)
+        carry[lost] = 0.0
+        carry[1:][lost[:-1]] = 0.0
+        log_extra = 0.0
+        if lost_share > 0:
+            n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._cell, 1.0)
+            # The value is one of the cells of the range; then each reading that is lost is in that cell.
+            log_extra = n_lost * math.log(lost_share / self._cell) - math.log(cells)
+            log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
+        return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra)
+
+    @cached_property
+    def _readings(self) -> FloatArray:
+        return self.recording.readings[self.recording.usable]
+
+    @cached_property
+    def _steps(self) -> IntArray:
+        return steps_within_scans(self.recording)
+
+    @cached_property
+    def _cell(self) -> float:
+        """Width of what a lost reading is known to, in reading units."""
+        return self._lattice or _FINE * rough_sd(self.recording) or 1e-12
+
+    @cached_property
+    def _lattice(self) -> float:
+        """Step of a lattice that all readings are on, 0 where there is none."""
+        return lattice_step(self._readings)
+
+
+def rough_sd(recording: Recording) -> float:
+    """Estimate the noise sd without a model, from second differences within scans, of which few are at an edge."""
+    readings, steps = recording.readings[recording.usable], steps_within_scans(recording)
+    inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1
+    bends = readings[inner - 1] - 2 * readings[inner] + readings[inner + 1]
+    return float(np.median(np.abs(bends))) / (0.6745 * math.sqrt(6)) if inner.size else 0.0

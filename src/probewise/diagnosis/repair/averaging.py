@@ -1,0 +1,121 @@
+"""Average models by their probability: samples of several SSF orders, or of several hypotheses, in one model.
+
+What these readings leave open a prediction must leave open too: where readings are unlike those that a repair comes
+from, the likeliest explanation alone would be sure and, at times, wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.repair.repaired import ModelSamples
+from probewise.effects import NamedEffect
+from probewise.recordings.plan import Plan
+from probewise.sensor import ACCURATE_NODES
+
+__all__ = ["over_hypotheses", "over_orders", "side_by_side"]
+
+
+def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
+    """Mix samples of one hypothesis at several SSF orders by their probability.
+
+    All are written at the largest order: a Gaussian in two equal halves is the same Gaussian.
+
+    Parameters
+    ----------
+    parts
+        Samples of each order, as many of each.
+    weights
+        Probability of each order, (n_parts,).
+    rng
+        Source of randomness.
+    """
+    largest = max(parts, key=lambda part: part.n_gaussians)
+    n = len(largest.theta)
+    counts = rng.multinomial(n, weights)
+    order = rng.permutation(n)
+    theta = [
+        _halved(part.theta[:count], part.n_gaussians, largest.n_gaussians)
+        for part, count in zip(parts, counts, strict=True)
+    ]
+    noise_sd = [part.noise_sd[:count] for part, count in zip(parts, counts, strict=True)]
+    return replace(largest, theta=np.concatenate(theta)[order], noise_sd=np.concatenate(noise_sd)[order])
+
+
+def side_by_side(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
+    """Tell whether hypotheses of these effects fit into one model.
+
+    What both hold must be bound to the same scans, and what one lacks must have a setting at which it does nothing.
+    """
+    known = {effect.name: effect for effect in first}
+    shared = {effect.name for effect in second if effect.name in known}
+    alike = all(known[effect.name] == effect for effect in second if effect.name in shared)
+    return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
+
+
+def over_hypotheses(
+    parts: Sequence[ModelSamples], shares: FloatArray, null: Null, plan: Plan, *, rng: np.random.Generator
+) -> ModelSamples:
+    """Mix samples of several hypotheses by their probability: where one lacks an effect, the effect does nothing.
+
+    Parameters
+    ----------
+    parts
+        Samples of each hypothesis, as many of each; their effects fit `side_by_side`, their noise is of one kind.
+    shares
+        Probability of each, (n_parts,).
+    null
+        The model without effects, that of the part with the most Gaussians.
+    plan
+        What was read.
+    rng
+        Source of randomness.
+    """
+    largest = max(parts, key=lambda part: part.n_gaussians)
+    effects = {e.name: e for part in parts for e in cast(Sequence[NamedEffect[Any]], part.chain.effects)}
+    chain = null.chain(plan, tuple(effects.values()), n_nodes=ACCURATE_NODES)
+    n = len(largest.theta)
+    counts = rng.multinomial(n, shares / shares.sum())
+    theta, noise_sd = [], []
+    for part, count in zip(parts, counts, strict=True):
+        rows = rng.permutation(n)[:count]
+        head = len(part.chain.names) - sum(part.columns(name).shape[1] for name in effects)
+        columns = [_halved(part.theta[rows, :head], part.n_gaussians, largest.n_gaussians)]
+        for effect in cast(Sequence[NamedEffect[Any]], chain.effects):
+            if effect.name in part.effects:
+                columns.append(part.columns(effect.name)[rows])
+                continue
+            holder = next(other for other in parts if effect.name in other.effects)
+            absent = holder.columns(effect.name)[rows]
+            for k, value in (effect.nothing or {}).items():
+                absent[:, k] = value
+            columns.append(absent)
+        theta.append(np.concatenate(columns, axis=1))
+        noise_sd.append(part.noise_sd[rows])
+    order = rng.permutation(n)
+    return replace(
+        largest,
+        chain=chain,
+        theta=np.concatenate(theta)[order],
+        noise_sd=np.concatenate(noise_sd)[order],
+        effects=tuple(effect.name for effect in chain.effects),
+    )
+
+
+def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
+    """Write each sample's mixture with more Gaussians, by halving the heaviest."""
+    blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
+    rows = np.arange(len(theta))
+    for _ in range(wanted - n_gaussians):
+        mass = blocks[..., 0] / np.sqrt(blocks[..., 3] * blocks[..., 4] - blocks[..., 5] ** 2)
+        half = blocks[rows, np.argmax(mass, axis=1)].copy()
+        half[:, 0] /= 2
+        blocks = np.concatenate([blocks, half[:, None, :]], axis=1)
+        blocks[rows, np.argmax(mass, axis=1), 0] /= 2
+    return np.concatenate([blocks.reshape(len(theta), 6 * wanted), theta[:, 6 * n_gaussians :]], axis=1)

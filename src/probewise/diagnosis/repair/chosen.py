@@ -1,0 +1,58 @@
+"""The model with effects that somebody has chosen, whatever else might explain the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
+from probewise.diagnosis.search.search import search
+from probewise.effects import EFFECTS, Extent, NamedEffect
+from probewise.errors import ParameterError
+from probewise.inference import sd_floor
+from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
+
+__all__ = ["model_with"]
+
+
+def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
+    """Fit the sensor with these effects and no others, at the SSF order of the most evidence.
+
+    Parameters
+    ----------
+    recording
+        What was read.
+    names
+        Effects of the vocabulary; none for the calibrated sensor alone.
+    rng
+        Source of randomness, for the posterior samples.
+
+    Returns
+    -------
+    ModelSamples
+        Without an effect on the mean that these readings do not feel.
+
+    Raises
+    ------
+    ParameterError
+        If a name is not of the vocabulary, or its effect cannot show in this recording.
+    """
+    extent = Extent.of(recording)
+    effects: dict[str, NamedEffect[Any]] = {}
+    for name in names:
+        effect = EFFECTS[name].for_extent(extent) if name in EFFECTS else None
+        if effect is None:
+            raise ParameterError("names", name, "effects of the vocabulary that can show in this recording")
+        effects[name] = effect
+    found = search(recording, effects, sensor=None, sd_floor=sd_floor(recording), depth=max(len(names), 1))
+    on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
+    on_noise = tuple(sorted(set(names) - set(on_mean)))
+    noise = on_noise if on_noise in found.noise_models else found.certain
+    best = found.best(on_mean, noise) or found.best((), noise)
+    assert best is not None  # the calibrated sensor is always weighed
+    if not np.isfinite(best.evidence[noise].log_z):
+        raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that show in this recording")
+    return sample_model(best.found, best.evidence[noise], recording, weights=best.weights, rng=rng)

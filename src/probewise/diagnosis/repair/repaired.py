@@ -1,0 +1,221 @@
+"""The model that a diagnosis ends with: a chain with its effects, as posterior samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
+from probewise.calibration.noise import noise_by_scan
+from probewise.calibration.sensor_file import FittedSensor
+from probewise.diagnosis.evidence.joint import JointProblem
+from probewise.diagnosis.evidence.laplace import NoiseEvidence
+from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.null import Predictor
+from probewise.diagnosis.repair.annealing import Density, anneal, by_weight
+from probewise.diagnosis.repair.quadratic import Quadratic
+from probewise.diagnosis.repair.surrogate import Surrogate
+from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
+from probewise.inference import sd_ceiling, sd_floor
+from probewise.recordings import fingerprint
+from probewise.recordings.plan import Recording
+from probewise.sensor import ACCURATE_NODES
+
+__all__ = ["ModelSamples", "sample_model"]
+
+N_SAMPLES = 500
+N_WALKERS = 250
+_MOVES = 6  # of samples of the posterior after a step
+# What stands in for it costs next to nothing.
+_N_NEAR = 2000
+_MOVES_NEAR = 20
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSamples:
+    """Equally weighted posterior samples of a chain with effects.
+
+    `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
+    `effects` names all effects, those on the noise too, in the order of their columns; `nuisance` the
+    parameters that belong to this recording alone; `exchangeable` Gaussians are told by their mass.
+    """
+
+    chain: Predictor
+    theta: FloatArray
+    noise_sd: FloatArray
+    effects: tuple[str, ...]
+    n_gaussians: int
+    nuisance: tuple[str, ...] = ()
+    exchangeable: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", frozen(self.theta))
+        object.__setattr__(self, "noise_sd", frozen(self.noise_sd))
+
+    def columns(self, effect: str) -> FloatArray:
+        """Select samples of one effect's parameters, (n_samples, n_params of the effect)."""
+        at = [i for i, name in enumerate(self.chain.names) if name.startswith(f"{effect}.")]
+        return self.theta[:, at]
+
+    def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
+        """Make the sensor of it that predicts, drives the robot, and is written to sensor.json."""
+        kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
+        from_chain = by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
+        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_step_mm(recording))
+        field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
+        usable = recording.usable
+        residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
+        scan_noise = noise_by_scan(
+            residuals,
+            recording.plan.scan[usable],
+            recording.plan.scan_names,
+            sd_floor=sd_floor(recording),
+            sd_ceiling=sd_ceiling(recording),
+            rng=rng,
+        )
+        return FittedSensor(
+            names=tuple(self.chain.names[i] for i in kept),
+            samples=from_chain[:, kept],
+            n_gaussians=self.n_gaussians,
+            noise_sd=self.noise_sd,
+            field=field,
+            instrumentation=recording.plan.instrumentation,
+            effects=self.effects,
+            patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
+            scan_noise=scan_noise,
+            fingerprint=fingerprint(recording),
+            source=PurePath(recording.source).name,
+        )
+
+
+def sample_model(
+    found: Fit,
+    noise: NoiseEvidence,
+    recording: Recording,
+    *,
+    weights: Mapping[str, FloatArray],
+    rng: np.random.Generator,
+    annealed: bool = True,
+) -> ModelSamples:
+    """Draw from the posterior about a fit, under the noise model it was weighed with.
+
+    From its Laplace approximation, and on from there by way of the model to second order: where the SSF has several
+    Gaussians the posterior is bent, and what the approximation alone draws predicts new angles worse by
+    tens of nats.
+
+    Parameters
+    ----------
+    found, noise
+        The fit and its evidence under a noise model; the model's nodes are drawn by their weight.
+    recording
+        What was fitted.
+    weights
+        For each effect, the probability of each of its variants.
+    rng
+        Source of randomness.
+    annealed
+        Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
+    """
+    law, floor, n_samples = noise.law, sd_floor(recording), N_SAMPLES
+    z = np.clip(_posterior_draws(found, noise, recording, floor, annealed, rng=rng), -FARTHEST, FARTHEST)
+    # What is not annealed is drawn for the effects' sake alone: the noise is then that of the fit.
+    predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
+    residuals = recording.readings[recording.usable] - predicted
+    sigma = law.scale(law(residuals.T), floor=floor)
+    noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
+    noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
+    on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
+    effects = (*found.model.effects, *on_noise)
+    null = found.model.sensor
+    chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
+    own = {
+        effect.name: effect.spread(
+            effect_values(effect, z[:, found.model.columns_of(effect.name)]), weights[effect.name], rng=rng
+        )
+        for effect in found.model.effects
+    }
+    theta = found.model.theta_of(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
+    nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
+    theta = np.concatenate([theta, *(_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
+    names = tuple(effect.name for effect in chain.effects)
+    of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
+    for i in of_lattice:
+        sd = lattice_step_sd(recording.readings[recording.usable], float(theta[0, i]))
+        theta[:, i] += sd * rng.standard_normal(n_samples)
+    rounding = theta[:, of_lattice].sum(axis=1)
+    if law.flat:  # the noise beside rounding, as each node of its law has it
+        noise_sd = np.array([own.sigma for own in noise.laid_out.laws])[nodes]
+    else:
+        noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
+    return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)
+
+
+def _posterior_draws(
+    found: Fit, noise: NoiseEvidence, recording: Recording, floor: float, annealed: bool, *, rng: np.random.Generator
+) -> FloatArray:
+    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then carried to the posterior."""
+    law, model = noise.law, found.model
+    whitened, turned = law(found.residuals)[:, None], law(found.slopes)
+    sigma = law.scale(whitened)
+    sd = max(float(sigma[0]) / math.sqrt(law.information), 1e-150)
+    curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
+    # A step in a coordinate moves those behind it too, none before it. With the effects' first and the sensor's last,
+    # most steps leave the SSF's geometry alone, which a prediction of many at once makes use of.
+    order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
+    at, steps = np.ix_(order, order), np.empty_like(curvature)
+    steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
+    normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
+    center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
+    center = np.clip(center, -FARTHEST, FARTHEST)
+    draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
+    if not annealed:
+        return np.asarray(center + draws @ steps)
+    problem, usable = JointProblem(model, recording, noise.at_best, floor), recording.usable
+    quadratic = Quadratic.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
+    near = Surrogate.of(quadratic, center, steps, recording.readings[usable], law, floor)
+
+    def of_laplace(e: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * np.sum(e**2, axis=1))
+
+    def of_posterior(e: FloatArray) -> FloatArray:
+        z = center + e @ steps
+        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
+        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
+
+    def carried(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
+        weighed = by_weight(first, log_q, log_p, n_wanted=n, rng=rng)
+        if weighed is not None:
+            return weighed
+        return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng)
+
+    e = carried(draws, of_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
+    return center + carried(e, near.log_density, of_posterior, _MOVES, N_SAMPLES) @ steps
+
+
+def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:
+    """Take out of a residual's sd what rounding to a step adds; what is left is known no better than the whole is."""
+    return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
+
+
+def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:
+    """Draw one effect's parameters about the nodes drawn, as far as half way to the next: (n_samples, n_params)."""
+    settings = noise.laid_out.settings[:, noise.noise.columns_of(effect.name)]
+    values, units = settings[nodes], effect.prior.to_unit_cube(settings)
+    gaps = np.array([np.diff(np.unique(np.round(column, 9))).min(initial=1.0) for column in units.T])
+    spread = np.array([len(np.unique(column)) > 1 for column in settings.T])
+    moved = np.clip(units[nodes] + (rng.random(values.shape) - 0.5) * gaps, 0.0, 1.0)
+    return np.where(spread, effect.prior.from_unit_cube(moved), values)
+
+
+def _step_mm(recording: Recording) -> float:
+    plan = recording.plan
+    moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
+    moves = moves[moves > 0]
+    return float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)

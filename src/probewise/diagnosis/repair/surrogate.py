@@ -1,0 +1,58 @@
+"""What stands in for a posterior about a point: predictions to second order under the law of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.joint import log_likelihood_of_whitened
+from probewise.diagnosis.fitting.coordinates import FARTHEST
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.repair.quadratic import Quadratic
+
+__all__ = ["Surrogate"]
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """The log density of coordinates z = center + e @ steps, by e, (n_samples, n_params).
+
+    The noise is normal: of a law with a tail residuals are those of normal noise that say as much. `residual`
+    (n_changes + 1,) and `changes` (n_changes + 1, n_changes) are whitened, in the axes of the space that they span,
+    where a sum of squares has few terms.
+    """
+
+    quadratic: Quadratic
+    center: FloatArray
+    steps: FloatArray
+    law: NoiseLaw
+    sd_floor: float
+    residual: FloatArray
+    changes: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        quadratic: Quadratic,
+        center: FloatArray,
+        steps: FloatArray,
+        readings: FloatArray,
+        law: NoiseLaw,
+        sd_floor: float,
+    ) -> Self:
+        """Set predictions against readings, (n_points,)."""
+        residual = law(readings - quadratic.center)[:, None]
+        residual = law.as_normal(residual, np.maximum(law.scale(residual, floor=sd_floor), 1e-150))
+        _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
+        normal = law.plain()
+        return cls(quadratic, center, steps, normal, sd_floor, turned[:, -1], turned[:, :-1])
+
+    def log_density(self, e: FloatArray) -> FloatArray:
+        """Prior and likelihood but for a constant, (n_samples,); minus infinity outside the prior's bounds."""
+        z = self.center + e @ self.steps
+        whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts(e).T
+        height = log_likelihood_of_whitened(self.law, whitened, self.sd_floor) - 0.5 * np.sum(z**2, axis=1)
+        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)

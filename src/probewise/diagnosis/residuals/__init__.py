@@ -1,0 +1,1 @@
+"""What residuals say by themselves: whether something is missing, where, and what no name stands for."""

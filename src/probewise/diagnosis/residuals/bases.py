@@ -1,0 +1,213 @@
+"""What a mismatch that nobody has named may look like: bases over every covariate, by which it is found all the same.
+
+A mismatch that depends on a covariate smoothly adds to the readings, multiplies the signal, or moves the sensor:
+smooth functions of the covariate alone, times the signal, and times the slope of the readings along the move.
+Others jump (change points), last for a while (windows), belong to a scan or an angle, or to what the sensor
+saw before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.laplace import Blocks, Linearised
+from probewise.diagnosis.residuals.covariates import Covariate
+
+__all__ = ["unknown_templates", "unlike_named"]
+
+_LIKE = 0.9  # cosine from which what has no name is what has one
+_MOST_GROUPS = 24
+_FEW_SCANS = 6
+_MEMORIES = (3.0, 10.0, 30.0)  # readings
+
+
+@dataclass(frozen=True, eq=False)
+class _Ways:
+    """How a mismatch may act, each (n_points,): it adds, multiplies the signal, or moves the sensor along its axis."""
+
+    adds: FloatArray
+    gain: FloatArray
+    shift: FloatArray
+    turned: FloatArray  # sign of the move
+    n_scans: int
+
+
+def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, starts: IntArray) -> Bank:
+    """Lay out the bases.
+
+    Parameters
+    ----------
+    covariates
+        Those of the recording.
+    signal, slope
+        Predicted reading above its least, and its slope along the move, (n_usable,).
+    starts
+        First row of each scan among the usable ones.
+
+    Returns
+    -------
+    The bases, labelled by their family: families count alike, however many bases they hold.
+    """
+    sign = np.zeros(len(signal))
+    for covariate in covariates:
+        if covariate.name == "direction":
+            sign[covariate.rows] = covariate.values
+    along_axis = slope * np.where(sign == 0, 1.0, sign)
+    ways = _Ways(np.ones(len(signal)), signal, along_axis, sign, len(starts))
+    found = [(_family(covariate, template), template) for covariate in covariates for template in _of(covariate, ways)]
+    found += [("what was seen before", template) for template in _memories(signal, starts)]
+    found += [("ends of scans", template) for template in _ends(len(signal), starts)]
+    kept = [(name, template) for name, template in found if np.any(template)]
+    return Bank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
+
+
+def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
+    """Leave out single bases of which what survives looks like that of a named effect, cosine 0.9 and more.
+
+    A window that reaches to the end of the recording is a light that was switched on: what has a name
+    must not be found without it.
+    """
+    single = np.flatnonzero(bases.widths == 1)
+    if single.size == 0 or named.widths.size == 0:
+        return bases
+    alone = bases.take(single).columns
+    own = Blocks.of(problem, list(alone.T[:, :, None]), [""] * len(single)).u
+    blocks = Blocks.of(problem, [named[k] for k in range(len(named.widths))], named.labels)
+    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
+    like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
+    return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))
+
+
+def _family(covariate: Covariate, template: FloatArray) -> str:
+    """Set what is smooth apart from the many that are local, lest those outnumber it."""
+    where = covariate.name if covariate.scan is None else f"{covariate.name} within scans"
+    return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
+
+
+def _of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
+    if covariate.groups:
+        yield from _of_groups(covariate, ways)
+    elif covariate.scan is not None:
+        yield _smooth(covariate, ways.adds, 6)
+        yield _smooth(covariate, ways.shift, 3)
+        yield from _windows(covariate, ways.adds, (4, 8, 16) if ways.n_scans <= _FEW_SCANS else (8,))
+    elif covariate.name == "place":
+        for terms in (3, 8, 20):
+            yield _smooth(covariate, ways.adds, terms)
+            yield _smooth(covariate, ways.shift, terms)
+        yield _smooth(covariate, ways.gain, 3)
+        yield _smooth(covariate, ways.gain, 8)
+        yield _smooth(covariate, ways.turned, 3)
+        yield _smooth(covariate, ways.turned * ways.shift, 3)
+        yield from _steps(covariate, ways.shift)
+        yield from _windows(covariate, ways.adds, (4, 8, 16))
+    elif covariate.name == "time":
+        for terms in (3, 8, 24, 64):
+            yield _smooth(covariate, ways.adds, terms)
+        for way in (ways.gain, ways.shift):
+            yield _smooth(covariate, way, 3)
+            yield _smooth(covariate, way, 8)
+            yield from _steps(covariate, way)
+        yield from _steps(covariate, ways.adds)
+        yield from _windows(covariate, ways.adds, (4, 8, 16))
+    elif covariate.name in ("level", "edge_distance"):
+        for terms in (3, 8, 20):
+            yield _smooth(covariate, ways.adds, terms)
+        side = np.where(ways.gain > 0.5 * ways.gain.max(), 1.0, -1.0)
+        yield _smooth(covariate, side * ways.adds, 8)
+        yield _smooth(covariate, ways.turned, 3)
+        yield from _windows(covariate, ways.adds, (4, 8, 16))
+    elif covariate.name == "slope":
+        yield _smooth(covariate, ways.adds, 3)
+        yield _spread(covariate.values[:, None], covariate, len(ways.adds))
+        yield _spread(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
+    else:  # a column of the recording's own
+        for way in (ways.adds, ways.gain):
+            yield _smooth(covariate, way, 3)
+            yield _smooth(covariate, way, 8)
+
+
+def _of_groups(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
+    codes = np.unique(covariate.values, return_inverse=True)[1]
+    if codes.max() >= _MOST_GROUPS:
+        return
+    member = _spread((codes[:, None] == np.arange(codes.max() + 1)).astype(np.float64), covariate, len(ways.adds))
+    for way in (ways.adds, ways.gain, ways.shift):
+        yield member * way[:, None]
+    for way in (ways.adds, ways.shift):
+        yield from (column[:, None] * way[:, None] for column in member.T)
+
+
+def _memories(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
+    """Remember what the sensor saw before in the scan: means that forget, over several times, and the most so far."""
+    held = np.empty((len(signal), len(_MEMORIES) + 1))
+    keep = np.exp(-1 / np.array(_MEMORIES))
+    first = np.zeros(len(signal), dtype=np.bool_)
+    first[starts] = True
+    state, most = np.zeros(len(_MEMORIES)), 0.0
+    for k, value in enumerate(signal):
+        if first[k]:
+            state[:], most = value, value
+        state = keep * state + (1 - keep) * value
+        most = max(most, value)
+        held[k, :-1], held[k, -1] = state, most
+    yield held
+    yield held[:, -1:]
+
+
+def _ends(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
+    """Die away from where a scan begins, or grow to where it ends: in all scans alike, and in each by itself."""
+    first = np.repeat(starts, np.diff(starts, append=n_points))
+    last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
+    rows = np.arange(n_points)
+    each = (first[:, None] == starts).astype(np.float64)
+    for length in (2.0, 8.0):
+        begin, end = np.exp(-(rows - first) / length), np.exp(-(last - rows) / length)
+        yield np.stack([begin, end], axis=1)
+        if len(starts) <= _MOST_GROUPS:
+            yield np.concatenate([each * begin[:, None], each * end[:, None]], axis=1)
+
+
+def _smooth(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
+    """Cosines of the covariate, finest where the way acts most: along the running share of its square."""
+    values, weight = covariate.values, way[covariate.rows] ** 2
+    distinct, codes = np.unique(values, return_inverse=True)
+    share = np.cumsum(np.bincount(codes, weight + 1e-3 * weight.mean()))
+    if share[-1] == 0:
+        return np.zeros((len(way), n_terms))
+    along = (share / share[-1] - 0.5 * np.diff(share, prepend=0.0) / share[-1])[codes]
+    if covariate.name == "level":  # most readings are at its ends; what bends is between them
+        along = 0.5 * along + 0.5 * (values - distinct[0]) / np.ptp(distinct)
+    waves = np.cos(np.pi * along[:, None] * np.arange(0 if np.ptp(way) else 1, n_terms + 1))
+    return _spread(waves * way[covariate.rows, None], covariate, len(way))
+
+
+def _steps(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator[FloatArray]:
+    """Change points, at even shares of what the way does."""
+    values, weight = covariate.values, way[covariate.rows] ** 2
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(weight[order])
+    for k in range(1, n_steps + 1):
+        at = values[order][min(int(np.searchsorted(share, share[-1] * k / (n_steps + 1))), len(values) - 1)]
+        yield _spread(((values > at) * way[covariate.rows])[:, None], covariate, len(way))
+
+
+def _windows(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -> Iterator[FloatArray]:
+    order, n = np.argsort(covariate.values, kind="stable"), len(covariate.values)
+    for n_parts in parts:
+        width = max(n // n_parts, 2)
+        for first in range(0, n - width + 1, max(width // 2, 1)):
+            window = np.zeros(n)
+            window[order[first : first + width]] = 1.0
+            yield _spread((window * way[covariate.rows])[:, None], covariate, len(way))
+
+
+def _spread(columns: FloatArray, covariate: Covariate, n_points: int) -> FloatArray:
+    out = np.zeros((n_points, columns.shape[1]))
+    out[covariate.rows] = columns
+    return out

@@ -1,0 +1,70 @@
+"""What is finer in an SSF than any form that is fitted to it.
+
+A ring, a ridge's shadow or a sharp rim is no mixture of Gaussians and no free form either: of a noise-free recording
+one to three noise sds are left, a little more than nothing, and it is no physics. Small shares of narrow Gaussians,
+spread over the footprint, take that up to first order. They are no part of any fit: the test that nothing is missing
+asks whether its alarm outlasts them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.calibration import mixture_moments
+from probewise.diagnosis.fitting.coordinates import CalibratedSensor, known_scene
+from probewise.diagnosis.fitting.fit import Model
+from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+
+__all__ = ["fine_structure"]
+
+# In sds of the SSF, in its own metric.
+_REACH = 2.4
+_APART = 0.6
+_WIDTH = 0.35
+_SHARE = 0.03  # prior sd of each, of the mass
+
+
+def fine_structure(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
+    """Differentiate readings by fine structure about an SSF, in coordinates of standard normal prior, all 0 there.
+
+    Parameters
+    ----------
+    model
+        A sensor that is calibrated from the recording, no effects in its model.
+    z
+        Its coordinates, (n_params,).
+    usable
+        Rows of the plan to look at.
+
+    Returns
+    -------
+    Slopes, (n_usable, n_places), in reading units; nothing where the model has no SSF of its own.
+    """
+    sensor = model.sensor
+    if not isinstance(sensor, CalibratedSensor):
+        return np.zeros((len(usable), 0))
+    theta = sensor.theta(z[None, :])
+    of_all = {name: float(values[0]) for name, values in mixture_moments(theta, sensor.n_gaussians).items()}
+    sd_u, sd_v = (np.exp(of_all[f"log width along {axis}"]) for axis in ("x'", "y'"))
+    cov = of_all["correlation of x' and y'"] * sd_u * sd_v
+    covariance = np.array([[sd_u**2, cov], [cov, sd_v**2]])
+    center = np.array([of_all["centre x'"], of_all["centre y'"]])
+    places = center + _PLACES @ np.linalg.cholesky(covariance).T
+    (aa, cc), (_, bb) = np.linalg.inv(_WIDTH**2 * covariance) / 2
+    levels = theta[0, 6 * sensor.n_gaussians :]
+    narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
+    chain = Chain(FreeMixture(1), FreeLevels(), known_scene(model.plan), (), n_nodes=FAST_NODES)
+    whole = model.predict(z[None, :])[0]  # of which as much gives way
+    return np.asarray(_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
+
+
+def _hexagons() -> FloatArray:
+    """Lay places evenly over a disc, (n, 2)."""
+    steps = np.arange(-8, 9)
+    i, j = (a.ravel() for a in np.meshgrid(steps, steps))
+    places = _APART * np.stack([i + j / 2, j * np.sqrt(3) / 2], axis=-1)
+    return np.asarray(places[np.hypot(*places.T) <= _REACH])
+
+
+_PLACES = _hexagons()

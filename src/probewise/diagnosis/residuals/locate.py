@@ -1,0 +1,270 @@
+"""Is anything missing, and where? One global p-value, then windows over every covariate.
+
+The null law of every statistic comes from the same pivotal bootstrap, r* = P eps: residuals of a linearised
+fit to pure noise, no refits. Every look is counted, because each draw takes every look too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, frozen
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.effects import NamedEffect, sign_of_move
+from probewise.recordings.plan import Plan
+
+__all__ = ["Place", "global_p_value", "places", "places_of_effect", "windows"]
+
+_LEAST_ROWS = 3
+_FELT = 0.05  # share of its greatest strength
+_PLAIN = 0.25  # a share of the first draws from which more of them would change nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A window of a covariate where the residual stands out, with its witness curve.
+
+    `start`, `end` in the covariate's unit, None for a scan; the curve is the residual's mean in bins of
+    the covariate, with the noise sd of that mean.
+    """
+
+    covariate: str
+    scan: str | None
+    start: float | None
+    end: float | None
+    p_value: float
+    z: float
+    curve_at: FloatArray
+    curve_mean: FloatArray
+    curve_sd: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("curve_at", "curve_mean", "curve_sd"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def witness(self) -> str:
+        """Name of the figure file that shows it."""
+        where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
+        return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
+
+
+def global_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:
+    """Test that nothing is missing from the mean: the sum of all Bayes factors against its null law.
+
+    Parameters
+    ----------
+    problem
+        The fit under the noise model found.
+    banks
+        Every template looked at, labelled by what it belongs to; labels count alike.
+    draws
+        Residuals under the null, shape (n_rows, n_draws). Where the first few show that nothing stands
+        out, the others are left alone.
+
+    Returns
+    -------
+    Probability, under the null, of at least what was seen. Beyond the draws' reach the
+    bound P(Bayes factor > b) < 1/b takes over.
+    """
+    families = [(number, label) for number, bank in enumerate(banks) for label in bank.labels]
+    names = list(dict.fromkeys(families))
+    codes = np.array([names.index(family) for family in families])
+    log_weight = -np.log(np.bincount(codes)[codes]) - math.log(len(names))
+
+    def total(residuals: FloatArray) -> FloatArray:
+        scores = np.concatenate([bank.log_bayes_factors(problem, residuals) for bank in banks])
+        return np.asarray(logsumexp(scores + log_weight[:, None], axis=0))
+
+    seen = float(total(problem.residual[:, None])[0])
+    n_draws = draws.shape[1]
+    if seen > math.log(10 * n_draws):
+        return math.exp(-seen)
+    above = np.zeros(0)
+    for first, last in ((0, n_draws // 5), (n_draws // 5, n_draws)):
+        above = np.append(above, total(draws[:, first:last]) >= seen)
+        if above.mean() > _PLAIN:
+            break
+    return float((1 + above.sum()) / (1 + len(above)))
+
+
+def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
+    """List windows over the order statistics of a covariate, widths geometric, half overlapping.
+
+    Returns
+    -------
+    Indicator columns (n_points, n_windows) and each one's least and largest value.
+    """
+    values, rows = covariate.values, covariate.rows
+    columns: list[FloatArray] = []
+    ends: list[tuple[float, float]] = []
+
+    def add(members: FloatArray, low: float, high: float) -> None:
+        column = np.zeros(n_points)
+        column[rows[members.astype(np.int64)]] = 1.0
+        columns.append(column)
+        ends.append((low, high))
+
+    if covariate.groups:
+        for value in np.unique(values):
+            add(np.flatnonzero(values == value).astype(np.float64), float(value), float(value))
+        return np.stack(columns, axis=1), ends
+    order = np.argsort(values, kind="stable")
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]])
+    n = len(values)
+    width = n // 2
+    looked: set[tuple[int, int]] = set()
+    while width >= _LEAST_ROWS and len(columns) <= 160:
+        for first in sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width}):
+            # Equal values stay together: a window that parted them would select by something else.
+            low = int(edges[np.searchsorted(edges, first)])
+            high = int(edges[np.searchsorted(edges, first + width)])
+            if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
+                looked.add((low, high))
+                members = order[low:high]
+                add(members.astype(np.float64), float(values[members[0]]), float(values[members[-1]]))
+        width //= 2
+    if not columns:
+        return np.zeros((n_points, 0)), []
+    return np.stack(columns, axis=1), ends
+
+
+def places(
+    problem: Linearised,
+    covariates: Sequence[Covariate],
+    scan_names: Sequence[str],
+    residuals: FloatArray,
+    draws: FloatArray,
+    *,
+    largest_p: float = 0.05,
+) -> list[Place]:
+    """Find the window of each covariate that stands out most, strongest first.
+
+    Parameters
+    ----------
+    problem
+        The fit under the noise model found.
+    covariates
+        Where to look.
+    scan_names
+        Names of the scans, for the covariate `scan`.
+    residuals
+        Reading minus prediction, (n_points,), for the witness curves.
+    draws
+        Residuals under the null, (n_rows, n_draws).
+    largest_p
+        Windows less surprising than this are not reported.
+    """
+    out: list[Place] = []
+    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_points)
+    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_points) or 1.0
+    for covariate in covariates:
+        columns, ends = windows(covariate, problem.n_points)
+        if not ends:
+            continue
+        projected = problem.project(columns)
+        lengths = np.linalg.norm(projected, axis=0)
+        units = projected[:, lengths > 1e-6] / lengths[lengths > 1e-6]
+        kept = [e for e, length in zip(ends, lengths, strict=True) if length > 1e-6]
+        if not kept:
+            continue
+        scores = np.abs(units.T @ problem.residual) / own_norm
+        null = np.max(np.abs(units.T @ draws) / norms, axis=0)
+        best = int(np.argmax(scores))
+        p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
+        if p_value > largest_p:
+            continue
+        start: float | None
+        end: float | None
+        start, end = kept[best]
+        scan = covariate.scan
+        if covariate.name == "scan":
+            scan, start, end = scan_names[int(kept[best][0])], None, None
+        at, mean, sd = _curve(covariate, residuals, problem.sd)
+        out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), at, mean, sd))
+    return sorted(out, key=lambda place: (place.p_value, -place.z))
+
+
+def places_of_effect(
+    effect: NamedEffect[Any],
+    change: FloatArray,
+    predicted: FloatArray,
+    plan: Plan,
+    covariates: Sequence[Covariate],
+    residuals: FloatArray,
+    *,
+    p_value: float,
+    size: float,
+    sd: float,
+) -> list[Place]:
+    """Say where a named effect is: in the first of its covariates that varies here, where it has half its strength.
+
+    Parameters
+    ----------
+    effect
+        The effect; one that is bound to scans is in those.
+    change
+        What it makes of the readings, (n_points,).
+    predicted
+        The readings with it, (n_points,): a level is what would be read without it.
+    plan
+        Of the readings: a place is along the scans in which it is strongest.
+    covariates
+        Those of the recording.
+    residuals
+        Of the null, (n_points,), for the witness curve.
+    p_value, size
+        That nothing is missing, and lambda.
+    sd
+        Of the noise.
+    """
+    known = {c.name: c for c in covariates if c.scan is None}
+    sign = sign_of_move(plan)
+    if "direction" not in known and np.ptp(sign) > 0:  # to stand still is no direction, but tells what a move does
+        known["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
+    name = next((name for name in effect.covariates if name in known), None)
+    if name is None or not np.any(change):
+        return []
+    covariate = known[name]
+    if name == "level":
+        covariate = replace(covariate, values=(predicted - change)[covariate.rows])
+    if name == "place":
+        covariate = _along_the_strongest(change, plan) or covariate
+    curve = _curve(covariate, residuals, sd)
+    if name == "scan" or (effect.scans and "scan" in effect.covariates and "scan" in known):
+        curve = _curve(known["scan"], residuals, sd)
+        return [Place("scan", scan, None, None, p_value, size, *curve) for scan in effect.scans]
+    strength = np.abs(change[covariate.rows])
+    # What sets in at a level is there from where it is first felt.
+    felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
+    values = covariate.values[felt]
+    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve)]
+
+
+def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:
+    """Take the places along X or along Y, of readings that were come to that way: where a change is greater."""
+    along_x, along_y = (np.flatnonzero(plan.direction[:, k] != 0) for k in (0, 1))
+    strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
+    rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
+    return Covariate("place", values[rows], rows) if rows.size else None
+
+
+def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    values, mine = covariate.values, residuals[covariate.rows]
+    if covariate.groups:
+        parts = [np.flatnonzero(values == value) for value in np.unique(values)]
+    else:
+        parts = np.array_split(np.argsort(values, kind="stable"), min(30, max(len(values) // 4, 1)))
+    return (
+        np.array([values[p].mean() for p in parts]),
+        np.array([mine[p].mean() for p in parts]),
+        np.array([sd / math.sqrt(len(p)) for p in parts]),
+    )

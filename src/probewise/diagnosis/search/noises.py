@@ -1,0 +1,89 @@
+"""What may be wrong with a recording's noise: the noise models that compete, and how probable each is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
+from probewise.diagnosis.evidence.templates import subsets
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.noise.models import NoiseModel, rough_sd
+from probewise.diagnosis.search.odds import PriorOdds
+from probewise.effects import NoiseEffect, Quantisation, lattice_step
+from probewise.recordings.plan import Recording
+
+__all__ = ["Noises"]
+
+Names = tuple[str, ...]
+
+_HIDDEN = 0.5  # of a step: where noise by second differences is less, most neighbours read the same
+_WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
+
+
+@dataclass(eq=False)
+class Noises:
+    """The noise models of one recording: each fault alone, and pairs where one stands out.
+
+    `certain` are effects on the noise that the readings show without doubt, in every model of `models`.
+    """
+
+    recording: Recording
+    effects: Mapping[str, NoiseEffect]
+    prior: PriorOdds
+    sd_floor: float
+    certain: Names = field(init=False)
+    models: dict[Names, NoiseModel] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._step = lattice_step(self.recording.readings[self.recording.usable])
+        # That all readings are multiples of a coarse step is no chance.
+        seen = self._step > Quantisation.seen_above * rough_sd(self.recording)
+        self.certain = (Quantisation.name,) if Quantisation.name in self.effects and seen else ()
+        hidden = bool(self.certain) and rough_sd(self.recording) < _HIDDEN * self._step
+        # Beside a rounding that hides them, other faults of the noise would have to be rounded too; taken as they are
+        # they have densities above one over the step, which no rounded reading can have.
+        others = [] if hidden else [name for name in self.effects if name != Quantisation.name]
+        single = [tuple(sorted({*names, *self.certain})) for names in subsets(others, 1)]
+        self.models = {names: self._model(names) for names in single}
+
+    def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, float]] | None = None) -> NoiseModel:
+        # What is certain is not asked again about each fit, whose own residual may be larger.
+        known = {name: (np.array([[self._step]]), 0.0) for name in self.certain}
+        effects = tuple(self.effects[n] for n in names)
+        rounding = self._step if names and names == self.certain else 0.0
+        return NoiseModel(effects, self.recording, {**known, **(likely or {})}, rounding)
+
+    def log_prior(self, names: Names) -> float:
+        """Log prior of a noise model."""
+        return self.prior.log_noise(tuple(n for n in names if n not in self.certain))
+
+    def weigh(self, found: Fit) -> dict[Names, NoiseEvidence]:
+        """Weigh a fit under every model."""
+        return {names: weigh(found, model, sd_floor=self.sd_floor) for names, model in self.models.items()}
+
+    def best(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
+        """Give the evidence of the most probable model."""
+        return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
+
+    def pair_up(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
+        """Where one fault stands out about a fit, add the pairs that rival it; tell whether it was looked for."""
+        single = {names: e for names, e in evidence.items() if names != self.certain}
+        first = max(single, key=lambda names: single[names].log_z, default=self.certain)
+        if first == self.certain or single[first].log_z < evidence[self.certain].log_z + _WORTH_A_PAIR:
+            return False
+        (name,) = (n for n in first if n not in self.certain)
+        likely = {name: single[first].likely_nodes(name)}
+        best = max(e.log_z + self.log_prior(names) for names, e in evidence.items())
+        for other in single:
+            both = tuple(sorted({*first, *other}))
+            if other == first:
+                continue
+            model = self._model(both, likely | self.models[other].every_third())
+            value = weigh(found, model, sd_floor=self.sd_floor).log_z
+            if value + self.log_prior(both) > best - _WORTH_A_PAIR:
+                self.models[both] = model
+        return True

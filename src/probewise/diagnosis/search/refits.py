@@ -1,0 +1,154 @@
+"""Refit jointly and non-linearly, weigh by Laplace's approximation: a model, or a candidate with one more effect."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.convergence import require_finite
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.evidence.screening import log_mean, score_effects
+from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemory
+from probewise.diagnosis.evidence.visible import log_visible
+from probewise.diagnosis.fitting.fit import Fit, Model, fit
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.weighed import Candidate
+from probewise.effects import NamedEffect
+
+__all__ = ["Refits", "acts"]
+
+Names = tuple[str, ...]
+
+_WORTH_TRYING = 0.05  # of the leading variant's weight
+
+
+@dataclass(frozen=True, eq=False)
+class Refits:
+    """How a recording is fitted: with what is believed of its `sensor`, under which noises, about which templates."""
+
+    sensor: Null | None
+    noises: Noises
+    templates: TemplateMemory
+
+    def law_of(self, candidate: Candidate) -> NoiseLaw:
+        """Give the most probable law of the noise about a fit."""
+        return self.noises.best(candidate.evidence).law
+
+    def weighed(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> Candidate:
+        """Fit under a law of the noise, weigh under every noise model, refit where another one is more probable."""
+        found = self._fit(model, starts, law, max_steps)
+        for _ in range(2):
+            evidence = self.noises.weigh(found)
+            best = self.noises.best(evidence).law
+            if best.alike(law):
+                break
+            law = best
+            found = self._fit(model, found.z[None, :], law, max_steps)
+        else:
+            evidence = self.noises.weigh(found)
+        return Candidate.of(found, law, evidence, log_visible(found, law, self.templates.usable))
+
+    def extended(
+        self, parent: Candidate, effect: NamedEffect[Any], against: float = 0.0
+    ) -> tuple[Candidate, dict[Names, float]]:
+        """Refit with one more effect, in the likely ones of its variants.
+
+        Returns
+        -------
+        The best, as the share that it has of all variants, less the nats `against` it; and the closed-form scores of
+        the effect by the noise models that steer.
+        """
+        templates = self.templates.of(parent.found, effect)
+        own = Bank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
+
+        def scores_about(problem: Linearised) -> FloatArray:
+            return score_effects(problem, own)[effect.name]
+
+        by_noise = {
+            noise: log_mean(scores_about(Linearised.of(parent.found, evidence.law)))
+            for noise, evidence in parent.steering()
+        }
+        problem = Linearised.of(parent.found, self.law_of(parent))
+        scores = scores_about(problem)
+        weights = templates.weights(scores)
+        # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
+        plain = self._plainly(parent, problem)
+        likeliest = (int(np.argmax(templates.weights(scores_about(about)))) for about in plain)
+        tried = list(dict.fromkeys([*_worth_trying(templates, weights), *likeliest]))
+        refitted = [self._of_variant(parent, effect, templates, scores, k, [problem, *plain]) for k in tried]
+        # What refits have shown of variants counts for more than what screening promised.
+        log_z = np.array([candidate.log_z for candidate in refitted])
+        best = int(np.argmax(log_z))
+        weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
+        weights[tried] = np.exp(log_z - log_z[best])
+        weights /= weights.sum()
+        log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights)) - against
+        return refitted[best].as_share(log_share, {**parent.weights, effect.name: weights}), by_noise
+
+    def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
+        """Go a few steps from each start, then all the way from the best."""
+        recording, floor = self.noises.recording, self.noises.sd_floor
+        if len(starts) > 1:
+            tried = [fit(model, recording, start, law, sd_floor=floor, max_steps=5) for start in starts]
+            starts = min(tried, key=lambda f: f.objective).z[None, :]
+        return require_finite(fit(model, recording, starts[0], law, sd_floor=floor, max_steps=max_steps))
+
+    def _of_variant(
+        self,
+        parent: Candidate,
+        effect: NamedEffect[Any],
+        templates: EffectTemplates,
+        scores: FloatArray,
+        variant: int,
+        problems: Sequence[Linearised],
+    ) -> Candidate:
+        """Refit with one variant of one more effect, from the best entries of its bank."""
+        own = np.flatnonzero(templates.choice == variant)
+        model = parent.found.model.with_effect(templates.variants[variant])
+        ranked = own[np.argsort(-scores[own])]
+        starts = []
+        for about, at in itertools.product(problems, ranked[: 2 if scores[ranked[0]] > 5 else 1]):
+            columns = templates.columns[at]
+            amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
+            setting = effect.start(templates.settings[at], amount)
+            z = parent.found.z + about.absorbed(parent.found, columns @ amount)
+            starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
+        if self.sensor is not None and len(self.sensor.starts) > 1:
+            # A null with several basins: with the effect the best may be another one than without.
+            starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
+        return self.weighed(model, np.stack(starts), problems[0].law)
+
+    def _plainly(self, parent: Candidate, problem: Linearised) -> list[Linearised]:
+        """Lay a fit out under the plainest law of the noise, where that is another one."""
+        plain = parent.evidence[self.noises.certain].law
+        return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
+
+
+def acts(candidate: Candidate, parent: Candidate, sd_floor: float) -> bool:
+    """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
+    law = candidate.law
+
+    def misfit(found: Fit) -> float:
+        whitened = law(found.residuals)[:, None]
+        return float(law.misfit(whitened, law.scale(whitened, floor=sd_floor), floor=sd_floor)[0])
+
+    return 2 * (misfit(parent.found) - misfit(candidate.found)) > 3.0
+
+
+def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:
+    """Choose which of an effect's variants are refitted: the leader, and the next where they are bound to scans.
+
+    Two scans of opposite ways look the same to first order; which was turned by 30 degrees shows in a refit.
+    """
+    first, *others = np.argsort(-weights)[:2].tolist()
+    bound = templates.variants[first].scans or templates.variants[first].patterns
+    return [first, *(k for k in others if bound and weights[k] > _WORTH_TRYING * weights[first])]

@@ -1,0 +1,112 @@
+"""diagnosis.json: strict JSON with the keys that the command line promises, and the schema that holds it to them."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import Any
+
+from probewise.diagnosis.search.weighing import Weighing
+from probewise.diagnosis.statement.verdict import Diagnosis, ParameterFound
+
+__all__ = ["diagnosis_json", "diagnosis_schema"]
+
+NEXT_PLAN = "next_plan.csv"
+
+
+def diagnosis_schema() -> dict[str, Any]:
+    """Return the JSON schema of diagnosis.json, format "diagnosis/1"."""
+    text = files("probewise.diagnosis.statement").joinpath("diagnosis.schema.json").read_text(encoding="utf-8")
+    schema: dict[str, Any] = json.loads(text)
+    return schema
+
+
+def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Lay a diagnosis out as diagnosis.json: finite numbers, texts, lists; file names relative to it.
+
+    The witness figures (`where`) and the next plan are named here and written by the report and the
+    command line.
+    """
+    gain, plan = diagnosis.improvement, diagnosis.next_measurement
+    document = {
+        "format": "diagnosis/1",
+        "verdict": diagnosis.verdict,
+        "reason": diagnosis.reason,
+        "p_value": diagnosis.p_value,
+        "combination": list(diagnosis.combination),
+        "hypotheses": [{"effects": list(h.effects), "probability": h.probability} for h in diagnosis.hypotheses],
+        "effects": [
+            {
+                "name": e.name,
+                "probability": e.probability,
+                "size_lambda": e.size_lambda,
+                "sentence": e.sentence,
+                "parameters": [_parameter(p) for p in e.parameters],
+            }
+            for e in diagnosis.effects
+        ],
+        "unknown_probability": diagnosis.unknown_probability,
+        "clean_probability": diagnosis.clean_probability,
+        "unknown_candidates": [
+            {"name": name, "probability": probability} for name, probability in diagnosis.unknown_candidates
+        ],
+        "credible_set": list(diagnosis.credible),
+        "where": [
+            {
+                "covariate": place.covariate,
+                "scan": place.scan,
+                "from": place.start,
+                "to": place.end,
+                "p_value": place.p_value,
+                "witness": place.witness,
+            }
+            for place in diagnosis.where
+        ],
+        "improvement": {
+            "log_evidence": gain.log_evidence,
+            "heldout_log_density_per_reading": gain.heldout_log_density_per_reading,
+            "heldout_sd": gain.heldout_sd,
+            "rms_before": gain.rms_before,
+            "rms_after": gain.rms_after,
+            "p_value_after": gain.p_value_after,
+        },
+        "aliases": [
+            {"effects": list(a.effects), "cosine": a.cosine, "settle_by": a.settle_by, "readings": a.readings}
+            for a in diagnosis.aliases
+        ],
+        "noise": {
+            "model": diagnosis.noise.model,
+            "p_value": diagnosis.noise.p_value,
+            "parameters": [_parameter(p) for p in diagnosis.noise.parameters],
+        },
+        "next_measurement": None
+        if plan is None
+        else {
+            "plan": NEXT_PLAN,
+            "readings": len(plan.plan),
+            "minutes": plan.minutes,
+            "expected_log_bayes_factor": plan.expected_log_bayes_factor,
+        },
+    }
+    return document | ({"thorough": [_weighing(w) for w in diagnosis.weighings]} if diagnosis.weighings else {})
+
+
+def _weighing(twice: Weighing) -> dict[str, Any]:
+    return {
+        "effects": list(twice.effects),
+        "n_gaussians": twice.n_gaussians,
+        "log_evidence_laplace": twice.laplace,
+        "log_evidence_nested": twice.nested,
+        "error": twice.error,
+        "agree": twice.agree,
+    }
+
+
+def _parameter(found: ParameterFound) -> dict[str, Any]:
+    return {
+        "name": found.name,
+        "unit": found.unit,
+        "mean": found.mean,
+        "sd": found.sd,
+        "interval95": list(found.interval95),
+    }

@@ -1,0 +1,93 @@
+"""The verdict in one sentence."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+from probewise.diagnosis.advice.aliases import Alias
+from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.residuals.outlying import FAR_OUT
+from probewise.diagnosis.search.weighed import Search
+from probewise.diagnosis.statement.verdict import ALARM, EffectFound, Hypothesis, Verdict
+
+__all__ = ["reason_of"]
+
+Names = tuple[str, ...]
+
+
+def reason_of(
+    search: Search,
+    verdict: Verdict,
+    combination: Names,
+    hypotheses: tuple[Hypothesis, ...],
+    effects: tuple[EffectFound, ...],
+    p_value: float,
+    p_value_after: float,
+    fails: bool,
+    few: bool,
+    pairs: Sequence[Alias],
+    where: Sequence[Place],
+    noise: Names,
+    candidates: Sequence[str],
+    least_readings: int,
+) -> str:
+    """Say in one sentence what the verdict is and why.
+
+    Parameters
+    ----------
+    search
+        What was weighed.
+    verdict, combination, hypotheses, effects, p_value, where
+        As the diagnosis has them.
+    p_value_after
+        That nothing is missing from the repaired model.
+    fails
+        Whether what leads predicts readings kept back far worse than the plain sensor does.
+    few
+        Whether there are too few readings to say anything.
+    pairs
+        What cannot be told apart.
+    noise
+        The most probable noise model.
+    candidates
+        What is unknown may be this: sentences.
+    least_readings
+        Fewest readings that a verdict is given on.
+    """
+    n = int(search.recording.usable.sum())
+    if few and n >= least_readings:
+        return f"All {n} usable readings are equal: there is no signal to diagnose; scan across an edge."
+    if few:
+        return f"{n} usable readings are too few to tell; {least_readings} or more are needed."
+    by_name = {effect.name: effect for effect in effects}
+    if verdict == "clean":
+        order = max(search.order_probabilities, key=lambda k: search.order_probabilities[k])
+        form = search.sensors[order].form
+        ssf = f", {form}," if form else ""
+        return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
+    if verdict == "unknown":
+        if candidates:
+            like = "; ".join(candidates)
+            return f"Something is missing (p = {p_value:.2g}) that has no name; it is most like this: {like}."
+        family = max(search.unknown_shares, key=lambda k: search.unknown_shares[k], default="")
+        if family.endswith(FAR_OUT):
+            covariate = family.removesuffix(FAR_OUT).replace("_", " ")
+            return f"The readings that are far out lie together in {covariate}: something is missing there, not noise."
+        place = f" It shows most in {where[0].covariate}." if where else ""
+        found = search.beside(noise)
+        known = " and ".join(name.replace("_", " ") for name in found.names) if found else ""
+        beside = f", beside {known}" if known else ""
+        return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
+    if fails:
+        return (
+            f"Something is missing (p = {p_value:.2g}); {hypotheses[0].label} explains these readings best, and "
+            "predicts those kept back far worse than the sensor without it."
+        )
+    if verdict == "cannot_tell":
+        leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
+        cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
+        return f"These {n} readings are too few to decide between {leading}{cure}."
+    said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
+    more = f" Something more is missing: after the repair p = {p_value_after:.2g}." if p_value_after < ALARM else ""
+    return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g}).{more}"

@@ -1,0 +1,223 @@
+"""The Diagnosis value: what is missing, where, how sure, what it gains, what to measure next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from probewise._arrays import FloatArray, frozen
+from probewise._display import ShowsItself
+from probewise.diagnosis.advice.aliases import Alias
+from probewise.diagnosis.advice.next_scans import NextMeasurement
+from probewise.diagnosis.repair.repaired import ModelSamples
+from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.search.weighing import Weighing
+from probewise.recordings.plan import Recording
+
+__all__ = [
+    "ALARM",
+    "Diagnosis",
+    "EffectFound",
+    "Hypothesis",
+    "Improvement",
+    "NoiseFound",
+    "ParameterFound",
+    "Verdict",
+    "credible_set",
+    "decide",
+]
+
+ALARM = 0.01
+"""p-value below which something is missing."""
+
+_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
+
+Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of effects and its probability; () is clean, ("unknown",) what has no name."""
+
+    effects: tuple[str, ...]
+    probability: float
+
+    @property
+    def label(self) -> str:
+        """Its name in a credible set."""
+        return "+".join(self.effects) or "clean"
+
+
+@dataclass(frozen=True)
+class ParameterFound:
+    """One parameter: posterior mean, sd and central 95 % interval."""
+
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EffectFound:
+    """One effect: how probable, how large (lambda), what it does in words, its parameters, the scans it is bound to."""
+
+    name: str
+    probability: float
+    size_lambda: float
+    sentence: str
+    parameters: tuple[ParameterFound, ...]
+    scans: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """What the repaired model gains over the null."""
+
+    log_evidence: float
+    heldout_log_density_per_reading: float
+    heldout_sd: float
+    heldout_by_scan: tuple[tuple[str, float], ...]
+    rms_before: float
+    rms_after: float
+    p_value_after: float
+
+
+@dataclass(frozen=True)
+class NoiseFound:
+    """The noise model, a test of what it leaves, its parameters."""
+
+    model: str
+    p_value: float
+    parameters: tuple[ParameterFound, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis(ShowsItself):
+    """Hold everything of diagnosis.json, and the arrays that its figures show.
+
+    Attributes
+    ----------
+    recording
+        What was diagnosed, recordings joined.
+    verdict, reason
+        The verdict and one sentence.
+    p_value
+        That nothing is missing from the mean, under the noise model found.
+    combination
+        Most probable set of effects, sorted; () when clean, ("unknown",) when unknown.
+    hypotheses
+        All, most probable first; they sum to one.
+    effects, unknown_probability, clean_probability, credible
+        What each name, the unknown and clean amount to; the fewest hypotheses that hold 0.95.
+    where, improvement, aliases, noise, next_measurement
+        As in diagnosis.json.
+    null, repaired
+        The calibrated model and the repaired one, as posterior samples.
+    residuals_before, residuals_after, predicted_before, predicted_after
+        One a row, (n_points,); residuals are NaN where there is no usable reading.
+    order_probabilities
+        Probability of each number of Gaussians of a clean sensor's SSF.
+    unknown_shares
+        If something has no name, the probability that it depends on each covariate.
+    weighings
+        Hypotheses weighed twice, by Laplace and by nested sampling, where that was asked for.
+    """
+
+    recording: Recording
+    verdict: Verdict
+    reason: str
+    p_value: float
+    combination: tuple[str, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    effects: tuple[EffectFound, ...]
+    unknown_probability: float
+    clean_probability: float
+    credible: tuple[str, ...]
+    where: tuple[Place, ...]
+    improvement: Improvement
+    aliases: tuple[Alias, ...]
+    noise: NoiseFound
+    next_measurement: NextMeasurement | None
+    null: ModelSamples
+    repaired: ModelSamples
+    residuals_before: FloatArray
+    residuals_after: FloatArray
+    predicted_before: FloatArray
+    predicted_after: FloatArray
+    order_probabilities: Mapping[int, float]
+    unknown_shares: Mapping[str, float]
+    weighings: tuple[Weighing, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("residuals_before", "residuals_after", "predicted_before", "predicted_after"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
+        """What is outside the vocabulary, by the covariate in which it shows, with its share of the unknown."""
+        if self.unknown_probability < 1e-3:
+            return ()
+        shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
+        return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
+
+    def summary(self) -> str:
+        """Describe the diagnosis in plain text."""
+        lines = [f"{self.verdict}: {self.reason}", f"p = {self.p_value:.3g} that nothing is missing from the mean"]
+        lines += [f"  {h.probability:.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
+        lines += [f"{e.name} ({e.probability:.3f}): {e.sentence}" for e in self.effects if e.probability > 0.05]
+        gain = self.improvement
+        lines.append(
+            f"repaired: log evidence {gain.log_evidence:+.1f}, readings kept back "
+            f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats each, "
+            f"rms {gain.rms_before:.4g} -> {gain.rms_after:.4g}"
+        )
+        return "\n".join(lines)
+
+
+def credible_set(hypotheses: tuple[Hypothesis, ...], mass: float = 0.95) -> tuple[str, ...]:
+    """Name the fewest hypotheses that hold `mass`."""
+    out, held = [], 0.0
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        out.append(hypothesis.label)
+        held += hypothesis.probability
+        if held >= mass:
+            break
+    return tuple(out)
+
+
+def decide(
+    hypotheses: tuple[Hypothesis, ...],
+    noise_names: frozenset[str],
+    aliases: tuple[Alias, ...],
+    alike: Callable[[tuple[str, ...]], frozenset[tuple[str, ...]]],
+) -> tuple[Verdict, tuple[str, ...]]:
+    """Turn probabilities into a verdict and the combination it names.
+
+    A class of aliases is the combinations that differ only by swapping aliased effects; where it holds
+    half the probability and none of its members does, the answer is `cannot_tell`. The same where
+    clean leads without holding half, and where the readings cannot tell the leader from another that is
+    not out of the question (`alike`): what tells those apart is what was believed before, not what was read.
+    """
+    probability = {h.effects: h.probability for h in hypotheses}
+    if probability.get(("unknown",), 0.0) >= 0.5:
+        return "unknown", ("unknown",)
+    if probability.get((), 0.0) >= 0.5:
+        return "clean", ()
+    named = {effects: p for effects, p in probability.items() if effects not in ((), ("unknown",))}
+    if not named:
+        return "cannot_tell", ()
+    top = max(named, key=lambda effects: named[effects])
+    if named[top] >= 0.5:
+        if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in alike(top)):
+            return "cannot_tell", top
+        return ("noise" if set(top) <= noise_names else "named"), top
+    both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
+    of_class = {top} | {tuple(sorted({*top} - {name} | {other})) for name, other in both_ways if name in top}
+    if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
+        return "cannot_tell", top
+    if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
+        return "cannot_tell", ()
+    return ("noise" if set(top) <= noise_names else "named"), top

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from probewise import nested
 from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, weigh_thoroughly
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
@@ -75,19 +76,33 @@ def test_the_null_is_always_weighed_too(stepped):
     assert found.probabilities == stepped.probabilities
 
 
-def test_where_no_density_fits_a_second_run_joins(stepped, monkeypatch):
-    """Three times the live points: the error falls as their root."""
-    errors = []
-
-    def unsound(result, *_, **__):
-        errors.append(result.log_z_error)
-        return SimpleNamespace(sound=False)
-
-    monkeypatch.setattr(thorough.nested, "refine", unsound)
+def test_where_no_density_fits_the_runs_themselves_become_sharp(stepped, monkeypatch):
+    monkeypatch.setattr(thorough.nested, "refine", lambda *_, **__: SimpleNamespace(sound=False))
+    monkeypatch.setattr(thorough, "_SHARP", 0.1)
     _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
-    for weighing, alone in zip(weighings, errors, strict=True):
+    for weighing in weighings:
         assert weighing.agree
-        assert weighing.error < 0.85 * alone
+        assert not weighing.doubts
+        assert weighing.error < 0.15
+
+
+def test_a_prior_and_what_was_found_in_it_that_differ_are_a_doubt(stepped, monkeypatch):
+    """Tried again with four times the live points, then said."""
+    explored = []
+
+    def run(problem, **options):
+        result = nested.run(problem, **options)
+        if isinstance(problem, nested.Repartitioned):
+            return result
+        explored.append(options["n_live"])
+        return replace(result, log_z=result.log_z + 30.0)
+
+    monkeypatch.setattr(thorough, "nested", SimpleNamespace(**{**vars(nested), "run": run}))
+    found, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
+    assert explored == [50, 200] * len(weighings)
+    assert all("differ by" in doubt for w in weighings for doubt in w.doubts[-1:])
+    assert all(w.doubts for w in weighings)
+    assert found is stepped
 
 
 def moved(stepped, monkeypatch, gap, doubts=()):

@@ -6,12 +6,13 @@ the stop rule on consecutive values of log Z).
 """
 
 from probewise.nested.diversify import DiversifyTally, diversify
-from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.families import chain_memory
 from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
+from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, NestedResult
 from probewise.nested.sampler import run, step
 from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, StopRule
@@ -28,6 +29,8 @@ __all__ = [
     "Points",
     "PriorRejection",
     "RemainingEvidence",
+    "Repartitioned",
+    "Samplable",
     "SliceMove",
     "State",
     "StopRule",
@@ -41,6 +44,7 @@ __all__ = [
     "merge",
     "pareto_k",
     "refine",
+    "repartitioned",
     "run",
     "step",
     "update",

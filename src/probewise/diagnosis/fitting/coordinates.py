@@ -160,6 +160,14 @@ class SensorCoordinates(CalibratedSensor):
         """Invert `from_natural`."""
         return theta_to_natural(theta, self.n_gaussians)
 
+    def renamed(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
+        """Give coordinates, (n_samples, n_params), of the same SSF with its Gaussians named in another order."""
+        n, natural = self.n_gaussians, self.center + z @ self.factor.T
+        logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
+        blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
+        parts = [logits[:, 1:] - logits[:, :1], blocks.reshape(len(z), 5 * n), natural[:, -2:]]
+        return np.asarray(np.linalg.solve(self.factor, (np.concatenate(parts, axis=1) - self.center).T).T)
+
 
 @lru_cache(maxsize=32)
 def known_scene(plan: Plan) -> KnownScene:

@@ -8,25 +8,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from probewise import nested
+from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, weighed
 from probewise.diagnosis.search.weighing import Weighing
 
 __all__ = ["weigh_thoroughly"]
 
-N_LIVE = 200
+N_LIVE = 100
 
 _LEAST, _MOST = 2, 3  # hypotheses that are weighed again, the null apart
-_MORE = 2  # times as many live points where the posterior has no simple form
 _LEAST_PROBABILITY = 0.01
+_SHARP = 0.3  # nats: an error that leaves it open whether two evidences are a nat apart is too large
+_APART = 3.3  # standard errors: one in a thousand
+# Times as many live points: about what was found, until that is sharp; in the whole prior, where the two differ.
+_MORE_ABOUT = (1, 2, 4)
+_MORE_EXPLORING = (1, 4)
 
 Names = tuple[str, ...]
 Progress = Callable[[str, nested.State], None]
+Run = Callable[..., nested.NestedResult]
 
 
 def weigh_thoroughly(
@@ -46,8 +53,9 @@ def weigh_thoroughly(
     rng
         Source of randomness.
     n_live
-        Live points of each run. Where no density fits its samples (`probewise.nested.refine`), a second run of
-        twice as many joins it.
+        Live points. A run of the whole prior says where the posterior is, one from a prior near that
+        (`probewise.nested.repartitioned`) what the evidence is. There are more where that is not sharp yet, or the
+        two differ.
     progress
         Called after every round with the label of what is being weighed, and the state.
 
@@ -106,15 +114,48 @@ def _weigh(
     effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = JointProblem(candidate.found.model, search.recording, evidence, search.sd_floor)
-    show = None if progress is None else lambda state: progress(weighing.label, state)
-    result = nested.run(problem, rng=rng, n_live=n_live, progress=show, return_interrupted=False)
-    sharper = nested.refine(result, problem, rng=rng)
-    if sharper.sound:
-        return replace(weighing, nested=sharper.log_z + candidate.log_factor, error=sharper.log_z_error)
-    again = nested.run(problem, rng=rng, n_live=_MORE * n_live, progress=show, return_interrupted=False)
-    both = nested.merge([result, again], rng=rng)
-    log_z = both.log_z + candidate.log_factor
-    return replace(weighing, nested=log_z, error=both.log_z_error, doubts=tuple(both.warnings))
+    once = folded(problem, candidate.found.z)
+    run = partial(
+        nested.run,
+        rng=rng,
+        progress=None if progress is None else lambda state: progress(weighing.label, state),
+        return_interrupted=False,
+    )
+    for more in _MORE_EXPLORING:
+        explored = run(once, n_live=more * n_live)
+        about = _about(explored, once, run, n_live, rng)
+        apart = abs(explored.log_z - about.log_z) / math.hypot(explored.log_z_error, about.log_z_error)
+        if apart < _APART:
+            break
+    doubts = about.warnings
+    if apart >= _APART:
+        doubts = (*doubts, f"the prior as a whole and what was found in it differ by {apart:.1f} standard errors")
+    log_z = about.log_z + candidate.log_factor
+    return replace(weighing, nested=log_z, error=about.log_z_error, doubts=doubts)
+
+
+def _about(
+    found: nested.NestedResult, problem: nested.Samplable, run: Run, n_live: int, rng: np.random.Generator
+) -> _Evidence:
+    """Sharpen what a run of the whole prior has found by runs from priors near its posterior."""
+    for more in _MORE_ABOUT:
+        nearer = nested.repartitioned(problem, found, rng=rng)
+        found = run(nearer, n_live=more * n_live)
+        sharper = nested.refine(found, nearer, rng=rng)
+        if sharper.sound and sharper.log_z_error < found.log_z_error:
+            return _Evidence(sharper.log_z, sharper.log_z_error)
+        if found.log_z_error <= _SHARP:
+            break
+    return _Evidence(found.log_z, found.log_z_error, found.warnings)
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Log evidence, its standard error, and what speaks against it."""
+
+    log_z: float
+    log_z_error: float
+    warnings: tuple[str, ...] = ()
 
 
 def _moved(search: Search, gaps: dict[tuple[int, Names], float]) -> Search:

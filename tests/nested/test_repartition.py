@@ -1,0 +1,95 @@
+"""A second run from a prior near the posterior: the evidence is what quadrature has, and sharper."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from probewise import nested
+from probewise.errors import ParameterError
+from probewise.priors import Normal, Product, Uniform
+
+
+@dataclass(frozen=True)
+class Problem:
+    prior: Product
+    of: object
+
+    def log_likelihood(self, theta):
+        return self.of(theta)
+
+
+WIDE = Product({"x": Normal(0.0, 10.0), "y": Normal(0.0, 10.0)})
+
+
+def _bent(theta):
+    """A ridge along y = x^2, a twentieth wide: no ellipse holds it."""
+    x, y = theta.T
+    return -0.5 * x**2 - 0.5 * ((y - x**2) / 0.05) ** 2
+
+
+def _two(theta):
+    """Two spots, three to one."""
+    x, y = theta.T
+    return np.logaddexp(math.log(0.75) - 50 * ((x - 2) ** 2 + y**2), math.log(0.25) - 50 * ((x + 2) ** 2 + y**2))
+
+
+def _by_quadrature(of, low, high, n=1501):
+    x, y = (np.linspace(a, b, n) for a, b in zip(low, high, strict=True))
+    theta = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    log_p = of(theta) + WIDE.log_prob(theta)
+    return math.log(np.exp(log_p - log_p.max()).sum() * (x[1] - x[0]) * (y[1] - y[0])) + float(log_p.max())
+
+
+@pytest.mark.parametrize(
+    ("of", "low", "high"), [(_bent, (-6, -1), (6, 36)), (_two, (-3, -1), (3, 1))], ids=["bent", "two"]
+)
+def test_the_evidence_is_the_same_and_sharper(of, low, high):
+    problem, rng = Problem(WIDE, of), np.random.default_rng(5)
+    truth = _by_quadrature(of, low, high, 4001 if of is _bent else 1501)
+    first = nested.run(problem, rng=rng, n_live=100)
+    second = nested.run(nested.repartitioned(problem, first, rng=rng), rng=rng, n_live=100)
+    assert abs(first.log_z - truth) < 4 * first.log_z_error
+    assert abs(second.log_z - truth) < 4 * second.log_z_error
+    assert second.log_z_error < 0.75 * first.log_z_error
+    assert second.n_calls < first.n_calls
+
+
+def test_its_posterior_is_the_same():
+    problem, rng = Problem(WIDE, _two), np.random.default_rng(6)
+    first = nested.run(problem, rng=rng, n_live=200)
+    second = nested.run(nested.repartitioned(problem, first, rng=rng), rng=rng, n_live=400)
+    right = second.samples(4000, rng=rng)[:, 0] > 0
+    assert right.mean() == pytest.approx(0.75, abs=0.12)
+
+
+def test_walls_of_the_prior_stay_where_they_are():
+    """A slope down from the wall of a cube: 1 - exp(-20)."""
+    problem = Problem(Product({"x": Uniform(0.0, 1.0)}), lambda theta: math.log(20) - 20 * theta[:, 0])
+    rng = np.random.default_rng(7)
+    first = nested.run(problem, rng=rng, n_live=100)
+    second = nested.run(nested.repartitioned(problem, first, rng=rng), rng=rng, n_live=400)
+    assert ((second.theta >= 0) & (second.theta <= 1)).all()
+    assert abs(second.log_z) < 4 * second.log_z_error < 0.4
+
+
+def test_coordinates_and_cube_lead_to_the_same_points():
+    problem, rng = Problem(WIDE, _two), np.random.default_rng(8)
+    near = nested.repartitioned(problem, nested.run(problem, rng=rng, n_live=100), rng=rng).prior
+    u = rng.random((50, 2))
+    theta = near.from_unit_cube(u)
+    np.testing.assert_allclose(near.to_unit_cube(theta), u, atol=1e-9)
+    np.testing.assert_allclose(near.leave(near.enter(theta))[0], theta, atol=1e-9)
+
+
+def test_what_is_no_prior_is_refused():
+    problem, rng = Problem(WIDE, _two), np.random.default_rng(9)
+    first = nested.run(problem, rng=rng, n_live=50)
+    with pytest.raises(ParameterError, match=r"widening is 0\.9"):
+        nested.repartitioned(problem, first, rng=rng, widening=0.9)
+    other = Problem(Product({"a": Normal(0.0, 1.0), "b": Normal(0.0, 1.0)}), _two)
+    with pytest.raises(ParameterError, match="names"):
+        nested.repartitioned(other, first, rng=rng)

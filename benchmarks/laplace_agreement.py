@@ -30,10 +30,8 @@ def weigh_case(seed: int, number: int) -> dict:
     blind, nested = (np.random.default_rng(child) for child in np.random.SeedSequence([seed, number]).spawn(2))
     begun_s = time.process_time()
     found = diagnose(case.recording, thorough=partial(weigh_thoroughly, rng=nested), rng=blind)
-    weighings = [
-        {"label": w.label, "n_gaussians": w.n_gaussians, "gap": w.gap, "error": w.error, "agree": w.agree}
-        for w in found.weighings
-    ]
+    fields = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
+    weighings = [{name: getattr(w, name) for name in fields} for w in found.weighings]
     return {"number": number, "weighings": weighings, "cpu_s": time.process_time() - begun_s}
 
 

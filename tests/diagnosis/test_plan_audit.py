@@ -1,12 +1,14 @@
 """What a plan sees before any data, by a second route where there is a number."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from probewise.diagnosis import audit_plan, join
 from probewise.diagnosis.advice.commands import behind, commands
+from probewise.diagnosis.audit.plan_audit import _cured_at
 from probewise.diagnosis.audit.sights import Expected, LaidOut, Survivors
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.effects import Backlash, EdgeMisplacement, Extent
@@ -94,6 +96,15 @@ def test_what_a_cure_claims_is_seen_after_all_of_it():
     assert len(said.splitlines()) <= 25
     assert max(map(len, said.splitlines())) <= 130
     assert all(effect.name in said for effect in audit.effects)
+
+
+def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
+    """Of three scans the second cures two effects for good but one, which the third, that cures nothing, spoils."""
+    sights = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
+    words = {"a": "aliased", "f": "fine"}
+    steps = [[SimpleNamespace(name=n, sight=words[of[k]]) for n, of in sights.items()] for k in range(4)]
+    assert _cured_at(steps) == {"lag": 2, "tilt": 2}
+    assert _cured_at(steps[:1]) == {}
 
 
 def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():

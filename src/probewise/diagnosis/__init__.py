@@ -15,17 +15,17 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.own_model import OwnModel, Parameters
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.repair.chosen import model_with
+from probewise.diagnosis.repair.mending import Improvement
 from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.locate import Place
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.thorough import weigh_thoroughly
-from probewise.diagnosis.search.weighing import Weighing
+from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.statement.document import diagnosis_json, diagnosis_schema
 from probewise.diagnosis.statement.verdict import (
     Diagnosis,
     EffectFound,
     Hypothesis,
-    Improvement,
     NoiseFound,
     ParameterFound,
     Verdict,

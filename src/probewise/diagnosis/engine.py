@@ -19,20 +19,18 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.repair.ensemble import Ensemble
+from probewise.diagnosis.repair.mending import Improvement, corrected, improvement_of
 from probewise.diagnosis.residuals.fine_structure import fine_structure
-from probewise.diagnosis.residuals.locate import Place, global_p_value, places, places_of_effect
+from probewise.diagnosis.residuals.locate import ALARM, Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, outside
-from probewise.diagnosis.search.weighing import Weighing, with_agreement
-from probewise.diagnosis.statement.mending import corrected, improvement_of
+from probewise.diagnosis.search.weighed_twice import Weighing, with_agreement
 from probewise.diagnosis.statement.reasons import reason_of
 from probewise.diagnosis.statement.stating import effects_found, noise_found
 from probewise.diagnosis.statement.verdict import (
-    ALARM,
     Diagnosis,
     EffectFound,
     Hypothesis,
-    Improvement,
     credible_set,
     decide,
 )

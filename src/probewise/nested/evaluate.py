@@ -141,8 +141,17 @@ class Evaluator:
         return self.weigh(u, theta, log_density, rng)
 
     def weigh(self, u: FloatArray, theta: FloatArray, log_density: FloatArray, rng: np.random.Generator) -> Points:
-        """Evaluate what `space.leave` made of `u`, and give every point a fresh label."""
-        return Points(u, theta, log_density, self.log_likelihood(theta), rng.random(len(u)))
+        """Evaluate what `space.leave` made of `u`, and give every point a fresh label.
+
+        Coordinates that lead nowhere, where the prior's density is zero, are impossible: nobody is asked.
+        """
+        possible = np.isfinite(log_density)
+        if possible.all():
+            return Points(u, theta, log_density, self.log_likelihood(theta), rng.random(len(u)))
+        log_likelihood = np.full(len(u), -np.inf)
+        if possible.any():
+            log_likelihood[possible] = self.log_likelihood(theta[possible])
+        return Points(u, theta, log_density, log_likelihood, rng.random(len(u)))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate hypotheses, (n, n_params) -> (n,), with the checks described above."""

@@ -3,9 +3,9 @@
 Evidence and posterior know prior and likelihood by their product alone, so that any density may stand for the prior
 if the likelihood makes up for it (posterior repartitioning: Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29,
 835; Petrosyan & Handley 2023, Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats to shrink
-by, and both the cost of a run and the square of its error are in proportion to them. What the density reaches too
-seldom, where importance sampling lives on a handful of weights (`probewise.nested.importance`), live points climb to.
-A part of the posterior that the first run has not found is not looked for again.
+by, and with them the cost of a run falls and its error. What the density reaches too seldom, where importance
+sampling lives on a handful of weights (`probewise.nested.importance`), live points climb to. A part of the posterior
+that the first run has not found is not looked for again: see `lost_share`.
 """
 
 from __future__ import annotations
@@ -22,22 +22,24 @@ from probewise.errors import ParameterError
 from probewise.nested.evaluate import Samplable
 from probewise.nested.importance import Posterior
 from probewise.nested.space import Space, unbounded
+from probewise.priors import Prior
 
 __all__ = ["Repartitioned", "repartitioned"]
 
 _MOST_FITTED = 2000
 _DEGREES_OF_FREEDOM = 5.0
 _FLATTEST = 1e-12  # least variance along an axis, of the greatest
+_LEAST_EFFECTIVE = 2  # samples for each parameter, to know the axes by
 
 
 @dataclass(frozen=True, eq=False)
 class _Near:
     """A product of Student t along the axes of samples of a posterior: heavy tails, and no corner left out.
 
-    `center` (n_params,) and `root` (n_params, n_params) in coordinates without walls.
+    Coordinates e are those axes; those without walls, x, are `center` (n_params,) + `root` (n_params, n_params) e.
     """
 
-    names: tuple[str, ...]
+    plain: Prior
     space: Space
     center: FloatArray
     root: FloatArray
@@ -45,6 +47,10 @@ class _Near:
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", frozen(self.center))
         object.__setattr__(self, "root", frozen(self.root))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.plain.names
 
     @cached_property
     def inverse_root(self) -> FloatArray:
@@ -56,8 +62,10 @@ class _Near:
 
     @property
     def coordinates(self) -> _Near:
-        """Its own axes."""
         return self
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        return rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         return self.leave(np.asarray(stdtrit(_DEGREES_OF_FREEDOM, u), dtype=np.float64))[0]
@@ -66,16 +74,25 @@ class _Near:
         return np.asarray(stdtr(_DEGREES_OF_FREEDOM, self.enter(theta)))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Log density over the coordinates without walls, (n,)."""
-        return np.asarray(_log_student(self.enter(theta)) - self.log_volume)
+        log_plain = self.plain.log_prob(theta)
+        out = np.full(len(theta), -np.inf)
+        possible = np.isfinite(log_plain)
+        if possible.any():
+            out[possible] = log_plain[possible] - self.made_up(theta[possible])
+        return out
+
+    def made_up(self, theta: FloatArray) -> FloatArray:
+        """Log of the density of the plain prior over that of this one, (n,): the same over theta as over x."""
+        x = self.space.enter(theta)
+        own = _log_student((x - self.center) @ self.inverse_root.T) - self.log_volume
+        return np.asarray(self.space.leave(x)[1] - own)
 
     def enter(self, theta: FloatArray) -> FloatArray:
         return np.asarray((self.space.enter(theta) - self.center) @ self.inverse_root.T)
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        theta, log_prior = self.space.leave(self.center + x @ self.root.T)
-        # What the problem's own prior rules out is impossible here too: nobody need ask.
-        return theta, np.where(np.isfinite(log_prior), _log_student(x), -np.inf)
+        theta, log_plain = self.space.leave(self.center + x @ self.root.T)
+        return theta, np.where(np.isfinite(log_plain), _log_student(x), -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +103,8 @@ class Repartitioned:
     prior: _Near
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log of likelihood times prior over the density that stands for the prior, (n, n_params) -> (n,)."""
-        space = self.prior.space
-        log_prior = space.leave(space.enter(theta))[1]
-        possible = np.isfinite(log_prior)
-        out = np.full(len(theta), -np.inf)
-        if possible.any():
-            made_up = log_prior[possible] - self.prior.log_prob(theta[possible])
-            out[possible] = self.problem.log_likelihood(theta[possible]) + made_up
-        return out
+        """Log of the likelihood and of what makes up for the prior, (n, n_params) -> (n,)."""
+        return np.asarray(self.problem.log_likelihood(theta) + self.prior.made_up(theta))
 
 
 def repartitioned(
@@ -111,27 +121,32 @@ def repartitioned(
     rng
         Source of randomness, for the samples.
     widening
-        How many times wider than the samples the new prior is, 1 or more.
+        Scale of the new prior in sds of the samples, 1 or more; along each axis it is a Student t of five degrees of
+        freedom.
 
     Returns
     -------
     Repartitioned
-        Its log Z is the problem's own; `log_likelihood` of its runs is not.
+        Its log Z is the problem's own. The `log_likelihood` of its runs is not, so that they go with this problem
+        into `refine` or `update`, and not into `merge` with runs of the other.
 
     Raises
     ------
     ParameterError
-        If `widening` is below 1, or what was found is of other parameters.
+        If `widening` is below 1, what was found is of other parameters, or holds too few samples for so many.
     """
     if not 1.0 <= widening < math.inf:
         raise ParameterError("widening", widening, "1 or more, finite")
     if found.names != problem.prior.names:
         raise ParameterError("found.names", found.names, f"the problem's names {problem.prior.names}")
+    if found.n_eff < _LEAST_EFFECTIVE * len(found.names):
+        allowed = f"{_LEAST_EFFECTIVE * len(found.names)} or more effective samples; run with more live points"
+        raise ParameterError("found.n_eff", found.n_eff, allowed)
     space = unbounded(problem.prior)
     x = space.enter(found.samples(_MOST_FITTED, rng=rng))
     variance, axes = np.linalg.eigh(np.atleast_2d(np.cov(x, rowvar=False)))
     sd = np.sqrt(np.maximum(variance, _FLATTEST * max(float(variance[-1]), 1e-300)))
-    return Repartitioned(problem, _Near(found.names, space, x.mean(axis=0), widening * axes * sd))
+    return Repartitioned(problem, _Near(problem.prior, space, x.mean(axis=0), widening * axes * sd))
 
 
 def _log_student(x: FloatArray) -> FloatArray:

@@ -113,6 +113,8 @@ class _Own:
         return self.coordinates.leave(u)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        if isinstance(self.coordinates, _Draws):
+            return self.coordinates.draw(n, rng=rng)
         return self.enter(self.prior.from_unit_cube(rng.random((n, len(self.prior.names)))))
 
 
@@ -120,6 +122,13 @@ class _Own:
 class _HasCoordinates(Protocol):
     @property
     def coordinates(self) -> Coordinates: ...
+
+
+@runtime_checkable
+class _Draws(Protocol):
+    """Coordinates of which some lead nowhere: no parameters stand for those, and they have to be drawn themselves."""
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
 
 
 def space_of(prior: Prior) -> Space:

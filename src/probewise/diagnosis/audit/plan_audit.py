@@ -207,8 +207,8 @@ def audit_plan(
     for command in chosen:
         current = behind(current, [command.plan])
         steps.append(_judged(LaidOut.of(expected, current, effects), effects)[0])
-    n_kept = max(_cured_at(steps).values(), default=0)  # no scan that was to help a next one that never came
-    cured = _cured_at(steps[: n_kept + 1])
+    cured = _cured_at(steps)
+    n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
     cures = tuple(
         Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
         for k, c in enumerate(chosen[:n_kept], start=1)
@@ -217,10 +217,17 @@ def audit_plan(
 
 
 def _cured_at(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
-    """Say of each effect that is fine at the last step, but not at the first, from which step on it is."""
+    """Say of each effect that the steps cure from which one on it is fine; what no step does lasting good is left out.
+
+    An effect may be fine as long as the steps last that cure anything, and spoilt by one behind them.
+    """
     fine = [{effect.name for effect in step if effect.sight == "fine"} for step in steps]
-    names = [effect.name for effect in steps[0] if effect.name in fine[-1] - fine[0]]
-    return {name: max(k for k, known in enumerate(fine) if name not in known) + 1 for name in names}
+
+    def since(last: int) -> dict[str, int]:
+        names = [effect.name for effect in steps[0] if effect.name in fine[last] - fine[0]]
+        return {name: max(k for k in range(last) if name not in fine[k]) + 1 for name in names}
+
+    return since(max(since(len(steps) - 1).values(), default=0))
 
 
 def audit_recorded(

@@ -1,9 +1,10 @@
 """Each Gaussian of an SSF under one name: the same evidence, and one peak where there were as many as orders of them.
 
-A posterior of exchangeable Gaussians has every peak N! times, at the same height. Folded onto the order that is nearest
-to one of them, with the prior density of all orders summed, it has each once. Sampling then has nothing to hop
-between: of three Gaussians, one hardly needed, two hundred live points left the log evidence uncertain by five nats,
-and folded by one.
+The likelihood of exchangeable Gaussians has every peak N! times. (The prior of three shares and more, given by their
+ratios to the first, is not quite the same for all orders.) Folded onto the order that is nearest to a point, with the
+prior density of all orders summed, the posterior has each peak once. Sampling then has nothing to hop between: of
+three Gaussians, one hardly needed, two hundred live points left the log evidence uncertain by five nats, and folded by
+one.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def folded(problem: JointProblem, near: FloatArray) -> JointProblem | Folded:
 
     Returns
     -------
-    A problem of the same evidence; the same problem where no names can be traded.
+    A problem of the same evidence; the problem itself where its sensor is no mixture whose names can be traded.
     """
     sensor = problem.model.sensor
     if not (isinstance(sensor, SensorCoordinates) and sensor.exchangeable and sensor.n_gaussians > 1):

@@ -104,5 +104,5 @@ class Null(Protocol):
 
 
 def log_multiplicity(null: Null) -> float:
-    """Log of the number of equal peaks of the posterior: how often Gaussians can trade names."""
+    """Log of the number of peaks of the posterior that are one and the same sensor, taken to be of the same height."""
     return math.lgamma(null.n_gaussians + 1) if null.exchangeable else 0.0

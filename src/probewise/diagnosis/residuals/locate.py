@@ -21,7 +21,10 @@ from probewise.diagnosis.residuals.covariates import Covariate
 from probewise.effects import NamedEffect, sign_of_move
 from probewise.recordings.plan import Plan
 
-__all__ = ["Place", "global_p_value", "places", "places_of_effect", "windows"]
+__all__ = ["ALARM", "Place", "global_p_value", "places", "places_of_effect", "windows"]
+
+ALARM = 0.01
+"""p-value below which something is missing."""
 
 _LEAST_ROWS = 3
 _FELT = 0.05  # share of its greatest strength

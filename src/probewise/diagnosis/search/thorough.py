@@ -7,6 +7,7 @@ integral over the parameters: here the whole prior is searched, there the poster
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +18,8 @@ from probewise import nested
 from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, weighed
-from probewise.diagnosis.search.weighing import Weighing
+from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.errors import DoubtfulResultWarning
 
 __all__ = ["weigh_thoroughly"]
 
@@ -25,11 +27,10 @@ N_LIVE = 100
 
 _LEAST, _MOST = 2, 3  # hypotheses that are weighed again, the null apart
 _LEAST_PROBABILITY = 0.01
+_LEAST_LIVE = 2  # live points for each parameter
+_MOST_RUNS = 4  # of the whole prior, and as many about what is found there
 _SHARP = 0.3  # nats: an error that leaves it open whether two evidences are a nat apart is too large
 _APART = 3.3  # standard errors: one in a thousand
-# Times as many live points: about what was found, until that is sharp; in the whole prior, where the two differ.
-_MORE_ABOUT = (1, 2, 4)
-_MORE_EXPLORING = (1, 4)
 
 Names = tuple[str, ...]
 Progress = Callable[[str, nested.State], None]
@@ -53,9 +54,9 @@ def weigh_thoroughly(
     rng
         Source of randomness.
     n_live
-        Live points. A run of the whole prior says where the posterior is, one from a prior near that
-        (`probewise.nested.repartitioned`) what the evidence is. There are more where that is not sharp yet, or the
-        two differ.
+        Live points of each run. One of the whole prior says where the posterior is, one from a prior near that
+        (`probewise.nested.repartitioned`) what the evidence is. More of the first join where parts of the posterior
+        may be lost (`probewise.nested.lost_share`) or the two differ, more of the second follow until they are sharp.
     progress
         Called after every round with the label of what is being weighed, and the state.
 
@@ -115,38 +116,50 @@ def _weigh(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = JointProblem(candidate.found.model, search.recording, evidence, search.sd_floor)
     once = folded(problem, candidate.found.z)
+    n_live = max(n_live, _LEAST_LIVE * problem.model.n_params)
     run = partial(
         nested.run,
         rng=rng,
+        n_live=n_live,
         progress=None if progress is None else lambda state: progress(weighing.label, state),
         return_interrupted=False,
     )
-    for more in _MORE_EXPLORING:
-        explored = run(once, n_live=more * n_live)
-        about = _about(explored, once, run, n_live, rng)
-        apart = abs(explored.log_z - about.log_z) / math.hypot(explored.log_z_error, about.log_z_error)
-        if apart < _APART:
-            break
-    doubts = about.warnings
+    runs: list[nested.NestedResult] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against the last of them is told
+        while True:
+            runs.append(run(once))
+            last = len(runs) == _MOST_RUNS
+            explored = nested.merge(runs, rng=rng) if len(runs) > 1 else runs[0]
+            lost = nested.lost_share(explored, once, rng=rng)
+            if lost > _SHARP and not last:
+                continue
+            about = _about(explored, once, run, rng)
+            apart = abs(explored.log_z - about.log_z) / math.hypot(explored.log_z_error, about.log_z_error)
+            if apart < _APART or last:
+                break
+    doubts = (*explored.warnings, *about.warnings)
     if apart >= _APART:
         doubts = (*doubts, f"the prior as a whole and what was found in it differ by {apart:.1f} standard errors")
     log_z = about.log_z + candidate.log_factor
-    return replace(weighing, nested=log_z, error=about.log_z_error, doubts=doubts)
+    return replace(weighing, nested=log_z, error=math.hypot(about.log_z_error, lost), doubts=doubts)
 
 
-def _about(
-    found: nested.NestedResult, problem: nested.Samplable, run: Run, n_live: int, rng: np.random.Generator
-) -> _Evidence:
-    """Sharpen what a run of the whole prior has found by runs from priors near its posterior."""
-    for more in _MORE_ABOUT:
+def _about(found: nested.NestedResult, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:
+    """Sharpen what runs of the whole prior have found, by runs from priors near its posterior."""
+    runs: list[nested.NestedResult] = []
+    while True:
         nearer = nested.repartitioned(problem, found, rng=rng)
-        found = run(nearer, n_live=more * n_live)
+        found = run(nearer)
+        runs.append(found)
         sharper = nested.refine(found, nearer, rng=rng)
         if sharper.sound and sharper.log_z_error < found.log_z_error:
             return _Evidence(sharper.log_z, sharper.log_z_error)
-        if found.log_z_error <= _SHARP:
-            break
-    return _Evidence(found.log_z, found.log_z_error, found.warnings)
+        weights = np.array([1.0 / own.log_z_error**2 for own in runs])
+        error = float(weights.sum() ** -0.5)
+        if error <= _SHARP or len(runs) == _MOST_RUNS:
+            log_z = float(np.average([own.log_z for own in runs], weights=weights))
+            return _Evidence(log_z, error, tuple(doubt for own in runs for doubt in own.warnings))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import json
 from importlib.resources import files
 from typing import Any
 
-from probewise.diagnosis.search.weighing import Weighing
+from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.statement.verdict import Diagnosis, ParameterFound
 
 __all__ = ["diagnosis_json", "diagnosis_schema"]
@@ -99,6 +99,7 @@ def _weighing(twice: Weighing) -> dict[str, Any]:
         "log_evidence_nested": twice.nested,
         "error": twice.error,
         "agree": twice.agree,
+        "doubts": list(twice.doubts),
     }
 
 

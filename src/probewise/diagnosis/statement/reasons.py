@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Sequence
 
 from probewise.diagnosis.advice.aliases import Alias
-from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.search.weighed import Search
-from probewise.diagnosis.statement.verdict import ALARM, EffectFound, Hypothesis, Verdict
+from probewise.diagnosis.statement.verdict import EffectFound, Hypothesis, Verdict
 
 __all__ = ["reason_of"]
 

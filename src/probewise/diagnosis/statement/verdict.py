@@ -10,26 +10,22 @@ from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
 from probewise.diagnosis.advice.aliases import Alias
 from probewise.diagnosis.advice.next_scans import NextMeasurement
+from probewise.diagnosis.repair.mending import Improvement
 from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.locate import Place
-from probewise.diagnosis.search.weighing import Weighing
+from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.recordings.plan import Recording
 
 __all__ = [
-    "ALARM",
     "Diagnosis",
     "EffectFound",
     "Hypothesis",
-    "Improvement",
     "NoiseFound",
     "ParameterFound",
     "Verdict",
     "credible_set",
     "decide",
 ]
-
-ALARM = 0.01
-"""p-value below which something is missing."""
 
 _OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
 
@@ -70,19 +66,6 @@ class EffectFound:
     sentence: str
     parameters: tuple[ParameterFound, ...]
     scans: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Improvement:
-    """What the repaired model gains over the null."""
-
-    log_evidence: float
-    heldout_log_density_per_reading: float
-    heldout_sd: float
-    heldout_by_scan: tuple[tuple[str, float], ...]
-    rms_before: float
-    rms_after: float
-    p_value_after: float
 
 
 @dataclass(frozen=True)

@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.gain import blocks_kept_back, held_out_gain, parts_kept_back
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.residuals.locate import global_p_value
-from probewise.diagnosis.residuals.unknown import correct
+from probewise.diagnosis.repair.unknown import correct
+from probewise.diagnosis.residuals.locate import ALARM, global_p_value
 from probewise.diagnosis.search.weighed import Candidate, Search
-from probewise.diagnosis.statement.verdict import ALARM, Improvement
 
-__all__ = ["corrected", "improvement_of"]
+__all__ = ["Improvement", "corrected", "improvement_of"]
 
 Names = tuple[str, ...]
 
 _N_DRAWS = 499
 _MOST_BASES = 6
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """What the repaired model gains over the null."""
+
+    log_evidence: float
+    heldout_log_density_per_reading: float
+    heldout_sd: float
+    heldout_by_scan: tuple[tuple[str, float], ...]
+    rms_before: float
+    rms_after: float
+    p_value_after: float
 
 
 def improvement_of(

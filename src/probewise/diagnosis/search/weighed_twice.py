@@ -14,8 +14,8 @@ A_NAT = 1.0
 class Weighing:
     """Log evidence of one hypothesis, both ways; the same model, priors and law of the noise.
 
-    `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `error` of the nested run, one
-    standard error; `doubts` are what that run has against itself.
+    `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `error` of the nested runs, one
+    standard error, what they may have lost included; `doubts` are what they have against themselves.
     """
 
     effects: tuple[str, ...]
@@ -37,19 +37,20 @@ class Weighing:
 
     @property
     def agree(self) -> bool:
-        """Whether the two are within a nat, beyond the nested run's own error."""
+        """Whether the two are within a nat, beyond the nested runs' own error."""
         return abs(self.gap) <= A_NAT + self.error
 
 
 def with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
-    """Add to a sentence whether nested sampling agrees, and where not, by how much."""
+    """Add to a sentence whether nested sampling agrees, where not, by how much, and what it has against itself."""
     if not weighings:
         return reason
     apart = ", ".join(f"{w.label} by {w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree)
+    doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
     if not apart:
         said = "nested sampling agrees within a nat"
-    elif any(w.doubts for w in weighings):
-        said = f"nested sampling would move {apart}, but doubts itself, so probabilities are left as they were"
+    elif doubt is not None:
+        said = f"nested sampling would move {apart}, and probabilities are left as they were"
     else:
         said = f"nested sampling moves {apart}, and the probabilities are by its evidence"
-    return f"{reason.rstrip('.')}; {said}."
+    return f"{reason.rstrip('.')}; {said}{'' if doubt is None else f', but it doubts itself ({doubt})'}."

@@ -58,7 +58,7 @@ def measure(name: str, n_seeds: int, n_live: int) -> dict[str, Any]:
     for seed in range(n_seeds):
         rng = np.random.default_rng([seed, 24])
         first.append(run(known, rng=rng, n_live=n_live))
-        second.append(run(repartitioned(known, first[-1], rng=rng), rng=rng, n_live=n_live))
+        second.append(run(repartitioned(known, first[-1].samples(2000, rng=rng)), rng=rng, n_live=n_live))
     return {"problem": name, "first": _summary(known, first), "again": _summary(known, second)}
 
 

@@ -8,7 +8,7 @@ the stop rule on consecutive values of log Z).
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.families import chain_memory
-from probewise.nested.importance import Weighted, lost_share, pareto_k, refine, update
+from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
@@ -41,7 +41,6 @@ __all__ = [
     "chain_memory",
     "diversify",
     "diversify_by_kernels",
-    "lost_share",
     "merge",
     "pareto_k",
     "refine",

@@ -25,7 +25,7 @@ from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["Posterior", "Weighted", "lost_share", "pareto_k", "refine", "update"]
+__all__ = ["Weighted", "pareto_k", "refine", "update"]
 
 # Above it the mean of the weights converges too slowly for their sd to be its error (Vehtari et al. 2024).
 _MOST_K = 0.7
@@ -337,41 +337,15 @@ def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.ran
     return space.enter(theta[np.unique(np.concatenate(rows))])
 
 
-def lost_share(result: NestedResult, problem: Samplable, *, rng: np.random.Generator) -> float:
-    """Say what share of the posterior a run may have lost without a trace.
-
-    With n_live points and information H a run knows the shares of the posterior's parts as n_live / H independent
-    samples would, fewer where its chains remember: a part of share s is lost with probability exp(-s n_live / H).
-
-    Parameters
-    ----------
-    result
-        A run of the problem.
-    problem
-        Prior and likelihood.
-    rng
-        Source of randomness, for samples to find the parts by.
-
-    Returns
-    -------
-    The sum over the parts found, each as probable to be lost as if the run were done again.
-    """
-    return _lost(result, _lines(result), unbounded(problem.prior), rng)
-
-
 def _with_lost(found: Weighted, lines: float, space: Space, rng: np.random.Generator) -> Weighted:
     """Add to the error what `lines` lines of descent may have lost of the posterior's parts."""
     if not found.n_eff > 1:
         return found
-    lost = _lost(found, lines, space, rng)
-    return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
-
-
-def _lost(found: Posterior, lines: float, space: Space, rng: np.random.Generator) -> float:
-    n = max(int(min(found.n_eff, 1000)), 1)
+    n = int(min(found.n_eff, 1000))
     parts = find_parts(space.enter(found.theta[np.unique(found.rows(n, rng=rng))]))
     share = parts.size / parts.size.sum()
-    return float(share @ np.exp(-lines * share))
+    lost = float(share @ np.exp(-lines * share))
+    return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
 
 
 def _weigh(

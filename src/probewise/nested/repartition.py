@@ -4,8 +4,8 @@ Evidence and posterior know prior and likelihood by their product alone, so that
 if the likelihood makes up for it (posterior repartitioning: Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29,
 835; Petrosyan & Handley 2023, Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats to shrink
 by, and with them the cost of a run falls and its error. What the density reaches too seldom, where importance
-sampling lives on a handful of weights (`probewise.nested.importance`), live points climb to. A part of the posterior
-that the first run has not found is not looked for again: see `lost_share`.
+sampling lives on a handful of weights (`probewise.nested.importance`), live points climb to. A far part of the
+posterior that no sample stands for is not looked for again.
 """
 
 from __future__ import annotations
@@ -18,18 +18,16 @@ import numpy as np
 from scipy.special import gammaln, stdtr, stdtrit
 
 from probewise._arrays import FloatArray, frozen
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evaluate import Samplable
-from probewise.nested.importance import Posterior
 from probewise.nested.space import Space, unbounded
 from probewise.priors import Prior
 
 __all__ = ["Repartitioned", "repartitioned"]
 
-_MOST_FITTED = 2000
 _DEGREES_OF_FREEDOM = 5.0
 _FLATTEST = 1e-12  # least variance along an axis, of the greatest
-_LEAST_EFFECTIVE = 2  # samples for each parameter, to know the axes by
+_LEAST_SAMPLES = 2  # for each parameter, to know the axes by
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,19 +105,15 @@ class Repartitioned:
         return np.asarray(self.problem.log_likelihood(theta) + self.prior.made_up(theta))
 
 
-def repartitioned(
-    problem: Samplable, found: Posterior, *, rng: np.random.Generator, widening: float = 1.4
-) -> Repartitioned:
+def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.4) -> Repartitioned:
     """State a problem anew, with a prior that is near its posterior: for a second run, shorter and sharper.
 
     Parameters
     ----------
     problem
         Prior and likelihood.
-    found
-        What a run of it has found; its posterior samples say where the prior is to be.
-    rng
-        Source of randomness, for the samples.
+    theta
+        Samples of the posterior, (n_samples, n_params), such as a run's: they say where the prior is to be.
     widening
         Scale of the new prior in sds of the samples, 1 or more; along each axis it is a Student t of five degrees of
         freedom.
@@ -132,18 +126,21 @@ def repartitioned(
 
     Raises
     ------
+    ShapeError
+        If the samples are of other parameters.
     ParameterError
-        If `widening` is below 1, what was found is of other parameters, or holds too few samples for so many.
+        If `widening` is below 1, or there are too few different samples to know so many axes by.
     """
+    n_params = len(problem.prior.names)
+    if theta.ndim != 2 or theta.shape[1] != n_params:
+        raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_samples, {n_params})")
     if not 1.0 <= widening < math.inf:
         raise ParameterError("widening", widening, "1 or more, finite")
-    if found.names != problem.prior.names:
-        raise ParameterError("found.names", found.names, f"the problem's names {problem.prior.names}")
-    if found.n_eff < _LEAST_EFFECTIVE * len(found.names):
-        allowed = f"{_LEAST_EFFECTIVE * len(found.names)} or more effective samples; run with more live points"
-        raise ParameterError("found.n_eff", found.n_eff, allowed)
+    n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * n_params
+    if n_different < least:
+        raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
     space = unbounded(problem.prior)
-    x = space.enter(found.samples(_MOST_FITTED, rng=rng))
+    x = space.enter(theta)
     variance, axes = np.linalg.eigh(np.atleast_2d(np.cov(x, rowvar=False)))
     sd = np.sqrt(np.maximum(variance, _FLATTEST * max(float(variance[-1]), 1e-300)))
     return Repartitioned(problem, _Near(problem.prior, space, x.mean(axis=0), widening * axes * sd))

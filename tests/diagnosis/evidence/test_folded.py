@@ -88,7 +88,7 @@ def test_the_evidence_of_two_gaussians_is_the_same_folded():
     truth, error = np.log(likelihood.mean()), likelihood.std() / likelihood.mean() / np.sqrt(len(likelihood))
     problem = SimpleNamespace(prior=prior, log_likelihood=of)
     first = nested.run(problem, rng=rng, n_live=200)
-    second = nested.run(nested.repartitioned(problem, first, rng=rng), rng=rng, n_live=200)
+    second = nested.run(nested.repartitioned(problem, first.samples(2000, rng=rng)), rng=rng, n_live=200)
     for found in (first, second):
         assert abs(found.log_z - truth) < 4 * np.hypot(found.log_z_error, error)
 

@@ -78,7 +78,6 @@ def test_the_null_is_always_weighed_too(stepped):
 
 def test_where_no_density_fits_the_runs_themselves_become_sharp(stepped, monkeypatch):
     monkeypatch.setattr(thorough.nested, "refine", lambda *_, **__: SimpleNamespace(sound=False))
-    monkeypatch.setattr(thorough.nested, "lost_share", lambda *_, **__: 0.0)
     monkeypatch.setattr(thorough, "_SHARP", 0.1)
     _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
     for weighing in weighings:
@@ -87,35 +86,48 @@ def test_where_no_density_fits_the_runs_themselves_become_sharp(stepped, monkeyp
         assert weighing.error < 0.15  # one round alone leaves 0.18
 
 
-def test_a_prior_and_what_was_found_in_it_that_differ_are_a_doubt(stepped, monkeypatch):
-    """Tried again, with the live points of all runs, then said; also where the evidences agree."""
-    explored = []
+def stub_of_the_whole_prior(monkeypatch, change):
+    """Let runs of the whole prior, not those near the posterior, be changed."""
 
     def run(problem, **options):
         result = nested.run(problem, **options)
-        if isinstance(problem, nested.Repartitioned):
-            return result
-        explored.append(options["n_live"])
-        return replace(result, log_z=result.log_z + 30.0)
+        return result if isinstance(problem, nested.Repartitioned) else change(result)
 
-    def merge(runs, **options):
-        return replace(nested.merge(runs, **options), log_z=runs[0].log_z)
+    monkeypatch.setattr(thorough, "nested", SimpleNamespace(**{**vars(nested), "run": run}))
 
-    monkeypatch.setattr(thorough, "nested", SimpleNamespace(**{**vars(nested), "run": run, "merge": merge}))
+
+def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, monkeypatch):
+    """It is said where the evidences agree, too."""
+    stub_of_the_whole_prior(monkeypatch, lambda result: replace(result, log_z=result.log_z + 30.0))
     found, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
-    assert explored == [50] * 4 * len(weighings)
-    assert all("differ by" in w.doubts[-1] for w in weighings)
+    assert all("holds more" in w.doubts[-1] for w in weighings)
     assert all(w.agree for w in weighings)
     assert found is stepped
     assert "agrees within a nat, but it doubts itself" in with_agreement("A reason.", weighings)
 
 
-def test_what_may_be_lost_is_looked_for_again_and_joins_the_error(stepped, monkeypatch):
-    left = [0.9, 0.5, 0.25] * 3
-    monkeypatch.setattr(thorough.nested, "lost_share", lambda *_, **__: left.pop(0))
+def test_a_peak_that_the_search_has_lost_is_found_from_the_fit(stepped, monkeypatch):
+    """Samples of the line in quite another place: a ledge of the likelihood from which nothing leads back."""
+
+    def lost(result):
+        return SimpleNamespace(
+            log_z=result.log_z - 20.0,
+            log_z_error=result.log_z_error,
+            samples=lambda n, rng: 5.0 + 0.001 * result.samples(n, rng=rng),
+        )
+
+    plain = thorough._about
+    about = []
+
+    def noted(*given):
+        about.append(plain(*given))
+        return about[-1] if len(about) % 2 == 0 else replace(about[-1], log_z=about[-1].log_z - 20.0)
+
+    monkeypatch.setattr(thorough, "_about", noted)
+    stub_of_the_whole_prior(monkeypatch, lost)
     _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
-    assert len(left) == 9 - 3 * len(weighings)
-    assert all(0.25 < w.error < 0.3 for w in weighings)
+    assert len(about) == 2 * len(weighings)
+    assert all(w.agree and not w.doubts for w in weighings)
 
 
 def moved(stepped, monkeypatch, gap, doubts=()):

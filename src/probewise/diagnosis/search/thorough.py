@@ -15,10 +15,13 @@ from functools import partial
 import numpy as np
 
 from probewise import nested
+from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
+from probewise.diagnosis.evidence.laplace import NoiseEvidence
+from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, weighed
-from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.search.weighed_twice import A_NAT, Weighing
 from probewise.errors import DoubtfulResultWarning
 
 __all__ = ["weigh_thoroughly"]
@@ -28,7 +31,8 @@ N_LIVE = 100
 _LEAST, _MOST = 2, 3  # hypotheses that are weighed again, the null apart
 _LEAST_PROBABILITY = 0.01
 _LEAST_LIVE = 2  # live points for each parameter
-_MOST_RUNS = 4  # of the whole prior, and as many about what is found there
+_MOST_RUNS = 4  # from priors near the posterior
+_N_SAMPLES = 2000  # that say where that is
 _SHARP = 0.3  # nats: an error that leaves it open whether two evidences are a nat apart is too large
 _APART = 3.3  # standard errors: one in a thousand
 
@@ -54,9 +58,8 @@ def weigh_thoroughly(
     rng
         Source of randomness.
     n_live
-        Live points of each run. One of the whole prior says where the posterior is, one from a prior near that
-        (`probewise.nested.repartitioned`) what the evidence is. More of the first join where parts of the posterior
-        may be lost (`probewise.nested.lost_share`) or the two differ, more of the second follow until they are sharp.
+        Live points of each run. One of the whole prior looks for where the posterior is; from priors near that
+        (`probewise.nested.repartitioned`) others say what the evidence is, until that is sharp.
     progress
         Called after every round with the label of what is being weighed, and the state.
 
@@ -124,32 +127,26 @@ def _weigh(
         progress=None if progress is None else lambda state: progress(weighing.label, state),
         return_interrupted=False,
     )
-    runs: list[nested.NestedResult] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against the last of them is told
-        while True:
-            runs.append(run(once))
-            last = len(runs) == _MOST_RUNS
-            explored = nested.merge(runs, rng=rng) if len(runs) > 1 else runs[0]
-            lost = nested.lost_share(explored, once, rng=rng)
-            if lost > _SHARP and not last:
-                continue
-            about = _about(explored, once, run, rng)
-            apart = abs(explored.log_z - about.log_z) / math.hypot(explored.log_z_error, about.log_z_error)
-            if apart < _APART or last:
-                break
-    doubts = (*explored.warnings, *about.warnings)
+        explored = run(once)
+        about = _about(explored.samples(_N_SAMPLES, rng=rng), once, run, rng)
+        laplace = evidence.log_z - candidate.log_factor
+        if about.log_z < laplace - A_NAT - about.error:  # the search may have lost the peak that the fit has found
+            fitted = _about(_of_laplace(candidate, evidence, rng), once, run, rng)
+            about = max(about, fitted, key=lambda found: found.log_z)
+    doubts = about.warnings
+    apart = (explored.log_z - about.log_z) / math.hypot(explored.log_z_error, about.error)
     if apart >= _APART:
-        doubts = (*doubts, f"the prior as a whole and what was found in it differ by {apart:.1f} standard errors")
-    log_z = about.log_z + candidate.log_factor
-    return replace(weighing, nested=log_z, error=math.hypot(about.log_z_error, lost), doubts=doubts)
+        doubts = (*doubts, f"the whole prior holds more than what was found in it, by {apart:.1f} standard errors")
+    return replace(weighing, nested=about.log_z + candidate.log_factor, error=about.error, doubts=doubts)
 
 
-def _about(found: nested.NestedResult, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:
-    """Sharpen what runs of the whole prior have found, by runs from priors near its posterior."""
+def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:
+    """Weigh by runs from priors near the posterior: near samples of it first, then near what the run before found."""
     runs: list[nested.NestedResult] = []
     while True:
-        nearer = nested.repartitioned(problem, found, rng=rng)
+        nearer = nested.repartitioned(problem, theta)
         found = run(nearer)
         runs.append(found)
         sharper = nested.refine(found, nearer, rng=rng)
@@ -160,6 +157,16 @@ def _about(found: nested.NestedResult, problem: nested.Samplable, run: Run, rng:
         if error <= _SHARP or len(runs) == _MOST_RUNS:
             log_z = float(np.average([own.log_z for own in runs], weights=weights))
             return _Evidence(log_z, error, tuple(doubt for own in runs for doubt in own.warnings))
+        theta = found.samples(_N_SAMPLES, rng=rng)
+
+
+def _of_laplace(candidate: Candidate, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
+    """Draw from Laplace's approximation, (_N_SAMPLES, n_params)."""
+    found = candidate.found
+    slopes = evidence.law(found.slopes) / found.sd
+    root = np.linalg.cholesky(slopes.T @ slopes + np.eye(len(found.z)))
+    draws = rng.standard_normal((_N_SAMPLES, len(found.z)))
+    return np.clip(found.z + np.linalg.solve(root.T, draws.T).T, -FARTHEST, FARTHEST)
 
 
 @dataclass(frozen=True)
@@ -167,7 +174,7 @@ class _Evidence:
     """Log evidence, its standard error, and what speaks against it."""
 
     log_z: float
-    log_z_error: float
+    error: float
     warnings: tuple[str, ...] = ()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Weighing", "with_agreement"]
+__all__ = ["A_NAT", "Weighing", "with_agreement"]
 
 A_NAT = 1.0
 
@@ -15,7 +15,7 @@ class Weighing:
     """Log evidence of one hypothesis, both ways; the same model, priors and law of the noise.
 
     `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `error` of the nested runs, one
-    standard error, what they may have lost included; `doubts` are what they have against themselves.
+    standard error; `doubts` are what they have against themselves.
     """
 
     effects: tuple[str, ...]

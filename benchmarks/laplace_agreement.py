@@ -1,53 +1,84 @@
 """Does Laplace's approximation weigh hypotheses as nested sampling does, within a nat?
 
-    python benchmarks/laplace_agreement.py --cases 200 --seed 6161 --out docs/results/laplace.jsonl
+    python benchmarks/laplace_agreement.py --numbers 400 --plan paper --seed 20261202 --workers 2 \
+        --out docs/results/laplace.jsonl
 
-Concealed recordings of the challenge, each diagnosed as `probewise diagnose --thorough` does it. The file has a
-line a case and a run that was stopped goes on from it.
+The first so many recordings of a challenge, those in one plan, each diagnosed as `probewise diagnose --thorough` does
+it. The file has a line a case, and a run that was stopped goes on from it.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 import warnings
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from probewise.campaign import run_campaign
 from probewise.challenge import NullRefit
 from probewise.challenge.estimates import share
 from probewise.diagnosis import diagnose, weigh_thoroughly
-from probewise.errors import DoubtfulResultWarning
-from probewise.world.challenge import draw_case
+from probewise.errors import DoubtfulResultWarning, NotConvergedError
+from probewise.world.challenge import PLANS, draw_case
+
+Result = Mapping[str, Any]
+_FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
 
 
-def weigh_case(seed: int, number: int) -> dict:
+@dataclass(frozen=True)
+class Task:
+    """One case of a challenge; weighed where its plan is the one asked for."""
+
+    seed: int
+    number: int
+    plan: str
+
+
+def weigh_case(task: Task) -> dict[str, Any]:
     """Draw one case, diagnose it thoroughly, and tell both evidences of each hypothesis that was weighed twice."""
-    case = draw_case(seed, number, surviving=NullRefit())
-    blind, nested = (np.random.default_rng(child) for child in np.random.SeedSequence([seed, number]).spawn(2))
+    try:
+        case = draw_case(task.seed, task.number, surviving=NullRefit())
+    except NotConvergedError as error:  # no such effect can be so large
+        return {"left_out": str(error)}
+    if case.truth.plan != task.plan:
+        return {"left_out": case.truth.plan}
+    blind, nested = (
+        np.random.default_rng(child) for child in np.random.SeedSequence([task.seed, task.number]).spawn(2)
+    )
     begun_s = time.process_time()
-    found = diagnose(case.recording, thorough=partial(weigh_thoroughly, rng=nested), rng=blind)
-    fields = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
-    weighings = [{name: getattr(w, name) for name in fields} for w in found.weighings]
-    return {"number": number, "weighings": weighings, "cpu_s": time.process_time() - begun_s}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)
+        found = diagnose(case.recording, thorough=partial(weigh_thoroughly, rng=nested), rng=blind)
+    weighings = [{name: getattr(w, name) for name in _FIELDS} for w in found.weighings]
+    return {"weighings": weighings, "cpu_s": round(time.process_time() - begun_s, 2)}
 
 
-def summary(cases: list[dict]) -> str:
+def summary(results: Sequence[Result]) -> str:
     """Count hypotheses, and leading hypotheses alone, by the number of Gaussians of the SSF."""
-    lines = []
-    for name, most in (("all weighed twice", None), ("the leading one of each case", 1)):
-        chosen = [w for case in cases for w in case["weighings"][:most]]
-        for n in sorted({w["n_gaussians"] for w in chosen}):
-            own = [w for w in chosen if w["n_gaussians"] == n]
+    cases = [result["weighings"] for result in results if "weighings" in result]
+    lines = [f"{len(cases)} recordings, {np.mean([r['cpu_s'] for r in results if 'cpu_s' in r]):.0f} cpu s each"]
+    for name, most in (("all weighed twice", None), ("the leading one of each", 1)):
+        chosen = [w for weighings in cases for w in weighings[:most]]
+        orders = sorted({w["n_gaussians"] for w in chosen})
+        for label, own in [
+            ("", chosen),
+            *((f", order {n}", [w for w in chosen if w["n_gaussians"] == n]) for n in orders),
+        ]:
             agree = share([w["agree"] for w in own])
-            gaps = np.array([w["gap"] for w in own])
-            middle, widest = float(np.median(gaps)), float(gaps[np.argmax(np.abs(gaps))])
+            gaps, errors = (np.array([w[key] for w in own]) for key in ("gap", "error"))
             lines.append(
-                f"{name}, order {n}: {agree.value:.3f} ({agree.low:.3f} to {agree.high:.3f}) of {agree.n} in a nat, "
-                f"nested less Laplace {middle:+.2f} (median), {widest:+.2f} (worst)"
+                f"{name}{label}: {agree.value:.3f} ({agree.low:.3f} to {agree.high:.3f}) of {agree.n} in a nat; nested "
+                f"less Laplace {np.median(gaps):+.2f} (median), {np.quantile(np.abs(gaps), 0.95):.2f} (95 % below), "
+                f"{gaps[np.argmax(np.abs(gaps))]:+.2f} (worst); error {np.median(errors):.2f} (median); "
+                f"{sum(bool(w['doubts']) for w in own)} with doubts"
             )
     return "\n".join(lines)
 
@@ -55,19 +86,17 @@ def summary(cases: list[dict]) -> str:
 def main() -> None:
     """Weigh the cases that are missing in the file, then print the summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--numbers", type=int, default=400)
     parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--plan", choices=sorted(PLANS), default="paper")
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
-    arguments = parser.parse_args()
-    known = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.exists() else []
-    done = {case["number"] for case in known}
-    warnings.simplefilter("ignore", DoubtfulResultWarning)
-    with arguments.out.open("a") as file:
-        for number in (k for k in range(arguments.cases) if k not in done):
-            known.append(weigh_case(arguments.seed, number))
-            file.write(json.dumps(known[-1]) + "\n")
-            file.flush()
-    print(summary(known))
+    options = parser.parse_args()
+    tasks = {f"{options.seed} / {n}": Task(options.seed, n, options.plan) for n in range(options.numbers)}
+    settings = {"seed": options.seed, "plan": options.plan}
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        results = run_campaign(weigh_case, tasks, path=options.out, settings=settings, executor=pool)
+    print(summary(list(results.values())))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,6 +23,7 @@ import numpy as np
 
 from probewise.campaign import run_campaign
 from probewise.challenge import NullRefit
+from probewise.challenge.case import Task
 from probewise.challenge.estimates import share
 from probewise.diagnosis import diagnose, weigh_thoroughly
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
@@ -33,22 +33,13 @@ Result = Mapping[str, Any]
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
 
 
-@dataclass(frozen=True)
-class Task:
-    """One case of a challenge; weighed where its plan is the one asked for."""
-
-    seed: int
-    number: int
-    plan: str
-
-
-def weigh_case(task: Task) -> dict[str, Any]:
-    """Draw one case, diagnose it thoroughly, and tell both evidences of each hypothesis that was weighed twice."""
+def weigh_case(task: Task, *, plan: str) -> dict[str, Any]:
+    """Draw one case and, in the plan asked for, tell both evidences of each hypothesis that was weighed twice."""
     try:
         case = draw_case(task.seed, task.number, surviving=NullRefit())
     except NotConvergedError as error:  # no such effect can be so large
         return {"left_out": str(error)}
-    if case.truth.plan != task.plan:
+    if case.truth.plan != plan:
         return {"left_out": case.truth.plan}
     blind, nested = (
         np.random.default_rng(child) for child in np.random.SeedSequence([task.seed, task.number]).spawn(2)
@@ -92,10 +83,16 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    tasks = {f"{options.seed} / {n}": Task(options.seed, n, options.plan) for n in range(options.numbers)}
+    tasks = [Task(options.seed, number) for number in range(options.numbers)]
     settings = {"seed": options.seed, "plan": options.plan}
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        results = run_campaign(weigh_case, tasks, path=options.out, settings=settings, executor=pool)
+        results = run_campaign(
+            partial(weigh_case, plan=options.plan),
+            {task.key: task for task in tasks},
+            path=options.out,
+            settings=settings,
+            executor=pool,
+        )
     print(summary(list(results.values())))
 
 

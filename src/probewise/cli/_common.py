@@ -131,7 +131,9 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
 
 def check_live(n_live: int, n_params: int) -> int:
     """Refuse, before any work, too few live points for so many parameters."""
-    least = max(2 * n_params, 10)
+    from probewise.nested import least_live  # here: most commands do without
+
+    least = least_live(n_params)
     if n_live < least:
         raise ParameterError("--live", n_live, f"{least} or more for {n_params} parameters")
     return n_live

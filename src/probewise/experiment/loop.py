@@ -32,6 +32,7 @@ from probewise.inference.problem import SensorProblem
 from probewise.inquiry import bits_gained, prior_entropy
 from probewise.nested.kernels import KernelMove
 from probewise.nested.result import NestedResult
+from probewise.nested.sampler import LIVE_PER_PARAM
 from probewise.nested.sampler import run as run_nested
 from probewise.nested.stop import RemainingEvidence
 
@@ -152,7 +153,7 @@ def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.
     return run_nested(
         problem,
         rng=rng,
-        n_live=max(experiment.n_live, 2 * len(experiment.names)),
+        n_live=max(experiment.n_live, LIVE_PER_PARAM * len(experiment.names)),
         move=KernelMove(),
         stop=RemainingEvidence(DLOGZ),
         return_interrupted=False,

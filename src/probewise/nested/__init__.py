@@ -14,10 +14,11 @@ from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, NestedResult
-from probewise.nested.sampler import run, step
+from probewise.nested.sampler import LIVE_PER_PARAM, least_live, run, step
 from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, StopRule
 
 __all__ = [
+    "LIVE_PER_PARAM",
     "Agreement",
     "Bound",
     "DiversifyTally",
@@ -41,6 +42,7 @@ __all__ = [
     "chain_memory",
     "diversify",
     "diversify_by_kernels",
+    "least_live",
     "merge",
     "pareto_k",
     "refine",

@@ -82,11 +82,14 @@ class _Near:
     def made_up(self, theta: FloatArray) -> FloatArray:
         """Log of the density of the plain prior over that of this one, (n,): the same over theta as over x."""
         x = self.space.enter(theta)
-        own = _log_student((x - self.center) @ self.inverse_root.T) - self.log_volume
+        own = _log_student(self._along(x)) - self.log_volume
         return np.asarray(self.space.leave(x)[1] - own)
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        return np.asarray((self.space.enter(theta) - self.center) @ self.inverse_root.T)
+        return self._along(self.space.enter(theta))
+
+    def _along(self, x: FloatArray) -> FloatArray:
+        return np.asarray((x - self.center) @ self.inverse_root.T)
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         theta, log_plain = self.space.leave(self.center + x @ self.root.T)

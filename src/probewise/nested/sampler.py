@@ -23,7 +23,10 @@ from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult, versions
 from probewise.nested.stop import RemainingEvidence, State, StopRule
 
-__all__ = ["Dead", "Live", "run", "step"]
+__all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "run", "step"]
+
+LIVE_PER_PARAM = 2
+"""Live points for each parameter, at least."""
 
 # Draw from the whole prior while a point costs fewer evaluations than a chain would.
 _PRIOR_VOLUME = 0.05
@@ -31,6 +34,11 @@ _PRIOR_VOLUME = 0.05
 _DOUBTFUL_P_VALUE = 1e-4
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
+
+
+def least_live(n_params: int) -> int:
+    """Count the fewest live points that a run accepts."""
+    return max(LIVE_PER_PARAM * n_params, 10)
 
 
 def step(
@@ -141,7 +149,7 @@ def run(
     """
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
-    least = max(2 * n_params, 10)
+    least = least_live(n_params)
     if n_live < least:
         raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
     if n_replaced is None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
-from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import Fit, degrees_of_freedom
 from probewise.diagnosis.search.weighed import Candidate, Search
 
@@ -67,7 +67,6 @@ def _imagined(search: Search, null: Candidate, name: str) -> Rival:
 
 
 def _root_of(found: Fit) -> FloatArray:
-    """Take the square root of the covariance of a fit's coordinates by Laplace, noise white."""
-    n_points, p = found.slopes.shape
-    variance = found.sd**2 * n_points / degrees_of_freedom(found.slopes, found.sd)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(found.slopes.T @ found.slopes / variance + np.eye(p))).T)
+    """Take the square root of the covariance of a fit's coordinates, noise white."""
+    free = degrees_of_freedom(found.slopes, found.sd)
+    return covariance_root(found.slopes, found.sd**2 * len(found.slopes) / free)

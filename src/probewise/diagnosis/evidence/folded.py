@@ -10,12 +10,11 @@ one.
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp, ndtri
+from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, frozen
 from probewise.diagnosis.evidence.joint import JointProblem, StandardNormal
@@ -25,47 +24,39 @@ __all__ = ["Folded", "folded"]
 
 
 @dataclass(frozen=True, eq=False)
-class FoldedNormal:
+class FoldedNormal(StandardNormal):
     """A standard normal prior, folded onto the order of a sensor's Gaussians that is nearest to a point.
 
     Parameters
     ----------
-    plain
-        What is folded.
+    n_params
+        Number of coordinates.
     sensor
         Whose Gaussians trade names; its coordinates come first.
     near
         The point, (n_params,).
     """
 
-    plain: StandardNormal
     sensor: SensorCoordinates
     near: FloatArray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "near", frozen(self.near))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Those of the coordinates."""
-        return self.plain.names
-
-    @property
-    def coordinates(self) -> FoldedNormal:
-        """Its own."""
-        return self
-
     @cached_property
-    def _orders(self) -> list[tuple[int, ...]]:
-        """All orders, as they stand first."""
-        return list(itertools.permutations(range(self.sensor.n_gaussians)))
+    def _other_orders(self) -> tuple[FloatArray, FloatArray]:
+        """Every other order's coordinates as z @ turn + shift: (n_others, n_own, n_own), (n_others, 1, n_own)."""
+        n_own = self.sensor.n_params
+        orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
+        shift = np.stack([self.sensor.renamed(np.zeros((1, n_own)), order) for order in orders])
+        return np.stack([self.sensor.renamed(np.eye(n_own), order) for order in orders]) - shift, shift
 
     def _images(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give every order's coordinates, (n_orders, n_samples, n_params), and how far each is from the point."""
+        turn, shift = self._other_orders
+        images = np.repeat(z[None], len(turn) + 1, axis=0)
         n_own = self.sensor.n_params
-        images = np.repeat(z[None], len(self._orders), axis=0)
-        for image, order in zip(images[1:], self._orders[1:], strict=True):
-            image[:, :n_own] = self.sensor.renamed(z[:, :n_own], order)
+        images[1:, :, :n_own] = z[:, :n_own] @ turn + shift
         return images, np.linalg.norm(images - self.near, axis=2)
 
     def fold(self, z: FloatArray) -> FloatArray:
@@ -75,25 +66,13 @@ class FoldedNormal:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map the unit cube to folded coordinates, (n_samples, n_params) both ways."""
-        return self.fold(np.asarray(ndtri(u)))
-
-    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Give one of the points of the unit cube that lead there."""
-        return self.plain.to_unit_cube(theta)
+        return self.fold(super().from_unit_cube(u))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Log density, (n_samples,): of all orders together, and -inf where another order is nearer."""
         images, far = self._images(theta)
-        density = logsumexp([self.plain.log_prob(image) for image in images], axis=0)
-        return np.where(far[0] <= far[1:].min(axis=0, initial=math.inf), density, -np.inf)
-
-    def enter(self, theta: FloatArray) -> FloatArray:
-        """Leave parameters as they are."""
-        return theta
-
-    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Leave coordinates as they are, and give their log density."""
-        return x, self.log_prob(x)
+        density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
+        return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,4 +104,4 @@ def folded(problem: JointProblem, near: FloatArray) -> JointProblem | Folded:
     sensor = problem.model.sensor
     if not (isinstance(sensor, SensorCoordinates) and sensor.exchangeable and sensor.n_gaussians > 1):
         return problem
-    return Folded(problem, FoldedNormal(problem.prior, sensor, near))
+    return Folded(problem, FoldedNormal(problem.model.n_params, sensor, near))

@@ -21,7 +21,7 @@ __all__ = ["JointProblem", "StandardNormal", "log_likelihood_of_whitened"]
 _HELD = 0.999  # of the evidence by the nodes of the noise that are kept; the rest is made up for
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StandardNormal:
     """The prior of a model's coordinates: independent, standard normal, and chains step in them as they are."""
 

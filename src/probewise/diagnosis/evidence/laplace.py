@@ -22,6 +22,7 @@ __all__ = [
     "Linearised",
     "NoiseEvidence",
     "block_log_bayes_factors",
+    "covariance_root",
     "mix_scales",
     "orthonormal",
     "project_scaled",
@@ -98,6 +99,15 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     out += [law.log_extra for law in laid_out.laws]
     out += laid_out.log_weights + log_multiplicity(found.model.sensor)
     return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, laid_out)
+
+
+def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
+    """Take a square root of the covariance of a fit's coordinates by Laplace, root root^T, (n_params, n_params).
+
+    Of whitened slopes (n_points, n_params), and the variance of a whitened reading.
+    """
+    curvature = slopes.T @ slopes / variance + np.eye(slopes.shape[1])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(curvature)).T)
 
 
 def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:

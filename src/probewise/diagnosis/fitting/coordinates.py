@@ -114,11 +114,18 @@ class CalibratedSensor(ABC):
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
-        return self.from_natural(self.center + z @ self.factor.T)
+        return self.from_natural(self._natural(z))
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
-        return np.asarray(np.linalg.solve(self.factor, (self.to_natural(theta) - self.center).T).T)
+        return self._scores(self.to_natural(theta))
+
+    def _natural(self, z: FloatArray) -> FloatArray:
+        return self.center + z @ self.factor.T
+
+    def _scores(self, natural: FloatArray) -> FloatArray:
+        """Invert `_natural`."""
+        return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
         """Build the chain over the plan's patterns."""
@@ -162,11 +169,11 @@ class SensorCoordinates(CalibratedSensor):
 
     def renamed(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
         """Give coordinates, (n_samples, n_params), of the same SSF with its Gaussians named in another order."""
-        n, natural = self.n_gaussians, self.center + z @ self.factor.T
+        n, natural = self.n_gaussians, self._natural(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
         parts = [logits[:, 1:] - logits[:, :1], blocks.reshape(len(z), 5 * n), natural[:, -2:]]
-        return np.asarray(np.linalg.solve(self.factor, (np.concatenate(parts, axis=1) - self.center).T).T)
+        return self._scores(np.concatenate(parts, axis=1))
 
 
 @lru_cache(maxsize=32)

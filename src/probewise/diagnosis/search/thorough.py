@@ -18,10 +18,10 @@ from probewise import nested
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
-from probewise.diagnosis.evidence.laplace import NoiseEvidence
+from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, weighed
-from probewise.diagnosis.search.weighed_twice import A_NAT, Weighing
+from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.errors import DoubtfulResultWarning
 
 __all__ = ["weigh_thoroughly"]
@@ -30,7 +30,6 @@ N_LIVE = 100
 
 _LEAST, _MOST = 2, 3  # hypotheses that are weighed again, the null apart
 _LEAST_PROBABILITY = 0.01
-_LEAST_LIVE = 2  # live points for each parameter
 _MOST_RUNS = 4  # from priors near the posterior
 _N_SAMPLES = 2000  # that say where that is
 _SHARP = 0.3  # nats: an error that leaves it open whether two evidences are a nat apart is too large
@@ -119,7 +118,7 @@ def _weigh(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = JointProblem(candidate.found.model, search.recording, evidence, search.sd_floor)
     once = folded(problem, candidate.found.z)
-    n_live = max(n_live, _LEAST_LIVE * problem.model.n_params)
+    n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
         nested.run,
         rng=rng,
@@ -130,16 +129,21 @@ def _weigh(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against the last of them is told
         explored = run(once)
-        about = _about(explored.samples(_N_SAMPLES, rng=rng), once, run, rng)
-        laplace = evidence.log_z - candidate.log_factor
-        if about.log_z < laplace - A_NAT - about.error:  # the search may have lost the peak that the fit has found
-            fitted = _about(_of_laplace(candidate, evidence, rng), once, run, rng)
-            about = max(about, fitted, key=lambda found: found.log_z)
-    doubts = about.warnings
-    apart = (explored.log_z - about.log_z) / math.hypot(explored.log_z_error, about.error)
-    if apart >= _APART:
-        doubts = (*doubts, f"the whole prior holds more than what was found in it, by {apart:.1f} standard errors")
-    return replace(weighing, nested=about.log_z + candidate.log_factor, error=about.error, doubts=doubts)
+
+        def about(theta: FloatArray) -> Weighing:
+            found = _about(theta, once, run, rng)
+            log_z = found.log_z + candidate.log_factor
+            return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
+
+        told = about(explored.samples(_N_SAMPLES, rng=rng))
+        if told.gap < 0 and not told.agree:  # the search may have lost the peak that the fit has found
+            told = max(told, about(_of_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
+    more = explored.log_z + candidate.log_factor - told.nested
+    apart = more / math.hypot(explored.log_z_error, told.error)
+    if apart < _APART:
+        return told
+    doubt = f"the whole prior holds more than what was found in it, by {apart:.1f} standard errors"
+    return replace(told, doubts=(*told.doubts, doubt))
 
 
 def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:
@@ -163,10 +167,9 @@ def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.rando
 def _of_laplace(candidate: Candidate, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
     """Draw from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
-    slopes = evidence.law(found.slopes) / found.sd
-    root = np.linalg.cholesky(slopes.T @ slopes + np.eye(len(found.z)))
+    root = covariance_root(evidence.law(found.slopes), found.sd**2)
     draws = rng.standard_normal((_N_SAMPLES, len(found.z)))
-    return np.clip(found.z + np.linalg.solve(root.T, draws.T).T, -FARTHEST, FARTHEST)
+    return np.clip(found.z + draws @ root.T, -FARTHEST, FARTHEST)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["A_NAT", "Weighing", "with_agreement"]
+__all__ = ["Weighing", "with_agreement"]
 
 A_NAT = 1.0
 

@@ -98,6 +98,14 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     assert found.unknown_probability < 0.05
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
+    """What differs between ways to come holds hysteresis and more; were it not spoken for, a tenth would be unknown."""
+    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=seed), rng=np.random.default_rng(0))
+    assert found.combination == ("hysteresis",)
+    assert found.unknown_probability < 0.03
+
+
 def test_backlash_is_named_measured_located_and_repaired():
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     document = strict(found)

@@ -150,6 +150,7 @@ class _Searcher:
         self._speak_for_the_unnamed()
         refitted = [c for c in self.candidates.values() if c.names]
         self._weigh_unknown(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
+        self._speak_for_the_unknown()
         return self._weighed_up()
 
     def _weighed_up(self) -> Search:
@@ -428,6 +429,26 @@ class _Searcher:
             if outside(names) and any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
                 self.spoken_for.add(names)
         self.candidates = {key: c for key, c in self.candidates.items() if key[1] not in self.spoken_for}
+
+    def _speak_for_the_unknown(self) -> None:
+        """Leave out something unknown alone where one name explains as much, and leaves nothing for it to explain.
+
+        A basis of many columns, what differs from scan to scan say, holds the traces of named effects too.
+        """
+        least = max((value for (_, names, _), value in self.unknown.items() if not names), default=np.inf) - TOO_ALIKE
+        singles = [c for c in self.candidates.values() if len(c.names) == 1 and not outside(c.names)]
+        for candidate in sorted((c for c in singles if c.log_z >= least), key=lambda c: -c.log_z):
+            if self._left_beside(candidate) < TOO_ALIKE:
+                self.unknown = {key: value for key, value in self.unknown.items() if key[1]}
+                return
+
+    def _left_beside(self, candidate: Candidate) -> float:
+        """Give the log Bayes factor of something unknown beside a candidate, under the noise where it is greatest."""
+        own = candidate.n_gaussians, candidate.names
+        if not any(key[:2] == own for key in self.unknown):
+            self._weigh_unknown([candidate])
+        weighed = ((noise, value) for (*held, noise), value in self.unknown.items() if tuple(held) == own)
+        return max((value - candidate.evidence[noise].log_z for noise, value in weighed), default=-np.inf)
 
     def _weigh_unknown(self, candidates: Sequence[Candidate]) -> None:
         """Weigh something unknown beside each candidate."""

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from probewise.challenge import NullRefit, score
-from probewise.challenge.likeness import cosines
+from probewise.challenge.likeness import cosines, left_beside
 from probewise.effects import VOCABULARY
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
-from probewise.world.concealed import AmbientStep, Halo
+from probewise.world.concealed import AlbedoPatch, AmbientStep, Halo, Hysteresis, Saturation
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -82,6 +82,21 @@ def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, 
     assert cosines(refit, clean, skirt)["ssf_order"] > 0.99
     step = replace(world, concealed=(AmbientStep(0.4, 300.0),)).simulate(plan, rng=None)
     assert "ssf_order" not in cosines(refit, clean, step)
+
+
+def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan, clean):
+    """Two routes: one effect fitted to both, and the null fitted to the other alone."""
+    hidden = AmbientStep(0.8, float(np.quantile(plan.time_s, 0.4))), Hysteresis(0.5)
+    both = replace(world, concealed=hidden).simulate(plan, rng=None)
+    alone = replace(world, concealed=hidden[1:]).simulate(plan, rng=None)
+    assert left_beside(refit, clean, both, "ambient_step") == pytest.approx(refit(clean, alone), rel=0.1)
+
+
+def test_a_ceiling_hides_what_is_above_it(refit, world, plan, clean):
+    patch = AlbedoPatch(0.05, 10.0, 0.0, 4.0)
+    alone = replace(world, concealed=(patch,)).simulate(plan, rng=None)
+    both = replace(world, concealed=(patch, Saturation(45.0))).simulate(plan, rng=None)
+    assert left_beside(refit, clean, both, "saturation") < 0.3 * refit(clean, alone)
 
 
 def test_an_alarm_is_due_on_physics_alone(make):

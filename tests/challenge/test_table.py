@@ -166,6 +166,17 @@ def test_both_of_a_pair_have_to_be_named(make):
     assert row(results, "two effects: a false extra").found.value == 0.5
 
 
+def test_a_pair_of_which_one_hides_the_other_is_counted_apart(make):
+    def pair(beside, *said):
+        hides = [make.hidden(name, 12.0) | {"size_beside": left} for name, left in (("halo", 12.0), ("lag", beside))]
+        return make.case("pair", 12.0, truth=["halo", "lag"], hides=hides, said=said)
+
+    results = [pair(11.0, "halo", "lag"), pair(2.0, "halo"), pair(9.8, "halo", "lag"), pair(10.0, "halo")]
+    assert row(results, "two effects: both named").found.value == 0.5
+    shown = row(results, "  where neither hides the other").found
+    assert (shown.value, shown.n) == (pytest.approx(2 / 3), 3)
+
+
 def test_what_has_no_name_should_be_unknown_and_nothing_else(make):
     results = [
         make.outside(),

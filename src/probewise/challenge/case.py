@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise.challenge.covering import parameters_within, place_overlap, sensor_within
 from probewise.challenge.held_out import log_densities
-from probewise.challenge.likeness import cosines
+from probewise.challenge.likeness import cosines, left_beside
 from probewise.challenge.surviving import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
@@ -76,7 +76,9 @@ def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
         "noise_model": truth.noise_model,
         "readings": len(case.recording),
         "truth": list(truth.combination),
-        "hidden": [_hidden(hidden, ruler, refit) for hidden in truth.hidden],
+        "hidden": [
+            _hidden(hidden, ruler, refit) | _beside(hidden, truth.hidden, ruler, refit) for hidden in truth.hidden
+        ],
         "alias": None if truth.alias is None else truth.alias.effect.name,
         "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
     }
@@ -95,6 +97,16 @@ def _hidden(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
         "shows_in": list(hidden.shows_in),
         "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
     }
+
+
+def _beside(hidden: Hidden, everything: Sequence[Hidden], ruler: Ruler, refit: NullRefit) -> dict[str, float]:
+    """Tell how large an effect still is where the other of two is named."""
+    others = [other for other in everything if other is not hidden]
+    if len(others) != 1:
+        return {}
+    both = ruler.recording(*(one.effect for one in everything))
+    left = left_beside(refit, ruler.clean, both, others[0].name)
+    return {"size_beside": left / ruler.setting.world.noise_sd}
 
 
 def _diagnosed(case: Case, task: Task) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How alike a concealed effect is to every effect that a diagnosis could name instead."""
+"""How alike a concealed effect is to every effect that a diagnosis could name instead, and what one of two leaves."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.challenge.surviving import NullRefit
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
-from probewise.diagnosis.evidence.templates import effect_templates
+from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.fitting.fit import Fit, fit
 from probewise.diagnosis.noise.law import white
 from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["cosines"]
+__all__ = ["cosines", "left_beside"]
 
 _WORTH_A_REFIT = 0.8
+_STARTS = 3  # entries of an effect's bank that are refitted where one effect of two is to be taken up
 _LIKE_AN_SSF = ("halo", "edge_blur")  # what looks like these may be an SSF of one Gaussian more
 
 
@@ -56,31 +58,69 @@ def cosines(
         effect = kind.for_extent(extent)
         if effect is None or effect.stage is Stage.NOISE:
             continue
-        templates = effect_templates(found, effect, usable)
-        blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
-        taken = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
+        templates, taken = _weighed(problem, found, effect, usable)
         best = int(np.argmax(taken))
         rho = float(np.sqrt(min(taken[best] / float(problem.residual @ problem.residual), 1.0)))
         if rho > _WORTH_A_REFIT:
-            columns, setting = templates.columns[best], templates.settings[best]
-            amount = np.linalg.lstsq(problem.project(columns), problem.residual)[0]
-            start = effect.start(setting, np.asarray(amount, dtype=np.float64))
-            z = found.z + problem.absorbed(found, columns @ amount)
-            rho = _refitted(found, templates.variant(best), start, z, refit.exact(clean, changed))
+            exact = refit.exact(clean, changed)
+            rho = _taken_up(found, _with_effect(problem, found, effect, templates, best, exact))
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
         out["ssf_order"] = _taken_up(found, refit.with_one_more(found, clean, changed))
     return out
 
 
-def _refitted(found: Fit, effect: NamedEffect[Any], start: FloatArray, z: FloatArray, exact: Recording) -> float:
-    model = found.model.with_effect(effect)
+def left_beside(refit: NullRefit, clean: Recording, both: Recording, name: str) -> float:
+    """Tell what is left of two effects where one of them is named, in units of the reading: what shows of the other.
+
+    Parameters
+    ----------
+    refit
+        The null.
+    clean, both
+        Noise-free readings without any effect and with both.
+    name
+        The one that is fitted, together with the null.
+
+    Returns
+    -------
+    Root of the sum of squares of the residuals: in noise sds, the size of the other beside it. Readings that a ceiling
+    cuts off say nothing of a paler patch, however large it would be alone.
+    """
+    found, exact = refit.refit(clean, both), refit.exact(clean, both)
+    usable = np.flatnonzero(clean.usable)
+    problem = Linearised.of(found, white(len(usable)))
+    effect = VOCABULARY[name].for_extent(Extent.of(clean))
+    if effect is None:
+        raise ParameterError("name", name, "an effect that this plan can show")
+    templates, taken = _weighed(problem, found, effect, usable)
+    fits = [_with_effect(problem, found, effect, templates, int(k), exact) for k in np.argsort(-taken)[:_STARTS]]
+    return min(float(np.linalg.norm(by.residuals)) for by in fits)
+
+
+def _weighed(
+    problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
+) -> tuple[EffectTemplates, FloatArray]:
+    """Lay out an effect's bank, and what each entry takes up of the sum of squares, (n_entries,)."""
+    templates = effect_templates(found, effect, usable)
+    blocks = Blocks.of(problem, templates.columns, [effect.name] * len(templates.columns))
+    return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
+
+
+def _with_effect(
+    problem: Linearised, found: Fit, effect: NamedEffect[Any], templates: EffectTemplates, at: int, exact: Recording
+) -> Fit:
+    """Refit the null and an effect from an entry of its bank."""
+    columns, setting = templates.columns[at], templates.settings[at]
+    amount = np.linalg.lstsq(problem.project(columns), problem.residual)[0]
+    start = effect.start(setting, np.asarray(amount, dtype=np.float64))
+    z = found.z + problem.absorbed(found, columns @ amount)
+    model = found.model.with_effect(templates.variant(at))
     start_z = np.concatenate([z, model.scores_of(start[None, :])[0]])
     rss = float(found.residuals @ found.residuals)
     # As floor of the sd a tenth of what survives: far enough below it to be seen, and no exact fit is asked for.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))
-    with_effect = fit(model, exact, start_z, white(len(found.residuals)), sd_floor=floor, tolerance=0.02)
-    return _taken_up(found, with_effect)
+    return fit(model, exact, start_z, white(len(found.residuals)), sd_floor=floor, tolerance=0.02)
 
 
 def _taken_up(found: Fit, by: Fit) -> float:

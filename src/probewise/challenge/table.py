@@ -34,6 +34,7 @@ Decision: TypeAlias = Literal["met", "missed", "open"]
 Result: TypeAlias = Mapping[str, Any]
 
 _GAUSSIAN = ("gaussian", "two_lobes")  # SSFs that are mixtures of Gaussians
+_BESIDE = 0.8  # of an effect's size, where another is named: sqrt(1 - 0.5^2) at the largest cosine, and some tolerance
 _SCANS = ("angle", "pattern", "direction")
 
 
@@ -240,11 +241,18 @@ def _ratio(gains: FloatArray) -> float:
 def _pairs(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [leading_name_right(r) for r in pairs]
+    shown = [right for r, right in zip(pairs, both, strict=True) if _each_shows(r)]
     more = [bool(extras(_mean_names(r), answers(r, merged=True, noise=False))) for r in pairs]
     return [
         Row("two effects: both named", share(both), 0.95),
+        Row("  where neither hides the other", share(shown)),
         Row("two effects: a false extra", share(more), most=0.03),
     ]
+
+
+def _each_shows(result: Result) -> bool:
+    """Tell whether each of two effects is about as large beside the other as their cosine promises."""
+    return all(h.get("size_beside", 0.0) >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
 def _outside(done: list[Result]) -> list[Row]:

@@ -434,7 +434,7 @@ def test_verdicts_follow_the_probabilities(probability, verdict, combination):
 
 
 @pytest.mark.parametrize(
-    ("lag", "verdict"), [(0.1, "cannot_tell"), (0.02, "named")], ids=["a rival", "out of the question"]
+    ("lag", "verdict"), [(0.3, "cannot_tell"), (0.1, "named")], ids=["a rival", "out of the question"]
 )
 def test_what_readings_cannot_tell_apart_is_not_named(lag, verdict):
     """Half of the probability is not enough where priors alone may have parted two that predict the same."""

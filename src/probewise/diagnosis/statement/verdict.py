@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -14,7 +13,6 @@ from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.repair.mending import Improvement
 from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.locate import Place
-from probewise.diagnosis.search.weighed import TOO_ALIKE
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.recordings.plan import Recording
 
@@ -29,7 +27,7 @@ __all__ = [
     "decide",
 ]
 
-_OUT_OF_THE_QUESTION = math.exp(-TOO_ALIKE)  # of the leader's probability
+_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 

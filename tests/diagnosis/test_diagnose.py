@@ -129,6 +129,16 @@ def test_backlash_is_named_measured_located_and_repaired():
     assert sensor.names[-1] == "backlash.width_mm"
 
 
+def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
+    monkeypatch.setattr("probewise.diagnosis.engine.global_p_value", lambda *_: 0.2)
+    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("cannot_tell", ())
+    assert found.hypotheses[0].effects == ("hysteresis",)
+    amp = found.repaired.columns("hysteresis")[:, 0]
+    # The share that does without it is that of the rest.
+    assert np.mean(amp != 0) == pytest.approx(found.hypotheses[0].probability, abs=0.05)
+
+
 def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
     plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)

@@ -193,7 +193,7 @@ class _Diagnoser:
             by_mean = self.search.by_mean
             named = {names: by_mean[names] for names in ensemble.likely(best) if names}
             written = ensemble.averaged(best, {**named, (): 1 - sum(named.values())})
-        elif verdict in ("named", "cannot_tell") and best.names:
+        elif verdict in ("named", "cannot_tell") and not (few or fails):  # also where no alarm lets a name be given
             written = ensemble.averaged(best, ensemble.likely(best))
         null_samples = samples if best is null else ensemble.of(null)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)

@@ -420,13 +420,17 @@ class _Searcher:
             self._keep(candidate)
 
     def _speak_for_the_unnamed(self) -> None:
-        """Leave out what is outside the vocabulary where the readings cannot tell it from what is inside."""
+        """Leave out what is outside the vocabulary where the readings do not tell it from what is inside.
+
+        Or are not expected to: a push, of three parameters, finds more in the noise than a tilt, of two.
+        """
         by_name = sorted(self.candidates.values(), key=lambda c: c.log_z)
         leading = {c.names: c for c in by_name if c.names}
         named = [c for names, c in leading.items() if not outside(names)]
         for names, candidate in leading.items():
-            rivals = (c for c in named if len(c.names) <= len(names))
-            if outside(names) and any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
+            rivals = [c for c in named if len(c.names) <= len(names)]
+            near = any(c.log_z > candidate.log_z - TOO_ALIKE or nats_apart(candidate, c) < TOO_ALIKE for c in rivals)
+            if outside(names) and near:
                 self.spoken_for.add(names)
         self.candidates = {key: c for key, c in self.candidates.items() if key[1] not in self.spoken_for}
 

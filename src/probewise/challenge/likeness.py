@@ -14,14 +14,13 @@ from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templ
 from probewise.diagnosis.fitting.fit import Fit, fit
 from probewise.diagnosis.noise.law import white
 from probewise.effects import VOCABULARY, Extent, NamedEffect
-from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
 __all__ = ["cosines", "left_beside"]
 
 _WORTH_A_REFIT = 0.8
-_STARTS = 3  # entries of an effect's bank that are refitted where one effect of two is to be taken up
+_STARTS = 3  # variants of an effect that are refitted where it is one of two
 _LIKE_AN_SSF = ("halo", "edge_blur")  # what looks like these may be an SSF of one Gaussian more
 
 
@@ -58,7 +57,7 @@ def cosines(
         effect = kind.for_extent(extent)
         if effect is None or effect.stage is Stage.NOISE:
             continue
-        templates, taken = _weighed(problem, found, effect, usable)
+        templates, taken = _taken_by_each(problem, found, effect, usable)
         best = int(np.argmax(taken))
         rho = float(np.sqrt(min(taken[best] / float(problem.residual @ problem.residual), 1.0)))
         if rho > _WORTH_A_REFIT:
@@ -91,14 +90,16 @@ def left_beside(refit: NullRefit, clean: Recording, both: Recording, name: str) 
     usable = np.flatnonzero(clean.usable)
     problem = Linearised.of(found, white(len(usable)))
     effect = VOCABULARY[name].for_extent(Extent.of(clean))
-    if effect is None:
-        raise ParameterError("name", name, "an effect that this plan can show")
-    templates, taken = _weighed(problem, found, effect, usable)
-    fits = [_with_effect(problem, found, effect, templates, int(k), exact) for k in np.argsort(-taken)[:_STARTS]]
+    fits = [found]
+    if effect is not None:
+        templates, taken = _taken_by_each(problem, found, effect, usable)
+        best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # of each variant, the best last
+        starts = [*best.values()][-_STARTS:]
+        fits += [_with_effect(problem, found, effect, templates, at, exact) for at in starts]
     return min(float(np.linalg.norm(by.residuals)) for by in fits)
 
 
-def _weighed(
+def _taken_by_each(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
     """Lay out an effect's bank, and what each entry takes up of the sum of squares, (n_entries,)."""

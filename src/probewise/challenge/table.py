@@ -252,7 +252,7 @@ def _pairs(done: list[Result]) -> list[Row]:
 
 def _each_shows(result: Result) -> bool:
     """Tell whether each of two effects is about as large beside the other as their cosine promises."""
-    return all(h.get("size_beside", 0.0) >= _BESIDE * h["size_lambda"] for h in result["hidden"])
+    return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
 def _outside(done: list[Result]) -> list[Row]:

@@ -20,6 +20,7 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.repair.ensemble import Ensemble
 from probewise.diagnosis.repair.mending import Improvement, corrected, improvement_of
+from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.fine_structure import fine_structure
 from probewise.diagnosis.residuals.locate import ALARM, Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.search.search import search
@@ -189,12 +190,10 @@ class _Diagnoser:
         if verdict == "unknown" and best is not null:
             share = max(1 - self.search.by_mean[foreseen], _LEAST_DOUBT) if foreseen else _DOUBT_BESIDE
             written = ensemble.averaged(best, {best.names: 1 - share, (): share})
-        elif verdict == "unknown":  # to the plain sensor what has no name; what has one may still be it
-            by_mean = self.search.by_mean
-            named = {names: by_mean[names] for names in ensemble.likely(best) if names}
-            written = ensemble.averaged(best, {**named, (): 1 - sum(named.values())})
-        elif verdict in ("named", "cannot_tell") and not (few or fails):  # also where no alarm lets a name be given
+        elif verdict in ("named", "cannot_tell") and best.names:
             written = ensemble.averaged(best, ensemble.likely(best))
+        elif verdict in ("unknown", "cannot_tell") and not (few or fails):
+            written = self._left_open(ensemble, null, noise_of, p_value)
         null_samples = samples if best is null else ensemble.of(null)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)
         where = self._where(null, problem, draws, best, effects, p_value)
@@ -258,6 +257,16 @@ class _Diagnoser:
         """Lay the repaired model out as a linear problem, and measure what it gains over the null."""
         after = Linearised.of(best.found, best.evidence[noise].law)
         return after, improvement_of(self.search, null, best, noise, after, p_value, rng=self.rng)
+
+    def _left_open(self, ensemble: Ensemble, null: Candidate, noise: Names, p_value: float) -> ModelSamples:
+        """Average over hypotheses where none is stated: what has a name may be it all the same, the rest is plain."""
+        by_mean = self.search.by_mean
+        named = {names for _, names in self.search.candidates if not outside(names)}
+        best = self.search.best(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or null
+        if best.names and self._judged(null, best, noise, p_value)[1].heldout_log_density_per_reading < _RUIN:
+            return ensemble.of(null)
+        shares = {names: by_mean.get(names, 0.0) for names in ensemble.likely(best) if names}
+        return ensemble.averaged(best, {**shares, (): 1 - sum(shares.values())})
 
     def _p_value(self, null: Candidate, noise: Names, problem: Linearised, draws: FloatArray) -> float:
         """Test that nothing is missing from the mean, be the SSF of the null's order, of a greater one, or finer still.

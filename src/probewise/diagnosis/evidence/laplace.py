@@ -81,7 +81,8 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     """Integrate a fit's likelihood over its parameters and the noise sd (Laplace), and the noise model's nodes.
 
     At each node the fit is carried to its new optimum by the linearised model, so that a correlation
-    is judged without the bias of residuals that were fitted as if white.
+    is judged without the bias of residuals that were fitted as if white. Where the floor of the sd is above what is
+    left, the integral over the sd is taken to be as wide as elsewhere.
     """
     laid_out = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
@@ -126,9 +127,9 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd
         return np.asarray(np.maximum(rss, 0.0))
 
     for _ in range(3):
-        variance = np.maximum(squares() / n_points, sd_floor**2)[:, None]
-        curvature = jj / variance[:, :, None] + np.eye(p)
-        steps = np.asarray(np.linalg.solve(curvature, (jr / variance - found.z)[:, :, None])[:, :, 0])
+        variance = np.maximum(squares() / n_points, sd_floor**2)
+        curvature = jj / variance[:, None, None] + np.eye(p)
+        steps = np.asarray(np.linalg.solve(curvature, (jr / variance[:, None] - found.z)[:, :, None])[:, :, 0])
     fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
     rss = squares()
     variance = np.maximum(rss / n_points, sd_floor**2)

@@ -197,7 +197,7 @@ class Tail:
         squares = whitened**2
         if start is None:  # from the middle half of what is not lost, which the tail leaves alone
             middle = len(whitened) - n_points // 2 - 1
-            sigma = np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745 + floor + _LEAST
+            sigma = np.maximum(np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745, floor) + _LEAST
         else:
             sigma = start
         for _ in range(_EM_STEPS if start is None else 3):

@@ -420,18 +420,23 @@ class _Searcher:
             self._keep(candidate)
 
     def _speak_for_the_unnamed(self) -> None:
-        """Leave out what is outside the vocabulary where the readings do not tell it from what is inside.
+        """Let what is outside the vocabulary give way to what is inside where the readings do not tell the two.
 
-        Or are not expected to: a push, of three parameters, finds more in the noise than a tilt, of two.
+        Where they are not expected to, it is left out. Where they have told it by less, a push of three parameters from
+        a tilt of two, it is believed no more than the name is: what it has found beyond that may be noise.
         """
-        by_name = sorted(self.candidates.values(), key=lambda c: c.log_z)
+        by_name = sorted(self.candidates.values(), key=self._believed)
         leading = {c.names: c for c in by_name if c.names}
-        named = [c for names, c in leading.items() if not outside(names)]
         for names, candidate in leading.items():
-            rivals = [c for c in named if len(c.names) <= len(names)]
-            near = any(c.log_z > candidate.log_z - TOO_ALIKE or nats_apart(candidate, c) < TOO_ALIKE for c in rivals)
-            if outside(names) and near:
+            if not outside(names):
+                continue
+            rivals = [c for c in leading.values() if not outside(c.names) and len(c.names) <= len(names)]
+            if any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
                 self.spoken_for.add(names)
+            ahead = self._believed(candidate) - max((self._believed(c) for c in rivals), default=-np.inf)
+            if 0 < ahead < TOO_ALIKE:
+                for own in [c for c in self.candidates.values() if c.names == names]:
+                    self._keep(own.as_share(own.log_share - ahead, own.weights))
         self.candidates = {key: c for key, c in self.candidates.items() if key[1] not in self.spoken_for}
 
     def _speak_for_the_unknown(self) -> None:
@@ -439,20 +444,29 @@ class _Searcher:
 
         A basis of many columns, what differs from scan to scan say, holds the traces of named effects too.
         """
-        least = max((value for (_, names, _), value in self.unknown.items() if not names), default=np.inf) - TOO_ALIKE
+        alone = max((self._unknown_beside(c) for c in self._nulls()), default=-np.inf)
         singles = [c for c in self.candidates.values() if len(c.names) == 1 and not outside(c.names)]
-        for candidate in sorted((c for c in singles if c.log_z >= least), key=lambda c: -c.log_z):
-            if self._left_beside(candidate) < TOO_ALIKE:
+        for candidate in sorted(singles, key=self._believed, reverse=True):
+            if self._believed(candidate) < alone - TOO_ALIKE:
+                break
+            if not any(key[:2] == (candidate.n_gaussians, candidate.names) for key in self.unknown):
+                self._weigh_unknown([candidate])
+            if self._unknown_beside(candidate) - self._believed(candidate) < TOO_ALIKE:
                 self.unknown = {key: value for key, value in self.unknown.items() if key[1]}
-                return
+                break
 
-    def _left_beside(self, candidate: Candidate) -> float:
-        """Give the log Bayes factor of something unknown beside a candidate, under the noise where it is greatest."""
+    def _believed(self, candidate: Candidate) -> float:
+        """Give the log evidence of a candidate under whatever noise."""
+        return self._under_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
+
+    def _unknown_beside(self, candidate: Candidate) -> float:
+        """Give the log evidence of something unknown beside a candidate under whatever noise."""
         own = candidate.n_gaussians, candidate.names
-        if not any(key[:2] == own for key in self.unknown):
-            self._weigh_unknown([candidate])
-        weighed = ((noise, value) for (*held, noise), value in self.unknown.items() if tuple(held) == own)
-        return max((value - candidate.evidence[noise].log_z for noise, value in weighed), default=-np.inf)
+        return self._under_all({key[2]: value for key, value in self.unknown.items() if key[:2] == own})
+
+    def _under_all(self, log_z: Mapping[Names, float]) -> float:
+        values = [value + self.noises.log_prior(noise) for noise, value in log_z.items()]
+        return float(logsumexp(values)) if values else -math.inf
 
     def _weigh_unknown(self, candidates: Sequence[Candidate]) -> None:
         """Weigh something unknown beside each candidate."""

@@ -18,6 +18,7 @@ from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
+from probewise.diagnosis.noise.models import least_sd
 from probewise.diagnosis.repair.ensemble import Ensemble
 from probewise.diagnosis.repair.mending import Improvement, corrected, improvement_of
 from probewise.diagnosis.repair.repaired import ModelSamples
@@ -38,7 +39,6 @@ from probewise.diagnosis.statement.verdict import (
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
-from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
@@ -104,7 +104,7 @@ def diagnose(
     recording = everything if len(rows) == len(everything) else everything.take(rows)
     extent = Extent.of(recording)
     fitted = {name: kind.for_extent(extent) for name, kind in {**effects, **UNNAMED, **NUISANCES}.items()}
-    floor = sd_floor(recording)
+    floor = least_sd(recording)
     known = null
     if sensor is not None:
         known = sensor_of(sensor)

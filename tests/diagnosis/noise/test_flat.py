@@ -7,11 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.noise.flat import Flat
 from probewise.diagnosis.noise.law import NoiseLaw, forms
+from probewise.diagnosis.noise.models import NoiseModel, least_sd, rough_sd
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.effects import VOCABULARY, Extent
@@ -31,6 +33,11 @@ def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recordi
     mean = World(spot, concealed=concealed).expected(plan)
     readings = mean + noise_sd * np.random.default_rng(seed).standard_normal(len(plan))
     return Recording(plan, STEP * np.round(readings / STEP))
+
+
+def as_declared(recording: Recording) -> Recording:
+    instrumentation = dataclasses.replace(recording.plan.instrumentation, step=STEP)
+    return dataclasses.replace(recording, plan=dataclasses.replace(recording.plan, instrumentation=instrumentation))
 
 
 def noises(recording: Recording) -> Noises:
@@ -97,11 +104,55 @@ def test_no_pseudo_observation_is_farther_than_what_was_read():
     assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
 
 
+@pytest.mark.parametrize("declared", [False, True])
 @pytest.mark.parametrize(("noise_sd", "coarse"), [(0.4, True), (3.0, False)])
-def test_rounding_that_hides_the_noise_stands_alone(noise_sd, coarse):
-    found = noises(rounded(noise_sd, 1))
-    assert found.certain == ("quantisation",)
-    assert (list(found.models) == [("quantisation",)]) is coarse
+def test_rounding_that_hides_the_noise_leaves_only_what_single_readings_show(noise_sd, coarse, declared):
+    recording = rounded(noise_sd, 1)
+    found = noises(as_declared(recording) if declared else recording)
+    assert found.certain == (() if declared else ("quantisation",))
+    others = {name for names in found.models for name in names} - {"quantisation"}
+    assert (others == {"outliers", "dropouts"}) is coarse
+    laws = found.models[found.certain].laws(recording.readings).laws
+    assert all(law.flat > 0 for law in laws) is coarse
+
+
+@pytest.mark.parametrize("noise_sd", [0.5, 1.0, 3.0])
+def test_the_noise_of_rounded_readings_is_told_without_a_model(noise_sd):
+    """Rounding and all; the median of few values would be one of them. Less noise than half a step is told as less."""
+    rng = np.random.default_rng(5)
+    plan = paper_plan()
+    mean = 20 + 0.15 * np.arange(len(plan))
+    readings = Recording(plan, np.round(mean + noise_sd * rng.standard_normal(len(plan))))
+    wanted = np.sqrt(noise_sd**2 + 1 / 12 + 1 / 72)  # rounding, and what is the same spread over a step
+    assert rough_sd(readings) == pytest.approx(wanted, rel=0.2)
+
+
+def test_no_normal_law_sums_to_more_than_one_over_a_lattice():
+    """As narrow as it may be, about any mean, to a third of a percent."""
+    sd = least_sd(rounded(0.4, 1))
+    cells = STEP * np.arange(-9, 10)
+    sums = STEP * norm.pdf(cells, np.linspace(0, STEP / 2, 9)[:, None], sd).sum(axis=1)
+    np.testing.assert_allclose(sums, 1.0, atol=3.4e-3)
+    narrower = STEP * norm.pdf(cells, 0.0, 0.4 * STEP).sum()
+    assert narrower > 1.08
+
+
+@pytest.mark.parametrize("noise_sd", [0.3, 0.9, 1.6])
+def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
+    """Route two: a fine grid of its logarithm, each reading the probability of its cell."""
+    rng = np.random.default_rng(7)
+    plan = paper_plan()
+    mean = 50 + 35 * np.sin(np.arange(len(plan)))
+    recording = Recording(plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP))
+    laid_out = NoiseModel((), recording, rounding=STEP).laws(mean)
+    off = (recording.readings - mean)[:, None]
+    each = np.array([-law.misfit(off, law.scale(off))[0] for law in laid_out.laws])
+
+    log_sigma = np.linspace(np.log(STEP / 30), np.log(3 * STEP), 1201)
+    cell = norm.cdf((off + STEP / 2) / np.exp(log_sigma)) - norm.cdf((off - STEP / 2) / np.exp(log_sigma))
+    grid = np.log(np.maximum(cell, 1e-300) / STEP).sum(axis=0) + 0.5 * len(plan) * np.log(2 * np.pi)
+    wanted = logsumexp(grid) + np.log(log_sigma[1] - log_sigma[0])
+    assert logsumexp(each + laid_out.log_weights) == pytest.approx(wanted, abs=0.1)
 
 
 @pytest.mark.parametrize("noise_sd", [0.3, 0.7])
@@ -120,3 +171,20 @@ def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
     slope = next(effect for effect in found.effects if effect.name == "ambient_gradient").parameters[0]
     assert abs(slope.mean - 0.15) < 4 * slope.sd
     assert dataclasses.asdict(found.improvement)["log_evidence"] > 10
+
+
+@pytest.mark.parametrize("noise_sd", [0.9, 1.4])
+def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):
+    found = diagnose(as_declared(rounded(noise_sd, 1)), rng=np.random.default_rng(0))
+    assert (found.verdict, found.noise.model) == ("clean", "white")
+    assert found.p_value > 0.01  # one test each
+    sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
+    assert sigma == pytest.approx(np.hypot(noise_sd, STEP / np.sqrt(12)), rel=0.15)
+
+
+def test_lost_readings_are_found_among_coarsely_rounded_ones():
+    whole = rounded(0.4, 1)
+    readings = whole.readings.copy()
+    readings[np.random.default_rng(3).choice(len(readings), 8, replace=False)] = 0.0
+    found = diagnose(as_declared(Recording(whole.plan, readings)), rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("noise", ("dropouts",))

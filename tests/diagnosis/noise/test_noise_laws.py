@@ -66,10 +66,10 @@ def test_a_tail_that_is_not_there_is_none():
     """With the floor of the scale too: white and nearly white noise are to have the same evidence."""
     z = np.random.default_rng(2).normal(size=(50, 2))
     thin, none = heavy(1e-12, 3.0), white(50)
-    for floor in (0.0, 0.3):
+    for floor in (0.0, 3.0):
         sigma = none.scale(z, floor=floor)
         np.testing.assert_allclose(thin.scale(z, floor=floor), sigma, rtol=1e-6)
-        np.testing.assert_allclose(thin.misfit(z, sigma, floor=floor), none.misfit(z, sigma, floor=floor), rtol=1e-6)
+        np.testing.assert_allclose(thin.misfit(z, sigma), none.misfit(z, sigma), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
@@ -101,12 +101,12 @@ def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
     ids=lambda e: type(e).__name__,
 )
 def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
-    """Route two: a grid over both, for each node."""
+    """Route two: a grid over both, for each node. A floor of the scale that is below it plays no part."""
     rng = np.random.default_rng(4)
     slope = rng.normal(size=N)
     noise = SD * rng.normal(size=N) * np.where(rng.random(N) < 0.03, 6.0, 1.0)
     found, recording = found_with(noise, slope)
-    evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording), sd_floor=1e-6)
+    evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording), sd_floor=0.6 * SD)
     step = np.linspace(-0.2, 0.2, 161)
     log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
     for node in (0, len(evidence.laid_out.laws) // 2):

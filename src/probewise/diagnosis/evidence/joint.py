@@ -110,5 +110,5 @@ def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray, sd_floor: fl
     n_points = law.n_points
     sigma = law.scale(whitened, floor=sd_floor)
     curvature = law.tail.scale_curvature(whitened, sigma, n_points) if not law.tail.is_normal else 2.0 * n_points
-    peak = -law.misfit(whitened, sigma, floor=sd_floor) - 0.5 * n_points * math.log(2 * math.pi)
+    peak = -law.misfit(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
     return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.log_det() + law.log_extra)

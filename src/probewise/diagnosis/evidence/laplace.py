@@ -81,7 +81,8 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     """Integrate a fit's likelihood over its parameters and the noise sd (Laplace), and the noise model's nodes.
 
     At each node the fit is carried to its new optimum by the linearised model, so that a correlation
-    is judged without the bias of residuals that were fitted as if white.
+    is judged without the bias of residuals that were fitted as if white. Where the floor of the sd is above what is
+    left, the integral over the sd is taken to be as wide as elsewhere.
     """
     laid_out = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
@@ -121,16 +122,19 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
     steps: FloatArray = np.zeros_like(jr)
 
-    def variance_now() -> FloatArray:
+    def squares() -> FloatArray:
         rss = rr - 2 * np.sum(steps * jr, axis=1) + np.einsum("lp,lpq,lq->l", steps, jj, steps)
-        return np.asarray(np.maximum(rss, 0.0) / n_points + sd_floor**2)
+        return np.asarray(np.maximum(rss, 0.0))
 
     for _ in range(3):
-        variance = variance_now()[:, None]
-        curvature = jj / variance[:, :, None] + np.eye(p)
-        steps = np.asarray(np.linalg.solve(curvature, (jr / variance - found.z)[:, :, None])[:, :, 0])
+        variance = np.maximum(squares() / n_points, sd_floor**2)
+        curvature = jj / variance[:, None, None] + np.eye(p)
+        steps = np.asarray(np.linalg.solve(curvature, (jr / variance[:, None] - found.z)[:, :, None])[:, :, 0])
     fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
-    return np.asarray(fit_and_prior - 0.5 * n_points * (np.log(variance_now()) + 1) + 0.5 * np.log(math.pi / n_points))
+    rss = squares()
+    variance = np.maximum(rss / n_points, sd_floor**2)
+    misfit = 0.5 * n_points * np.log(variance) + 0.5 * rss / variance
+    return np.asarray(fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points))
 
 
 def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:
@@ -152,7 +156,7 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor
     sigma = tail.scale(left, n_points, floor=sd_floor, start=sigma)
     fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
     scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
-    return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points, floor=sd_floor) + scale)
+    return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points) + scale)
 
 
 def _peak(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:

@@ -151,7 +151,7 @@ def fit(
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         whitened = law((readings - predicted).T)
         sigma = law.scale(whitened, floor=sd_floor)
-        return np.asarray(law.misfit(whitened, sigma, floor=sd_floor) + 0.5 * np.sum(z**2, axis=1))
+        return np.asarray(law.misfit(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))

@@ -135,15 +135,15 @@ class NoiseLaw:
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0)
 
     def scale(self, whitened: FloatArray, *, floor: float = 0.0) -> FloatArray:
-        """Most likely sigma of whitened residuals, (n_points, k) -> (k,); `floor` is added in quadrature."""
+        """Most likely sigma of whitened residuals, (n_points, k) -> (k,), `floor` at least."""
         return self.tail.scale(whitened, self.n_points, floor=floor)
 
-    def misfit(self, whitened: FloatArray, sigma: FloatArray, *, floor: float = 0.0) -> FloatArray:
-        """Minus log likelihood of whitened residuals (n_points, k) at the sigma (k,) that `scale` gives: (k,).
+    def misfit(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Minus log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
 
         Without n/2 log 2 pi.
         """
-        return self.tail.misfit(whitened, sigma, self.n_points, floor=floor)
+        return self.tail.misfit(whitened, sigma, self.n_points)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Turn whitened residuals (n_points, k) into those of normal noise that say as much about the mean."""
@@ -193,31 +193,27 @@ class Tail:
     ) -> FloatArray:
         """Most likely sigma, (k,), by expectation and maximisation; rows beyond `n_points` are 0 and do not count."""
         if self.is_normal:
-            return np.asarray(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points + floor**2))
+            return np.asarray(np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), floor))
         squares = whitened**2
         if start is None:  # from the middle half of what is not lost, which the tail leaves alone
             middle = len(whitened) - n_points // 2 - 1
-            sigma = np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745 + floor + _LEAST
+            sigma = np.maximum(np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745, floor) + _LEAST
         else:
             sigma = start
         for _ in range(_EM_STEPS if start is None else 3):
             weighed = self._weights(squares / sigma**2) * squares
-            sigma = np.sqrt(weighed.sum(axis=0) / n_points + floor**2) + _LEAST
+            sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + _LEAST
         return np.asarray(sigma)
 
-    def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int, *, floor: float = 0.0) -> FloatArray:
-        """Minus log likelihood at the most likely sigma (k,), without n/2 log 2 pi: (k,).
-
-        The floor counts as what is always left of each reading, so that laws with and without a tail compare.
-        """
+    def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+        """Minus log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
         if self.is_normal:
-            return np.asarray(n_points * (np.log(sigma) + 0.5))
+            return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
         squares = (whitened / sigma) ** 2
         log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds(squares))
         at_zero = np.logaddexp(0.0, self._log_odds(np.zeros((1, 1))))[0]
         of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
-        always = 0.5 * (floor / sigma) ** 2
-        return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share) + always) - of_kept)
+        return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share)) - of_kept)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Turn residuals into those of normal noise that say as much about the mean.

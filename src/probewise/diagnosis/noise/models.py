@@ -10,17 +10,20 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.noise.flat import Flat
 from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
 from probewise.effects import NoiseEffect, NoiseRows, lattice_step
+from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["LaidOut", "NoiseModel", "rough_sd"]
+__all__ = ["LaidOut", "NoiseModel", "hides_the_noise", "least_sd", "rough_sd"]
 
 _FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
 _MANY = 12  # nodes of one effect that beside another's would be too many
-_APART = 0.3  # of the logarithm, from one node of the noise beside rounding to the next
-_HALF_STEPS = np.exp(_APART * np.arange(-6, 10))  # of rounding, in sd of the noise beside it: 0.17 to 15
+_HALF_STEPS = np.exp(0.3 * np.arange(-6, 10))  # of rounding, in sd of the noise beside it: 0.17 to 15
+_UNLIKELY = 15.0  # nats behind the best: such nodes of the noise beside rounding are left out
+_HIDDEN = 0.6  # of a step: below, a normal density sums to more than 1 over a lattice (1 + 2 exp(-2 pi^2 0.36) at most)
 _FINE = 0.01  # noise sd: how exactly a lost reading holds its value where nothing is rounded
 
 
@@ -97,9 +100,11 @@ class NoiseModel:
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law(level, k, far) for k in range(len(settings)))
         if self.rounding:
-            laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for law in laws for x in _HALF_STEPS)
-            # Sigma is integrated out by these nodes, over its logarithm, as it is elsewhere in closed form.
-            settings, log_weight = np.repeat(settings, len(_HALF_STEPS), axis=0), math.log(_APART)
+            # Sigma is integrated out by nodes, over its logarithm, as it is elsewhere in closed form.
+            (law,) = laws
+            halves, log_weights = _beside_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
+            laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
+            return LaidOut(np.repeat(settings, len(laws), axis=0), laws, log_weights)
         return LaidOut(settings, laws, np.full(len(laws), log_weight))
 
     def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, float]:
@@ -161,9 +166,55 @@ class NoiseModel:
         return lattice_step(self._readings)
 
 
+def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
+    """Lay out the sd of the noise beside rounding, as the half steps that are one sd: nodes and log weights, (n,).
+
+    Wide apart, and closer about the best, down to the sd that readings without rounding would tell log sigma to.
+    """
+
+    def log_likelihood(halves: FloatArray) -> FloatArray:
+        sigma = half_step / halves
+        return -Flat(halves, sigma).misfit(residuals[:, None], sigma, n_points)
+
+    x = np.log(_HALF_STEPS)
+    height, apart = log_likelihood(_HALF_STEPS), x[1] - x[0]
+    while apart > 1 / math.sqrt(2 * n_points):
+        apart /= 4
+        between = x[np.argmax(height)] + apart * np.array([-5, -3, -2, -1, 1, 2, 3, 5])
+        order = np.argsort(np.append(x, between))
+        x = np.append(x, between)[order]
+        height = np.append(height, log_likelihood(np.exp(between)))[order]
+    log_weights = np.log(np.gradient(x))
+    likely = height > height.max() - _UNLIKELY
+    return np.exp(x[likely]), log_weights[likely]
+
+
+def hides_the_noise(step: float, recording: Recording) -> bool:
+    """Tell whether readings are rounded to steps so coarse that a normal law is no density of them."""
+    return rough_sd(recording) < _HIDDEN * step
+
+
+def least_sd(recording: Recording) -> float:
+    """Least sd that a normal law of the readings can have, however they are rounded.
+
+    Where they are on a coarse lattice a narrower one would gain by each level that a model puts on the lattice too:
+    a nat in ten readings at 0.4 of a step.
+    """
+    return max(sd_floor(recording), _HIDDEN * lattice_step(recording.readings[recording.usable]))
+
+
 def rough_sd(recording: Recording) -> float:
-    """Estimate the noise sd without a model, from second differences within scans, of which few are at an edge."""
+    """Estimate the noise sd without a model, from second differences within scans, of which few are at an edge.
+
+    That of readings on a lattice as they are, rounding and all: those that are the same are spread over a step, without
+    which the median would be one of few values.
+    """
     readings, steps = recording.readings[recording.usable], steps_within_scans(recording)
     inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1
-    bends = readings[inner - 1] - 2 * readings[inner] + readings[inner + 1]
+    bends = np.sort(readings[inner - 1] - 2 * readings[inner] + readings[inner + 1])
+    step = lattice_step(readings)
+    if step:
+        bends = np.round(bends / step) * step
+        first, last = np.searchsorted(bends, bends, "left"), np.searchsorted(bends, bends, "right")
+        bends = bends + step * ((np.arange(len(bends)) - first + 0.5) / (last - first) - 0.5)
     return float(np.median(np.abs(bends))) / (0.6745 * math.sqrt(6)) if inner.size else 0.0

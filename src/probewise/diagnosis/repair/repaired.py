@@ -19,6 +19,7 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
+from probewise.diagnosis.noise.models import least_sd
 from probewise.diagnosis.repair.annealing import Density, anneal, by_weight
 from probewise.diagnosis.repair.quadratic import Quadratic
 from probewise.diagnosis.repair.surrogate import Surrogate
@@ -123,7 +124,7 @@ def sample_model(
     annealed
         Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
     """
-    law, floor, n_samples = noise.law, sd_floor(recording), N_SAMPLES
+    law, floor, n_samples = noise.law, least_sd(recording), N_SAMPLES
     z = np.clip(_posterior_draws(found, noise, recording, floor, annealed, rng=rng), -FARTHEST, FARTHEST)
     # What is not annealed is drawn for the effects' sake alone: the noise is then that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
@@ -150,8 +151,9 @@ def sample_model(
         sd = lattice_step_sd(recording.readings[recording.usable], float(theta[0, i]))
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
-    if law.flat:  # the noise beside rounding, as each node of its law has it
-        noise_sd = np.array([own.sigma for own in noise.laid_out.laws])[nodes]
+    if law.flat:  # as each node of its law has it: beside rounding where that is an effect, else with it
+        each = [own.sigma * (1.0 if of_lattice else own.widening) for own in noise.laid_out.laws]
+        noise_sd = np.array(each)[nodes]
     else:
         noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
     return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)

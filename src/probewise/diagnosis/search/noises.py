@@ -11,16 +11,16 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
 from probewise.diagnosis.evidence.templates import subsets
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.noise.models import NoiseModel, rough_sd
+from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, rough_sd
 from probewise.diagnosis.search.odds import PriorOdds
-from probewise.effects import NoiseEffect, Quantisation, lattice_step
+from probewise.effects import Dropouts, NoiseEffect, Outliers, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 
 __all__ = ["Noises"]
 
 Names = tuple[str, ...]
 
-_HIDDEN = 0.5  # of a step: where noise by second differences is less, most neighbours read the same
+_OF_SINGLE_READINGS = (Outliers.name, Dropouts.name)
 _WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
 
 
@@ -40,13 +40,13 @@ class Noises:
 
     def __post_init__(self) -> None:
         self._step = lattice_step(self.recording.readings[self.recording.usable])
-        # That all readings are multiples of a coarse step is no chance.
+        # That all readings are multiples of a coarse step is no chance; an effect it is where nobody declared it.
         seen = self._step > Quantisation.seen_above * rough_sd(self.recording)
         self.certain = (Quantisation.name,) if Quantisation.name in self.effects and seen else ()
-        hidden = bool(self.certain) and rough_sd(self.recording) < _HIDDEN * self._step
-        # Beside a rounding that hides them, other faults of the noise would have to be rounded too; taken as they are
-        # they have densities above one over the step, which no rounded reading can have.
-        others = [] if hidden else [name for name in self.effects if name != Quantisation.name]
+        self._hidden = hides_the_noise(self._step, self.recording)
+        others = [name for name in self.effects if name != Quantisation.name]
+        if self._hidden:  # all but what a few readings show
+            others = [name for name in others if name in _OF_SINGLE_READINGS]
         single = [tuple(sorted({*names, *self.certain})) for names in subsets(others, 1)]
         self.models = {names: self._model(names) for names in single}
 
@@ -54,7 +54,7 @@ class Noises:
         # What is certain is not asked again about each fit, whose own residual may be larger.
         known = {name: (np.array([[self._step]]), 0.0) for name in self.certain}
         effects = tuple(self.effects[n] for n in names)
-        rounding = self._step if names and names == self.certain else 0.0
+        rounding = self._step if self._hidden and names == self.certain else 0.0
         return NoiseModel(effects, self.recording, {**known, **(likely or {})}, rounding)
 
     def log_prior(self, names: Names) -> float:

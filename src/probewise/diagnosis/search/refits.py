@@ -139,7 +139,7 @@ def acts(candidate: Candidate, parent: Candidate, sd_floor: float) -> bool:
 
     def misfit(found: Fit) -> float:
         whitened = law(found.residuals)[:, None]
-        return float(law.misfit(whitened, law.scale(whitened, floor=sd_floor), floor=sd_floor)[0])
+        return float(law.misfit(whitened, law.scale(whitened, floor=sd_floor))[0])
 
     return 2 * (misfit(parent.found) - misfit(candidate.found)) > 3.0
 

@@ -232,14 +232,24 @@ def test_what_is_not_in_the_vocabulary_is_unknown_and_still_repaired():
 @pytest.mark.slow
 def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
     plain = recording("two_way")
-    step = 1.0 * (plain.plan.direction[:, 0] > 0)
+    step = 1.0 * (plain.plan.scan == plain.plan.scan_names.index("edge_90_out"))
     found = diagnose(dataclasses.replace(plain, readings=plain.readings + step), rng=np.random.default_rng(0))
     strict(found)
     assert found.verdict == "unknown"
     assert found.improvement.log_evidence > 10
     assert found.improvement.rms_after < found.improvement.rms_before
     assert found.improvement.heldout_log_density_per_reading > 0
-    assert found.where[0].covariate in ("direction", "scan", "place")
+    assert (found.where[0].covariate, found.where[0].scan) == ("scan", "edge_90_out")
+
+
+@pytest.mark.slow
+def test_a_jump_of_all_scans_that_go_forward_is_hysteresis_of_half_its_size():
+    plain = recording("two_way")
+    step = 1.0 * (plain.plan.direction[:, 0] > 0)
+    found = diagnose(dataclasses.replace(plain, readings=plain.readings + step), rng=np.random.default_rng(0))
+    assert found.combination == ("hysteresis",)
+    (amp,) = next(effect for effect in found.effects if effect.name == "hysteresis").parameters
+    assert amp.mean == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.slow

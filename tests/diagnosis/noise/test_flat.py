@@ -106,14 +106,13 @@ def test_no_pseudo_observation_is_farther_than_what_was_read():
 
 @pytest.mark.parametrize("declared", [False, True])
 @pytest.mark.parametrize(("noise_sd", "coarse"), [(0.4, True), (3.0, False)])
-def test_rounding_that_hides_the_noise_leaves_only_what_single_readings_show(noise_sd, coarse, declared):
+def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, coarse, declared):
     recording = rounded(noise_sd, 1)
     found = noises(as_declared(recording) if declared else recording)
     assert found.certain == (() if declared else ("quantisation",))
-    others = {name for names in found.models for name in names} - {"quantisation"}
-    assert (others == {"outliers", "dropouts"}) is coarse
-    laws = found.models[found.certain].laws(recording.readings).laws
-    assert all(law.flat > 0 for law in laws) is coarse
+    for names, model in found.models.items():
+        laws = model.laws(recording.readings).laws
+        assert all(bool(law.flat) == (coarse and names == found.certain) for law in laws)
 
 
 @pytest.mark.parametrize("noise_sd", [0.5, 1.0, 3.0])
@@ -135,6 +134,17 @@ def test_no_normal_law_sums_to_more_than_one_over_a_lattice():
     np.testing.assert_allclose(sums, 1.0, atol=3.4e-3)
     narrower = STEP * norm.pdf(cells, 0.0, 0.4 * STEP).sum()
     assert narrower > 1.08
+
+
+@pytest.mark.parametrize("noise", ["correlated_noise", "signal_dependent_noise", "outliers"])
+def test_no_reading_is_known_better_from_those_before_it_than_a_lattice_allows(noise):
+    """Whatever the law makes of small residuals: their conditional sd is the floor's."""
+    recording = rounded(0.4, 1)
+    model = NoiseModel((noises(recording).effects[noise],), recording)
+    small = 0.01 * np.random.default_rng(4).standard_normal((int(recording.usable.sum()), 1))
+    for law in model.laws(recording.readings[recording.usable]).laws:
+        conditional = law.scale(law(small), floor=0.6 * STEP) * law.sd * np.sqrt(1 - law.carry**2)
+        assert conditional.min() == pytest.approx(0.6 * STEP)
 
 
 @pytest.mark.parametrize("noise_sd", [0.3, 0.9, 1.6])

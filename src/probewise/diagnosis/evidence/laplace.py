@@ -120,19 +120,19 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd
         turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
     gram = turned.transpose(0, 2, 1) @ turned
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
-    steps: FloatArray = np.zeros_like(jr)
+    steps, least = np.zeros_like(jr), np.array([(sd_floor / law.narrowest) ** 2 for law in laws])
 
     def squares() -> FloatArray:
         rss = rr - 2 * np.sum(steps * jr, axis=1) + np.einsum("lp,lpq,lq->l", steps, jj, steps)
         return np.asarray(np.maximum(rss, 0.0))
 
     for _ in range(3):
-        variance = np.maximum(squares() / n_points, sd_floor**2)
+        variance = np.maximum(squares() / n_points, least)
         curvature = jj / variance[:, None, None] + np.eye(p)
         steps = np.asarray(np.linalg.solve(curvature, (jr / variance[:, None] - found.z)[:, :, None])[:, :, 0])
     fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
     rss = squares()
-    variance = np.maximum(rss / n_points, sd_floor**2)
+    variance = np.maximum(rss / n_points, least)
     misfit = 0.5 * n_points * np.log(variance) + 0.5 * rss / variance
     return np.asarray(fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points))
 
@@ -143,17 +143,17 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor
     p, n_points = turned.shape[1] - 1, laws[0].n_points
     slopes, residual = turned[:, :p], turned[:, p:]
     gram = slopes.T @ slopes
-    tail = forms(laws)
-    steps, sigma = np.zeros((p, len(laws))), tail.scale(residual, n_points, floor=sd_floor)
+    tail, least = forms(laws), sd_floor / laws[0].narrowest
+    steps, sigma = np.zeros((p, len(laws))), tail.scale(residual, n_points, floor=least)
     for _ in range(3):
         left = residual - slopes @ steps
-        sigma = tail.scale(left, n_points, floor=sd_floor, start=sigma)
+        sigma = tail.scale(left, n_points, floor=least, start=sigma)
         variance = sigma**2 / tail.information
         curvature = gram / variance[:, None, None] + np.eye(p)
         downhill = slopes.T @ tail.as_normal(left, sigma) / variance - found.z[:, None] - steps
         steps += np.linalg.solve(curvature, downhill.T[:, :, None])[:, :, 0].T
     left = residual - slopes @ steps
-    sigma = tail.scale(left, n_points, floor=sd_floor, start=sigma)
+    sigma = tail.scale(left, n_points, floor=least, start=sigma)
     fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
     scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
     return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points) + scale)

@@ -125,6 +125,11 @@ class NoiseLaw:
         """The form of one whitened reading's density."""
         return forms([self])
 
+    @cached_property
+    def narrowest(self) -> float:
+        """Least sd of a reading given those before it, in units of sigma; 1 where all are lost."""
+        return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost])) if self.n_points else 1.0
+
     @property
     def widening(self) -> float:
         """Sd of a whitened reading in units of sigma, a tail aside: what rounding adds."""
@@ -135,8 +140,11 @@ class NoiseLaw:
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0)
 
     def scale(self, whitened: FloatArray, *, floor: float = 0.0) -> FloatArray:
-        """Most likely sigma of whitened residuals, (n_points, k) -> (k,), `floor` at least."""
-        return self.tail.scale(whitened, self.n_points, floor=floor)
+        """Most likely sigma of whitened residuals, (n_points, k) -> (k,).
+
+        Such that no reading's sd, given those before it, is below `floor`.
+        """
+        return self.tail.scale(whitened, self.n_points, floor=floor / self.narrowest)
 
     def misfit(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Minus log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).

@@ -13,14 +13,13 @@ from probewise.diagnosis.evidence.templates import subsets
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, rough_sd
 from probewise.diagnosis.search.odds import PriorOdds
-from probewise.effects import Dropouts, NoiseEffect, Outliers, Quantisation, lattice_step
+from probewise.effects import NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 
 __all__ = ["Noises"]
 
 Names = tuple[str, ...]
 
-_OF_SINGLE_READINGS = (Outliers.name, Dropouts.name)
 _WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
 
 
@@ -45,8 +44,6 @@ class Noises:
         self.certain = (Quantisation.name,) if Quantisation.name in self.effects and seen else ()
         self._hidden = hides_the_noise(self._step, self.recording)
         others = [name for name in self.effects if name != Quantisation.name]
-        if self._hidden:  # all but what a few readings show
-            others = [name for name in others if name in _OF_SINGLE_READINGS]
         single = [tuple(sorted({*names, *self.certain})) for names in subsets(others, 1)]
         self.models = {names: self._model(names) for names in single}
 

@@ -76,15 +76,24 @@ def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
         "noise_model": truth.noise_model,
         "readings": len(case.recording),
         "truth": list(truth.combination),
-        "hidden": [
-            _hidden(hidden, ruler, refit) | _beside(hidden, truth.hidden, ruler, refit) for hidden in truth.hidden
-        ],
+        "hidden": _hidden(truth.hidden, ruler, refit),
         "alias": None if truth.alias is None else truth.alias.effect.name,
         "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
     }
 
 
-def _hidden(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
+def _hidden(hidden: Sequence[Hidden], ruler: Ruler, refit: NullRefit) -> list[dict[str, Any]]:
+    """Tell of the effects; of two, "size_beside": how large each still is where the other is named."""
+    each = [_effect(one, ruler, refit) for one in hidden]
+    if len(hidden) == 2:
+        both = ruler.recording(*(one.effect for one in hidden))
+        left = left_beside(refit, ruler.clean, both, [one.name for one in hidden])
+        for own, other in zip(each, reversed(each), strict=True):
+            own["size_beside"] = left[other["name"]] / ruler.setting.world.noise_sd
+    return each
+
+
+def _effect(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
     """Tell of one effect; "cosines": what else looks like it in this plan, and how much."""
     # Rounding is no noise of the world's, but what a diagnosis says of it is said of the noise.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
@@ -97,16 +106,6 @@ def _hidden(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
         "shows_in": list(hidden.shows_in),
         "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
     }
-
-
-def _beside(hidden: Hidden, everything: Sequence[Hidden], ruler: Ruler, refit: NullRefit) -> dict[str, float]:
-    """Tell how large an effect still is where the other of two is named."""
-    others = [other for other in everything if other is not hidden]
-    if len(others) != 1:
-        return {}
-    both = ruler.recording(*(one.effect for one in everything))
-    left = left_beside(refit, ruler.clean, both, others[0].name)
-    return {"size_beside": left / ruler.setting.world.noise_sd}
 
 
 def _diagnosed(case: Case, task: Task) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,7 @@ def cosines(
     return out
 
 
-def left_beside(refit: NullRefit, clean: Recording, both: Recording, name: str) -> float:
+def left_beside(refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]) -> dict[str, float]:
     """Tell what is left of two effects where one of them is named, in units of the reading: what shows of the other.
 
     Parameters
@@ -78,25 +78,28 @@ def left_beside(refit: NullRefit, clean: Recording, both: Recording, name: str) 
         The null.
     clean, both
         Noise-free readings without any effect and with both.
-    name
-        The one that is fitted, together with the null.
+    names
+        The ones that are fitted, together with the null, each by itself.
 
     Returns
     -------
-    Root of the sum of squares of the residuals: in noise sds, the size of the other beside it. Readings that a ceiling
-    cuts off say nothing of a paler patch, however large it would be alone.
+    For each name the root of the sum of squares of the residuals: in noise sds, the size of the other beside it.
+    Readings that a ceiling cuts off say nothing of a paler patch, however large it would be alone.
     """
     found, exact = refit.refit(clean, both), refit.exact(clean, both)
     usable = np.flatnonzero(clean.usable)
     problem = Linearised.of(found, white(len(usable)))
-    effect = VOCABULARY[name].for_extent(Extent.of(clean))
-    fits = [found]
-    if effect is not None:
-        templates, taken = _taken_by_each(problem, found, effect, usable)
-        best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # of each variant, the best last
-        starts = [*best.values()][-_STARTS:]
-        fits += [_with_effect(problem, found, effect, templates, at, exact) for at in starts]
-    return min(float(np.linalg.norm(by.residuals)) for by in fits)
+    out = {}
+    for name in names:
+        effect = VOCABULARY[name].for_extent(Extent.of(clean))
+        fits = [found]
+        if effect is not None:
+            templates, taken = _taken_by_each(problem, found, effect, usable)
+            best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # of each variant, the best last
+            starts = [*best.values()][-_STARTS:]
+            fits += [_with_effect(problem, found, effect, templates, at, exact) for at in starts]
+        out[name] = min(float(np.linalg.norm(by.residuals)) for by in fits)
+    return out
 
 
 def _taken_by_each(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
@@ -57,6 +59,11 @@ class Noises:
     def log_prior(self, names: Names) -> float:
         """Log prior of a noise model."""
         return self.prior.log_noise(tuple(n for n in names if n not in self.certain))
+
+    def over_all(self, log_z: Mapping[Names, float]) -> float:
+        """Give the log evidence under whatever noise, from that under each model; of none it is minus infinity."""
+        values = [value + self.log_prior(names) for names, value in log_z.items()]
+        return float(logsumexp(values)) if values else -math.inf
 
     def weigh(self, found: Fit) -> dict[Names, NoiseEvidence]:
         """Weigh a fit under every model."""

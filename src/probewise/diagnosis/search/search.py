@@ -8,7 +8,6 @@ Laplace weighs.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -19,7 +18,7 @@ from scipy.special import logsumexp
 from probewise._arrays import IntArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs, score_unknown
+from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs
 from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemory
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, start_with_more_gaussians, starts_of_one_gaussian
@@ -28,11 +27,12 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.noise.law import steps_within_scans, white
 from probewise.diagnosis.residuals.bases import unknown_templates, unlike_named
 from probewise.diagnosis.residuals.covariates import covariates_of, slope_along_the_move
-from probewise.diagnosis.residuals.outlying import outlying, score_together
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.refits import Refits, acts
-from probewise.diagnosis.search.weighed import STEERING, TOO_ALIKE, Candidate, Search, nats_apart, outside, weighed
+from probewise.diagnosis.search.unknown import Unknown
+from probewise.diagnosis.search.unnamed import give_way
+from probewise.diagnosis.search.weighed import STEERING, Candidate, Search, weighed
 from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -116,8 +116,6 @@ class _Searcher:
         self.sensors: dict[int, Null] = {}
         self.about_null: dict[tuple[Names, Names], float] = {}  # (mean, noise) -> log evidence
         self.about_parts: dict[tuple[Names, Names], float] = {}
-        self.unknown: dict[tuple[int, Names, Names], float] = {}
-        self.unknown_shares: dict[str, float] = {}
         self.not_felt: set[Names] = set()
         self.spoken_for: set[Names] = set()  # without a name, and not to be told from what has one
 
@@ -132,25 +130,30 @@ class _Searcher:
         level = null.found.predicted
         model, z = null.found.model, null.found.z[None, :]
         slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[self.usable]
-        self.covariates = tuple(covariates_of(self.recording.plan, self.usable, level, slope))
+        covariates = covariates_of(self.recording.plan, self.usable, level, slope)
         starts = np.flatnonzero(steps_within_scans(self.recording) == 0)
-        bases = unknown_templates(self.covariates, level - level.min(), slope, starts)
+        bases = unknown_templates(covariates, level - level.min(), slope, starts)
         named = [effect for name, effect in self.mean_effects.items() if name not in UNNAMED]
         problem = Linearised.of(null.found, self.refits.law_of(null))
-        self.bases = unlike_named(bases, self.templates.bank(null.found, named), problem)
+        self.unknown = Unknown(
+            unlike_named(bases, self.templates.bank(null.found, named), problem),
+            tuple(covariates),
+            self.noises,
+            lambda worth: self._coincidence(worth, self.prior.unknown_coincidence),
+        )
         if self.depth > 1:
             self._screen_pairs(null)
         self._grow_beam()
         self._take_apart()
         # Beside a form of the SSF that the readings refute, it is the form that is missing.
         best = max(c.log_z for c in self._nulls())
-        self._weigh_unknown([c for c in self._nulls() if c.log_z > best - _WORTH_GROWING])
+        self.unknown.weigh([c for c in self._nulls() if c.log_z > best - _WORTH_GROWING])
         self._refit_what_matters()
         self._other_orders()
-        self._speak_for_the_unnamed()
+        self.candidates, self.spoken_for = give_way(self.candidates, self.noises)
         refitted = [c for c in self.candidates.values() if c.names]
-        self._weigh_unknown(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
-        self._speak_for_the_unknown()
+        self.unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
+        self.unknown.give_way(self.candidates.values())
         return self._weighed_up()
 
     def _weighed_up(self) -> Search:
@@ -163,12 +166,12 @@ class _Searcher:
                 self.sensors,
                 self.candidates,
                 self._screened(),
-                self.unknown,
+                self.unknown.log_z,
                 self.prior,
                 self.sd_floor,
-                self.covariates,
-                self.bases,
-                self.unknown_shares,
+                self.unknown.covariates,
+                self.unknown.bases,
+                self.unknown.shares,
                 self.about,
                 self.templates,
             )
@@ -418,72 +421,3 @@ class _Searcher:
         candidate = candidate.as_share(log_share, source.weights)
         if acts(candidate, null, self.sd_floor):
             self._keep(candidate)
-
-    def _speak_for_the_unnamed(self) -> None:
-        """Let what is outside the vocabulary give way to what is inside where the readings do not tell the two.
-
-        Where they are not expected to, it is left out. Where they have told it by less, a push of three parameters from
-        a tilt of two, it is believed no more than the name is: what it has found beyond that may be noise.
-        """
-        by_name = sorted(self.candidates.values(), key=self._believed)
-        leading = {c.names: c for c in by_name if c.names}
-        for names, candidate in leading.items():
-            if not outside(names):
-                continue
-            rivals = [c for c in leading.values() if not outside(c.names) and len(c.names) <= len(names)]
-            if any(nats_apart(candidate, c) < TOO_ALIKE for c in rivals):
-                self.spoken_for.add(names)
-            ahead = self._believed(candidate) - max((self._believed(c) for c in rivals), default=-np.inf)
-            if 0 < ahead < TOO_ALIKE:
-                for own in [c for c in self.candidates.values() if c.names == names]:
-                    self._keep(own.as_share(own.log_share - ahead, own.weights))
-        self.candidates = {key: c for key, c in self.candidates.items() if key[1] not in self.spoken_for}
-
-    def _speak_for_the_unknown(self) -> None:
-        """Leave out something unknown alone where one name explains as much, and leaves nothing for it to explain.
-
-        A basis of many columns, what differs from scan to scan say, holds the traces of named effects too.
-        """
-        alone = max((self._unknown_beside(c) for c in self._nulls()), default=-np.inf)
-        singles = [c for c in self.candidates.values() if len(c.names) == 1 and not outside(c.names)]
-        for candidate in sorted(singles, key=self._believed, reverse=True):
-            if self._believed(candidate) < alone - TOO_ALIKE:
-                break
-            if not any(key[:2] == (candidate.n_gaussians, candidate.names) for key in self.unknown):
-                self._weigh_unknown([candidate])
-            if self._unknown_beside(candidate) - self._believed(candidate) < TOO_ALIKE:
-                self.unknown = {key: value for key, value in self.unknown.items() if key[1]}
-                break
-
-    def _believed(self, candidate: Candidate) -> float:
-        """Give the log evidence of a candidate under whatever noise."""
-        return self._under_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
-
-    def _unknown_beside(self, candidate: Candidate) -> float:
-        """Give the log evidence of something unknown beside a candidate under whatever noise."""
-        own = candidate.n_gaussians, candidate.names
-        return self._under_all({key[2]: value for key, value in self.unknown.items() if key[:2] == own})
-
-    def _under_all(self, log_z: Mapping[Names, float]) -> float:
-        values = [value + self.noises.log_prior(noise) for noise, value in log_z.items()]
-        return float(logsumexp(values)) if values else -math.inf
-
-    def _weigh_unknown(self, candidates: Sequence[Candidate]) -> None:
-        """Weigh something unknown beside each candidate."""
-        best = -np.inf
-        for candidate in candidates:
-            for noise, evidence in candidate.steering():
-                by_family = score_unknown(Linearised.of(candidate.found, evidence.law), self.bases)
-                if evidence.law.share > 0:
-                    far_out = outlying(candidate.found.residuals, evidence.law)
-                    by_family |= score_together(far_out, self.covariates)
-                if not by_family:
-                    continue
-                value = evidence.log_z + log_mean(np.array(list(by_family.values())))
-                if not candidate.names:
-                    value -= self._coincidence(candidate.worth, self.prior.unknown_coincidence)
-                self.unknown[candidate.n_gaussians, candidate.names, noise] = value
-                if value > best and not candidate.names:
-                    best = value
-                    total = logsumexp(list(by_family.values()))
-                    self.unknown_shares = {k: math.exp(v - total) for k, v in by_family.items()}

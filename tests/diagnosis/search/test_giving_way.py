@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.noise.law import white
-from probewise.diagnosis.search.search import _Searcher
+from probewise.diagnosis.search.unknown import Unknown
+from probewise.diagnosis.search.unnamed import give_way
 
 N = 50
 NAME, PUSH = ("sensor_tilt",), ("arm_knock",)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Held:
     """As much of a candidate as is asked here: its names, its log evidence, what it leaves of every reading."""
 
@@ -39,36 +40,31 @@ class Held:
         return replace(self, log_z=self.log_z + log_share - self.log_share, log_share=log_share)
 
 
-def searcher(*candidates, unknown=None):
-    made = object.__new__(_Searcher)
-    made.candidates = {(c.n_gaussians, c.names): c for c in candidates}
-    made.unknown = {(1, names, ()): value for names, value in (unknown or {}).items()}
-    made.noises = SimpleNamespace(log_prior=lambda names: 0.0)
-    made.spoken_for = set()
-    return made
+NOISES = SimpleNamespace(over_all=lambda log_z: log_z.get((), -np.inf))
+
+
+def by_key(*candidates):
+    return {(c.n_gaussians, c.names): c for c in candidates}
 
 
 @pytest.mark.parametrize(("ahead", "believed"), [(-1.0, -1.0), (2.0, 0.0), (4.0, 4.0)])
 def test_what_is_ahead_of_a_name_by_less_than_the_readings_tell_is_believed_no_more(ahead, believed):
-    made = searcher(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0))
-    made._speak_for_the_unnamed()
-    assert made.candidates[1, PUSH].log_z == pytest.approx(believed)
-    assert made.candidates[1, NAME].log_z == 0.0
-    assert made.spoken_for == set()
+    stay, spoken_for = give_way(by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES)
+    assert stay[1, PUSH].log_z == pytest.approx(believed)
+    assert stay[1, NAME].log_z == 0.0
+    assert spoken_for == set()
 
 
 def test_what_predicts_the_same_as_a_name_is_left_out():
     """Half of the squared distance is 50 * 0.3^2 / 2, less than three nats."""
-    made = searcher(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3))
-    made._speak_for_the_unnamed()
-    assert made.spoken_for == {PUSH}
-    assert (1, PUSH) not in made.candidates
+    stay, spoken_for = give_way(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
+    assert spoken_for == {PUSH}
+    assert (1, PUSH) not in stay
 
 
 def test_two_names_do_not_speak_for_one_effect_without():
-    made = searcher(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1))
-    made._speak_for_the_unnamed()
-    assert made.candidates[1, PUSH].log_z == 2.0
+    stay, _ = give_way(by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES)
+    assert stay[1, PUSH].log_z == 2.0
 
 
 @pytest.mark.parametrize(
@@ -77,7 +73,7 @@ def test_two_names_do_not_speak_for_one_effect_without():
     ids=["as much, and nothing left", "something left", "far behind"],
 )
 def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
-    made = searcher(Held((), -50.0), Held(NAME, name), unknown={(): 0.0, NAME: beside})
-    made._speak_for_the_unknown()
-    assert ((1, (), ()) not in made.unknown) == speaks
-    assert (1, NAME, ()) in made.unknown
+    unknown = Unknown(None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
+    unknown.give_way([Held((), -50.0), Held(NAME, name)])
+    assert ((1, (), ()) not in unknown.log_z) == speaks
+    assert (1, NAME, ()) in unknown.log_z

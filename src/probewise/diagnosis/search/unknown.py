@@ -1,0 +1,91 @@
+"""Something unknown beside refitted candidates: how much it explains, and where it gives way to a name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.evidence.screening import log_mean, score_unknown
+from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.outlying import outlying, score_together
+from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.weighed import TOO_ALIKE, Candidate, outside
+
+__all__ = ["Unknown"]
+
+Names = tuple[str, ...]
+
+
+@dataclass(eq=False)
+class Unknown:
+    """What bases that know no physics explain beside each candidate, under each of its noises.
+
+    Parameters
+    ----------
+    bases
+        Templates of the unknown.
+    covariates
+        Along which readings that are far out may lie together.
+    noises
+        The noise models.
+    coincidence
+        The nats against it beside an SSF worth so many Gaussians.
+    """
+
+    bases: Bank
+    covariates: tuple[Covariate, ...]
+    noises: Noises
+    coincidence: Callable[[int], float]
+    log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
+    """Log evidence by (order, mean, noise)."""
+    shares: dict[str, float] = field(default_factory=dict)
+    """How much of it each family of bases has, beside the null that it explains most beside."""
+
+    def weigh(self, candidates: Iterable[Candidate]) -> None:
+        """Weigh it beside each candidate."""
+        best = -np.inf
+        for candidate in candidates:
+            for noise, evidence in candidate.steering():
+                by_family = score_unknown(Linearised.of(candidate.found, evidence.law), self.bases)
+                if evidence.law.share > 0:
+                    far_out = outlying(candidate.found.residuals, evidence.law)
+                    by_family |= score_together(far_out, self.covariates)
+                if not by_family:
+                    continue
+                value = evidence.log_z + log_mean(np.array(list(by_family.values())))
+                if not candidate.names:
+                    value -= self.coincidence(candidate.worth)
+                self.log_z[candidate.n_gaussians, candidate.names, noise] = value
+                if value > best and not candidate.names:
+                    best = value
+                    total = logsumexp(list(by_family.values()))
+                    self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
+
+    def give_way(self, candidates: Collection[Candidate]) -> None:
+        """Leave it out by itself where one name explains as much, and leaves nothing for it to explain.
+
+        A basis of many columns, what differs from scan to scan say, holds the traces of named effects too.
+        """
+        alone = max((self._beside(c) for c in candidates if not c.names), default=-np.inf)
+        believed = {c: self._believed(c) for c in candidates if len(c.names) == 1 and not outside(c.names)}
+        for candidate in sorted(believed, key=lambda c: -believed[c]):
+            if believed[candidate] < alone - TOO_ALIKE:
+                break
+            if self._beside(candidate) == -np.inf:
+                self.weigh([candidate])
+            if self._beside(candidate) - believed[candidate] < TOO_ALIKE:
+                self.log_z = {key: value for key, value in self.log_z.items() if key[1]}
+                break
+
+    def _believed(self, candidate: Candidate) -> float:
+        return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
+
+    def _beside(self, candidate: Candidate) -> float:
+        own = candidate.n_gaussians, candidate.names
+        return self.noises.over_all({key[2]: value for key, value in self.log_z.items() if key[:2] == own})

@@ -63,26 +63,26 @@ def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, free
 
 
 def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
-    extent, law, floor = Extent.of(recording), white(int(recording.usable.sum())), sd_floor(recording)
+    extent, law = Extent.of(recording), white(int(recording.usable.sum()), least=sd_floor(recording))
     one = default_sensor(extent, 1)
-    found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law, floor)
+    found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law)
     if free_form:
         wanted = FreeForm.about(one)
         starts = wanted.start_from(found.z)
     else:
         wanted = default_sensor(extent, 2)
         starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
-    found = _best(Model(wanted, (), recording.plan), recording, starts, law, floor)
+    found = _best(Model(wanted, (), recording.plan), recording, starts, law)
     for name in names:
         model = found.model.with_effect(VOCABULARY[name].for_extent(extent))
         own = np.zeros(model.n_params - found.model.n_params)
         starts = np.stack([np.concatenate([found.z, own + shift]) for shift in (-0.5, 0.1, 0.5)])
-        found = _best(model, recording, starts, law, floor)
+        found = _best(model, recording, starts, law)
     return found
 
 
-def _best(model, recording, starts, law, floor):
-    tried = [fit(model, recording, start, law, sd_floor=floor, max_steps=40) for start in starts]
+def _best(model, recording, starts, law):
+    tried = [fit(model, recording, start, law, max_steps=40) for start in starts]
     return min(tried, key=lambda f: f.objective)
 
 

@@ -124,7 +124,7 @@ def _with_effect(
     rss = float(found.residuals @ found.residuals)
     # As floor of the sd a tenth of what survives: far enough below it to be seen, and no exact fit is asked for.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))
-    return fit(model, exact, start_z, white(len(found.residuals)), sd_floor=floor, tolerance=0.02)
+    return fit(model, exact, start_z, white(len(found.residuals), least=floor), tolerance=0.02)
 
 
 def _taken_up(found: Fit, by: Fit) -> float:

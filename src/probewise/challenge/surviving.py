@@ -60,16 +60,16 @@ class NullRefit:
 
 
 def _best_order(clean: Recording) -> Fit:
-    extent, noise = Extent.of(clean), NoiseModel((), clean)
+    extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
     sensor = default_sensor(extent, 1)
     found = min(
         (_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),
         key=lambda f: f.objective,
     )
-    best, best_log_z = found, weigh(found, noise, sd_floor=_NOISE_SD).log_z
+    best, best_log_z = found, weigh(found, noise).log_z
     for _ in range(_MOST_GAUSSIANS - 1):
         found = min(_with_one_more(found, clean, extent), key=lambda f: f.objective)
-        log_z = weigh(found, noise, sd_floor=_NOISE_SD).log_z
+        log_z = weigh(found, noise).log_z
         if log_z > best_log_z:
             best, best_log_z = found, log_z
         elif log_z < best_log_z - _BEHIND:
@@ -85,5 +85,5 @@ def _with_one_more(found: Fit, recording: Recording, extent: Extent) -> Iterator
 
 
 def _fit(model: Model, recording: Recording, start: FloatArray) -> Fit:
-    whitener = white(int(recording.usable.sum()))
-    return fit(model, recording, start, whitener, sd_floor=_NOISE_SD, tolerance=0.02)
+    whitener = white(int(recording.usable.sum()), least=_NOISE_SD)
+    return fit(model, recording, start, whitener, tolerance=0.02)

@@ -18,7 +18,6 @@ from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.noise.models import least_sd
 from probewise.diagnosis.repair.ensemble import Ensemble
 from probewise.diagnosis.repair.mending import Improvement, corrected, improvement_of
 from probewise.diagnosis.repair.repaired import ModelSamples
@@ -104,7 +103,6 @@ def diagnose(
     recording = everything if len(rows) == len(everything) else everything.take(rows)
     extent = Extent.of(recording)
     fitted = {name: kind.for_extent(extent) for name, kind in {**effects, **UNNAMED, **NUISANCES}.items()}
-    floor = least_sd(recording)
     known = null
     if sensor is not None:
         known = sensor_of(sensor)
@@ -114,7 +112,7 @@ def diagnose(
         for name, effect in able.items()
         if (known.admits(effect) if known is not None else not effect.is_of_the_ssf(recording.plan))
     }
-    diagnoser = _Diagnoser(recording, built, known, floor, thorough, rng)
+    diagnoser = _Diagnoser(recording, built, known, thorough, rng)
     found = diagnoser.run()
     return found if recording is everything else _of_everything(found, diagnoser.fits, everything)
 
@@ -124,7 +122,6 @@ class _Diagnoser:
     recording: Recording
     built: Mapping[str, NamedEffect[Any]]
     sensor: Null | None
-    floor: float
     thorough: Thorough | None
     rng: np.random.Generator
 
@@ -138,9 +135,7 @@ class _Diagnoser:
         n = len(self.usable)
         constant = float(np.ptp(self.recording.readings[self.usable])) == 0.0
         few = n < self.least_readings or constant
-        self.search: Search = search(
-            self.recording, self.built, sensor=self.sensor, sd_floor=self.floor, max_order=1 if n < 40 else 3
-        )
+        self.search: Search = search(self.recording, self.built, sensor=self.sensor, max_order=1 if n < 40 else 3)
         weighings: tuple[Weighing, ...] = ()
         if self.thorough is not None and not few:
             self.search, weighings = self.thorough(self.search)

@@ -97,9 +97,9 @@ def test_where_no_names_can_be_traded_nothing_is_folded():
     recording = Recording(PLAN, np.random.default_rng(5).normal(30.0, 1.0, len(PLAN)))
     for n_gaussians, same in ((1, True), (2, False)):
         sensor = default_sensor(EXTENT, n_gaussians)
-        found = fit(Model(sensor, (), PLAN), recording, np.zeros(sensor.n_params), white(len(PLAN)), sd_floor=0.1)
-        evidence = weigh(found, NoiseModel((), recording), sd_floor=0.1)
-        problem = JointProblem(found.model, recording, evidence, 0.1)
+        found = fit(Model(sensor, (), PLAN), recording, np.zeros(sensor.n_params), white(len(PLAN), least=0.1))
+        evidence = weigh(found, NoiseModel((), recording, least_sd=0.1))
+        problem = JointProblem(found.model, recording, evidence)
         once = folded(problem, found.z)
         assert (once is problem) == same
         z = found.z[None, :]

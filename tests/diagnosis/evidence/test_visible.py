@@ -30,7 +30,7 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     found = Fit(model, z, predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
     law = white(len(PLAN))
     null = Model(sensor, (), PLAN)
-    left = fit(null, Recording(PLAN, predicted), z[: sensor.n_params], law, sd_floor=SD, tolerance=1e-6).residuals
+    left = fit(null, Recording(PLAN, predicted), z[: sensor.n_params], law.at_least(SD), tolerance=1e-6).residuals
     expected = float(log_ndtr(np.linalg.norm(left) / SD - LEAST_VISIBLE))
     assert log_visible(found, law, np.arange(len(PLAN))) == pytest.approx(expected, abs=0.1 + 0.02 * abs(expected))
 

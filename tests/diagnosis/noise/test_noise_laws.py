@@ -67,9 +67,9 @@ def test_a_tail_that_is_not_there_is_none():
     z = np.random.default_rng(2).normal(size=(50, 2))
     thin, none = heavy(1e-12, 3.0), white(50)
     for floor in (0.0, 3.0):
-        sigma = none.scale(z, floor=floor)
-        np.testing.assert_allclose(thin.scale(z, floor=floor), sigma, rtol=1e-6)
-        np.testing.assert_allclose(thin.misfit(z, sigma), none.misfit(z, sigma), rtol=1e-6)
+        bounded, sigma = thin.at_least(floor), none.at_least(floor).scale(z)
+        np.testing.assert_allclose(bounded.scale(z), sigma, rtol=1e-6)
+        np.testing.assert_allclose(bounded.misfit(z, sigma), none.misfit(z, sigma), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
@@ -106,7 +106,7 @@ def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
     slope = rng.normal(size=N)
     noise = SD * rng.normal(size=N) * np.where(rng.random(N) < 0.03, 6.0, 1.0)
     found, recording = found_with(noise, slope)
-    evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording), sd_floor=0.6 * SD)
+    evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording, least_sd=0.6 * SD))
     step = np.linspace(-0.2, 0.2, 161)
     log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
     for node in (0, len(evidence.laid_out.laws) // 2):
@@ -130,18 +130,18 @@ def test_readings_lost_to_one_value_are_no_wide_ones():
     noise[lost] = -MEAN[lost]
     found, recording = found_with(noise)
     log_z = {
-        type(e).__name__: weigh(found, NoiseModel((e,), recording), sd_floor=1e-6).log_z
+        type(e).__name__: weigh(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
         for e in (Dropouts(), Outliers())
     }
-    plain = weigh(found, NoiseModel((), recording), sd_floor=1e-6).log_z
+    plain = weigh(found, NoiseModel((), recording, least_sd=1e-6)).log_z
     assert log_z["Dropouts"] > log_z["Outliers"] + 3 > plain + 50
-    law = weigh(found, NoiseModel((Dropouts(),), recording), sd_floor=1e-6).law
+    law = weigh(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6)).law
     np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
 
 
 def test_where_nothing_is_lost_there_is_no_such_law():
     found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
-    evidence = weigh(found, NoiseModel((Dropouts(),), recording), sd_floor=1e-6)
+    evidence = weigh(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
     assert evidence.log_z == -math.inf
     assert evidence.laid_out.laws == ()
 

@@ -78,8 +78,8 @@ def test_the_density_is_that_of_its_predictions():
     e = np.random.default_rng(5).standard_normal((30, 3))
     z = CENTER + e @ STEPS
     residuals = (readings - predicted(quadratic, e)).T
-    expected = log_likelihood_of_whitened(LAW, LAW(residuals), 1e-3) - 0.5 * np.sum(z**2, axis=1)
-    near = Surrogate.of(quadratic, CENTER, STEPS, readings, LAW, 1e-3)
+    expected = log_likelihood_of_whitened(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
+    near = Surrogate.of(quadratic, CENTER, STEPS, readings, LAW)
     np.testing.assert_allclose(near.log_density(e), expected, rtol=1e-9)
     assert near.log_density(np.full((1, 3), 100.0))[0] == -np.inf
 
@@ -92,9 +92,9 @@ def test_under_a_tail_the_density_falls_off_as_it_should():
     falls = []
     for seed in range(60):
         readings = noisy(0.1, seed, tailed)
-        near = Surrogate.of(quadratic, CENTER, STEPS, readings, tailed, 1e-3)
+        near = Surrogate.of(quadratic, CENTER, STEPS, readings, tailed)
         true = [
-            log_likelihood_of_whitened(tailed, tailed((readings - predicted(quadratic, at)).T), 1e-3)
+            log_likelihood_of_whitened(tailed, tailed((readings - predicted(quadratic, at)).T))
             for at in (e, np.zeros((1, 3)))
         ]
         prior = 0.5 * np.sum((CENTER + e @ STEPS) ** 2, axis=1) - 0.5 * np.sum(CENTER**2)

@@ -47,8 +47,8 @@ def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
     truth[:, -1] += 20 * 0.05
     readings = tight.chain(PLAN, (), n_nodes=16).predict(truth, PLAN)[0] + 0.3 * rng.standard_normal(len(PLAN))
     recording = Recording(PLAN, readings)
-    found = fit(Model(tight, (), PLAN), recording, np.zeros(7), white(len(PLAN)), sd_floor=1e-3)
-    noise = weigh(found, NoiseModel((), recording), sd_floor=1e-3)
+    found = fit(Model(tight, (), PLAN), recording, np.zeros(7), white(len(PLAN), least=1e-3))
+    noise = weigh(found, NoiseModel((), recording, least_sd=1e-3))
     samples = sample_model(found, noise, recording, weights={}, rng=rng)
     z = tight.z(samples.theta)
     assert z[:, -1].max() < FARTHEST

@@ -25,12 +25,12 @@ NOISE_SD = 0.4
 def fitted(recording: Recording, *, free: bool = True) -> Fit:
     sensor = default_sensor(Extent.of(recording), 1)
     law = white(len(recording))
-    one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law, sd_floor=NOISE_SD)
+    one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.at_least(NOISE_SD))
     if not free:
         return one
     form = FreeForm.about(sensor)
     start = form.start_from(one.z)[0]
-    return fit(Model(form, (), recording.plan), recording, start, law, sd_floor=NOISE_SD)
+    return fit(Model(form, (), recording.plan), recording, start, law.at_least(NOISE_SD))
 
 
 def usable(recording: Recording) -> np.ndarray:

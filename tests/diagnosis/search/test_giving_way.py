@@ -32,9 +32,11 @@ class Held:
     def evidence(self):
         return {(): SimpleNamespace(log_z=self.log_z)}
 
+    sd = 1.0
+
     @property
     def found(self):
-        return SimpleNamespace(residuals=np.full(N, self.left), sd=1.0)
+        return SimpleNamespace(residuals=np.full(N, self.left))
 
     def as_share(self, log_share, _):
         return replace(self, log_z=self.log_z + log_share - self.log_share, log_share=log_share)

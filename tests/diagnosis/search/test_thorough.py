@@ -19,7 +19,6 @@ from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
 LINE = OwnModel(lambda p, plan: p["a"] + p["b"] * plan.time_s, Product({"a": Normal(0, 2), "b": Normal(0, 0.2)}))
-FLOOR = 1e-6
 
 
 def line_recording(step: float) -> Recording:
@@ -43,9 +42,7 @@ def line_recording(step: float) -> Recording:
 def searched(recording):
     names = ("ambient_step", "hysteresis")
     effects = {name: VOCABULARY[name].for_extent(Extent.of(recording)) for name in names}
-    return search(
-        recording, {k: e for k, e in effects.items() if e is not None}, sensor=LINE, sd_floor=FLOOR, max_order=1
-    )
+    return search(recording, {k: e for k, e in effects.items() if e is not None}, sensor=LINE, max_order=1)
 
 
 @pytest.fixture(scope="module")

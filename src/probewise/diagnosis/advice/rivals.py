@@ -7,7 +7,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
-from probewise.diagnosis.fitting.fit import Fit, degrees_of_freedom
+from probewise.diagnosis.fitting.fit import degrees_of_freedom
 from probewise.diagnosis.search.weighed import Candidate, Search
 
 __all__ = ["next_readings"]
@@ -33,7 +33,7 @@ def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
             found.append(candidate)
         if len(found) == _MOST_RIVALS:
             break
-    sd, plan = found[0].found.sd, search.recording.plan
+    sd, plan = found[0].sd, search.recording.plan
     rivals = [_as_rival(candidate, probabilities[candidate.names]) for candidate in found]
     if len(rivals) > 1:
         return next_scans(rivals, sd, plan)
@@ -43,7 +43,7 @@ def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
 
 
 def _as_rival(candidate: Candidate, probability: float) -> Rival:
-    return Rival(candidate.found.model, candidate.found.z, _root_of(candidate.found), probability)
+    return Rival(candidate.found.model, candidate.found.z, _root_of(candidate), probability)
 
 
 def _imagined(search: Search, null: Candidate, name: str) -> Rival:
@@ -62,11 +62,11 @@ def _imagined(search: Search, null: Candidate, name: str) -> Rival:
     change = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
     z[: len(found.z)] += problem.absorbed(found, change)  # the sensor as it would then have been fitted
     root = np.zeros((len(z), len(z)))  # of that size, and no other
-    root[: len(found.z), : len(found.z)] = _root_of(found)
+    root[: len(found.z), : len(found.z)] = _root_of(null)
     return Rival(model, z, root, 0.0)
 
 
-def _root_of(found: Fit) -> FloatArray:
+def _root_of(candidate: Candidate) -> FloatArray:
     """Take the square root of the covariance of a fit's coordinates, noise white."""
-    free = degrees_of_freedom(found.slopes, found.sd)
-    return covariance_root(found.slopes, found.sd**2 * len(found.slopes) / free)
+    slopes, sd = candidate.found.slopes, candidate.sd
+    return covariance_root(slopes, sd**2 * len(slopes) / degrees_of_freedom(slopes, sd))

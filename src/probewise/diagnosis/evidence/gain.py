@@ -33,7 +33,7 @@ class HeldOut:
     by_scan: tuple[tuple[str, float], ...]
 
 
-def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, *, sd_floor: float) -> HeldOut:
+def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw) -> HeldOut:
     """Refit both models without one scan at a time and compare how they predict it, reading by reading.
 
     Each reading counts by itself, as the law of the noise has it. Scans of fewer than eight readings stay
@@ -45,7 +45,7 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
     def gain(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
         rows[np.flatnonzero(usable)[out]] = True
-        repaired_one, null_one = (_log_density(f, recording, rows, law, out, sd_floor) for f in (repaired, null))
+        repaired_one, null_one = (_log_density(f, recording, rows, law, out) for f in (repaired, null))
         return repaired_one - null_one
 
     return compare_scans(parts, gain, names)
@@ -105,9 +105,7 @@ def compare_scans(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_
     return HeldOut(float(joined.mean()), sd, len(joined), by_scan)
 
 
-def _log_density(
-    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray, sd_floor: float
-) -> FloatArray:
+def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray) -> FloatArray:
     """Log predictive density of each reading kept back, by itself, by a refit to the others.
 
     `rows` (n_points,) and `out` (n_usable,) are the same readings. What a law says of lost readings is the
@@ -115,12 +113,12 @@ def _log_density(
     """
     kept = Recording(recording.plan, np.where(rows, np.nan, recording.readings), recording.source)
     rest, own = law.take(~out), law.take(out)
-    without = fit(found.model, kept, found.z, rest, sd_floor=sd_floor, max_steps=4, tolerance=0.05)
+    without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     asked = np.flatnonzero(rows & recording.usable)
     predicted, slopes = (part[asked] for part in found.model.jacobian(without.z))
     turned = rest(without.slopes)
     free = degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
-    sigma_2 = without.sd**2 * rest.n_points / free
+    sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_points / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     miss = recording.readings[asked] - predicted

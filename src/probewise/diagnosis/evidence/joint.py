@@ -68,14 +68,11 @@ class JointProblem:
         What predicts and what was read.
     noise
         The evidence of a fit under the noise model: its nodes, of which those that matter are kept.
-    sd_floor
-        Least believable sd of a reading's noise.
     """
 
     model: Model
     recording: Recording
     noise: NoiseEvidence
-    sd_floor: float
 
     @cached_property
     def prior(self) -> StandardNormal:
@@ -90,7 +87,7 @@ class JointProblem:
         laid_out, kept = self.noise.laid_out, self._kept
         laws, log_share = [laid_out.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         terms = [
-            log_weight + log_likelihood_of_whitened(law, law(residuals), self.sd_floor)
+            log_weight + log_likelihood_of_whitened(law, law(residuals))
             for log_weight, law in zip(laid_out.log_weights[kept], laws, strict=True)
         ]
         out = np.asarray(logsumexp(terms, axis=0)) + log_share
@@ -105,10 +102,10 @@ class JointProblem:
         return kept
 
 
-def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray, sd_floor: float) -> FloatArray:
+def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
     """Log likelihood of whitened residuals (n_points, n_samples) under one law, log sd integrated out: (n_samples,)."""
     n_points = law.n_points
-    sigma = law.scale(whitened, floor=sd_floor)
+    sigma = law.scale(whitened)
     curvature = law.tail.scale_curvature(whitened, sigma, n_points) if not law.tail.is_normal else 2.0 * n_points
     peak = -law.misfit(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
     return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.log_det() + law.log_extra)

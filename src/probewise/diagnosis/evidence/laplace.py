@@ -77,7 +77,7 @@ class NoiseEvidence:
         return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], laid_out)
 
 
-def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
+def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     """Integrate a fit's likelihood over its parameters and the noise sd (Laplace), and the noise model's nodes.
 
     At each node the fit is carried to its new optimum by the linearised model, so that a correlation
@@ -90,13 +90,13 @@ def weigh(found: Fit, noise: NoiseModel, *, sd_floor: float) -> NoiseEvidence:
     normal = [node for node, law in enumerate(laid_out.laws) if law.tail.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
-        out[nodes] = _of_normal_laws(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
+        out[nodes] = _of_normal_laws(found, [laid_out.laws[node] for node in nodes], joined)
     tailed: dict[tuple[tuple[bytes, bytes, bytes], bool], list[int]] = {}  # by whitening, flat tops apart
     for node in sorted({*range(len(out))} - {*normal}):
         law = laid_out.laws[node]
         tailed.setdefault((law.linear, law.flat > 0), []).append(node)
     for nodes in tailed.values():
-        out[nodes] = _of_tails(found, [laid_out.laws[node] for node in nodes], joined, sd_floor)
+        out[nodes] = _of_tails(found, [laid_out.laws[node] for node in nodes], joined)
     out += [law.log_extra for law in laid_out.laws]
     out += laid_out.log_weights + log_multiplicity(found.model.sensor)
     return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, laid_out)
@@ -111,7 +111,7 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(curvature)).T)
 
 
-def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:
+def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Weigh a fit under laws without a tail, (n_laws,); `joined` are slopes and residual, (n_points, n_params + 1)."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
     turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
@@ -120,7 +120,7 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd
         turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
     gram = turned.transpose(0, 2, 1) @ turned
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
-    steps, least = np.zeros_like(jr), np.array([(sd_floor / law.narrowest) ** 2 for law in laws])
+    steps, least = np.zeros_like(jr), np.array([law.floor**2 for law in laws])
 
     def squares() -> FloatArray:
         rss = rr - 2 * np.sum(steps * jr, axis=1) + np.einsum("lp,lpq,lq->l", steps, jj, steps)
@@ -137,13 +137,13 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd
     return np.asarray(fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points))
 
 
-def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray, sd_floor: float) -> FloatArray:
+def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Weigh a fit under laws of one whitening that differ in their tails or flat tops, (n_laws,)."""
     turned = laws[0](joined)
     p, n_points = turned.shape[1] - 1, laws[0].n_points
     slopes, residual = turned[:, :p], turned[:, p:]
     gram = slopes.T @ slopes
-    tail, least = forms(laws), sd_floor / laws[0].narrowest
+    tail, least = forms(laws), laws[0].floor
     steps, sigma = np.zeros((p, len(laws))), tail.scale(residual, n_points, floor=least)
     for _ in range(3):
         left = residual - slopes @ steps
@@ -188,15 +188,16 @@ class Linearised:
         n_points, p = slopes.shape
         whitened = law(found.residuals)[:, None]
         turned, sigma = law(slopes), law.scale(whitened)
+        known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.floor)
         sigma = np.where(sigma > 0, sigma, found.sd)
         free = degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
-        sigma = sigma * math.sqrt(n_points / free)
+        sigma = sigma if known else sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
         augmented = np.concatenate([law.pseudo(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
-        if law.flat:
-            # The noise is known; what says less than its readings should, flat at the top, does not make it smaller.
+        if known:
+            # What says less than so many readings should, flat at the top, does not make the noise smaller.
             rest = math.sqrt(max(free - float(residual @ residual), 0.0))
             basis, residual = np.concatenate([basis, np.zeros((1, p))]), np.append(residual, rest)
         return cls(basis, residual, law, sd, n_points)

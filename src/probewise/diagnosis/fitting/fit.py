@@ -98,7 +98,7 @@ class Model:
 class Fit:
     """The best point of a model: coordinates `z`, and at it the usable rows' predictions and slopes.
 
-    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` of the noise by maximum likelihood.
+    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` is the most likely sigma of its law.
     """
 
     model: Model
@@ -121,7 +121,6 @@ def fit(
     start: FloatArray,
     law: NoiseLaw,
     *,
-    sd_floor: float,
     max_steps: int = 30,
     tolerance: float = 5e-3,
 ) -> Fit:
@@ -138,8 +137,6 @@ def fit(
         Coordinates to start from, shape (n_params,).
     law
         The law of the noise.
-    sd_floor
-        Least believable sd of a reading's noise.
     max_steps
         Bound of the number of steps.
     tolerance
@@ -150,7 +147,7 @@ def fit(
 
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         whitened = law((readings - predicted).T)
-        sigma = law.scale(whitened, floor=sd_floor)
+        sigma = law.scale(whitened)
         return np.asarray(law.misfit(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
@@ -161,7 +158,7 @@ def fit(
         return Fit(model, z, predicted, readings - predicted, slopes, np.inf, np.inf)
     for _ in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
-        sigma = law.scale(whitened, floor=sd_floor)
+        sigma = law.scale(whitened)
         variance = float(sigma[0]) ** 2 / law.information
         curvature = turned.T @ turned / variance + eye
         downhill = turned.T @ law.as_normal(whitened, sigma)[:, 0] / variance - z
@@ -178,7 +175,7 @@ def fit(
         predicted, slopes = (part[usable] for part in model.jacobian(z))
         if gained < tolerance:
             break
-    sd = float(law.scale(law(readings - predicted)[:, None], floor=sd_floor)[0])
+    sd = float(law.scale(law(readings - predicted)[:, None])[0])
     return Fit(model, z, predicted, readings - predicted, slopes, sd, best)
 
 

@@ -57,6 +57,8 @@ class NoiseLaw:
         What the law says beyond the density of the readings that are not lost: of those that are.
     flat, sigma
         What rounding adds, where there is no tail: a uniform part, so many sigma either way; sigma is then known.
+    least
+        Least sd that a reading has, given those before it; where sigma is known it plays no part.
     """
 
     sd: FloatArray
@@ -67,6 +69,7 @@ class NoiseLaw:
     log_extra: float = 0.0
     flat: float = 0.0
     sigma: float = 1.0
+    least: float = 0.0
     kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
     def __post_init__(self) -> None:
@@ -126,9 +129,18 @@ class NoiseLaw:
         return forms([self])
 
     @cached_property
-    def narrowest(self) -> float:
+    def floor(self) -> float:
+        """Least sigma, such that no reading's sd, given those before it, is below `least`."""
+        return self.least / self._narrowest if self.least else 0.0
+
+    @cached_property
+    def _narrowest(self) -> float:
         """Least sd of a reading given those before it, in units of sigma; 1 where all are lost."""
         return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost])) if self.n_points else 1.0
+
+    def at_least(self, sigma: float) -> NoiseLaw:
+        """Bound sigma from below."""
+        return replace(self, least=sigma * self._narrowest)
 
     @property
     def widening(self) -> float:
@@ -136,15 +148,12 @@ class NoiseLaw:
         return math.sqrt(1 + self.flat**2 / 3)
 
     def plain(self) -> NoiseLaw:
-        """Leave normal noise of the same whitening."""
-        return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0)
+        """Leave normal noise of the same whitening; the normal part beside rounding is of any sd."""
+        return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
 
-    def scale(self, whitened: FloatArray, *, floor: float = 0.0) -> FloatArray:
-        """Most likely sigma of whitened residuals, (n_points, k) -> (k,).
-
-        Such that no reading's sd, given those before it, is below `floor`.
-        """
-        return self.tail.scale(whitened, self.n_points, floor=floor / self.narrowest)
+    def scale(self, whitened: FloatArray) -> FloatArray:
+        """Most likely sigma of whitened residuals, the floor at least, (n_points, k) -> (k,)."""
+        return self.tail.scale(whitened, self.n_points, floor=self.floor)
 
     def misfit(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Minus log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
@@ -278,9 +287,9 @@ def _information(share: float, times: float) -> float:
     return float(np.sum(score**2 * (narrow + wide)) * (z[1] - z[0]) / math.sqrt(2 * math.pi))
 
 
-def white(n_points: int) -> NoiseLaw:
+def white(n_points: int, *, least: float = 0.0) -> NoiseLaw:
     """Leave readings as they are."""
-    return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_))
+    return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_), least=least)
 
 
 def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:

@@ -21,9 +21,11 @@ __all__ = ["LaidOut", "NoiseModel", "hides_the_noise", "least_sd", "rough_sd"]
 
 _FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
 _MANY = 12  # nodes of one effect that beside another's would be too many
-_HALF_STEPS = np.exp(0.3 * np.arange(-6, 10))  # of rounding, in sd of the noise beside it: 0.17 to 15
+_APART = 0.3  # of the logarithm of half a step in sds of the noise beside it, from node to node to begin with
+_WIDEST, _NARROWEST = -6, 9  # nodes: sds of 3 steps, or what is left, to a thirtieth of a step
 _UNLIKELY = 15.0  # nats behind the best: such nodes of the noise beside rounding are left out
-_HIDDEN = 0.6  # of a step: below, a normal density sums to more than 1 over a lattice (1 + 2 exp(-2 pi^2 0.36) at most)
+_HIDDEN = 0.6  # of a step: there normal densities sum to 1 + 2 exp(-2 pi^2 0.36) = 1.0016 over a lattice, below to more
+
 _FINE = 0.01  # noise sd: how exactly a lost reading holds its value where nothing is rounded
 
 
@@ -50,12 +52,15 @@ class NoiseModel:
         For some effects by name, the nodes (n_nodes, n_params) that matter, and the log of what each stands for.
     rounding
         Step of a lattice that all readings are on, where nothing else is wrong with the noise, or 0.
+    least_sd
+        Least believable sd of a reading, given those before it.
     """
 
     effects: tuple[NoiseEffect, ...]
     recording: Recording
     likely: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
     rounding: float = 0.0
+    least_sd: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,7 +150,7 @@ class NoiseModel:
             # The value is one of the cells of the range; then each reading that is lost is in that cell.
             log_extra = n_lost * math.log(lost_share / self._cell) - math.log(cells)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
-        return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra)
+        return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd)
 
     @cached_property
     def _readings(self) -> FloatArray:
@@ -169,15 +174,18 @@ class NoiseModel:
 def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
     """Lay out the sd of the noise beside rounding, as the half steps that are one sd: nodes and log weights, (n,).
 
-    Wide apart, and closer about the best, down to the sd that readings without rounding would tell log sigma to.
+    Wide apart, and closer about the best, down to the sd that readings without rounding would tell log sigma to; as
+    wide as what is left, where something is missing from the mean.
     """
 
     def log_likelihood(halves: FloatArray) -> FloatArray:
         sigma = half_step / halves
         return -Flat(halves, sigma).misfit(residuals[:, None], sigma, n_points)
 
-    x = np.log(_HALF_STEPS)
-    height, apart = log_likelihood(_HALF_STEPS), x[1] - x[0]
+    rms = math.sqrt(float(residuals @ residuals) / n_points)
+    widest = math.floor(math.log(half_step / (2 * rms)) / _APART) if rms > 0 else _NARROWEST
+    x = _APART * np.arange(min(widest, _WIDEST), _NARROWEST + 1)
+    height, apart = log_likelihood(np.exp(x)), _APART
     while apart > 1 / math.sqrt(2 * n_points):
         apart /= 4
         between = x[np.argmax(height)] + apart * np.array([-5, -3, -2, -1, 1, 2, 3, 5])
@@ -190,8 +198,11 @@ def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> 
 
 
 def hides_the_noise(step: float, recording: Recording) -> bool:
-    """Tell whether readings are rounded to steps so coarse that a normal law is no density of them."""
-    return rough_sd(recording) < _HIDDEN * step
+    """Tell whether readings are rounded to steps so coarse that a normal law is no density of them.
+
+    Not where no three readings follow each other, which alone would tell.
+    """
+    return 0 < rough_sd(recording) < _HIDDEN * step
 
 
 def least_sd(recording: Recording) -> float:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from probewise.diagnosis.noise.models import least_sd
 from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
 from probewise.diagnosis.search.search import search
 from probewise.effects import EFFECTS, Extent, NamedEffect
@@ -47,7 +46,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
         if effect is None:
             raise ParameterError("names", name, "effects of the vocabulary that can show in this recording")
         effects[name] = effect
-    found = search(recording, effects, sensor=None, sd_floor=least_sd(recording), depth=max(len(names), 1))
+    found = search(recording, effects, sensor=None, depth=max(len(names), 1))
     on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
     on_noise = tuple(sorted(set(names) - set(on_mean)))
     noise = on_noise if on_noise in found.noise_models else found.certain

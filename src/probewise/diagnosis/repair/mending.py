@@ -65,7 +65,7 @@ def improvement_of(
     if best is null:
         return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value)
     law = best.evidence[noise].law
-    held = held_out_gain(null.found, best.found, search.recording, law, sd_floor=search.sd_floor)
+    held = held_out_gain(null.found, best.found, search.recording, law)
     p_after = global_p_value(after, search.looks(best.found), after.draws(_N_DRAWS, rng=rng))
     return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
 

@@ -19,7 +19,6 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
-from probewise.diagnosis.noise.models import least_sd
 from probewise.diagnosis.repair.annealing import Density, anneal, by_weight
 from probewise.diagnosis.repair.quadratic import Quadratic
 from probewise.diagnosis.repair.surrogate import Surrogate
@@ -124,12 +123,12 @@ def sample_model(
     annealed
         Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
     """
-    law, floor, n_samples = noise.law, least_sd(recording), N_SAMPLES
-    z = np.clip(_posterior_draws(found, noise, recording, floor, annealed, rng=rng), -FARTHEST, FARTHEST)
+    law, n_samples = noise.law, N_SAMPLES
+    z = np.clip(_posterior_draws(found, noise, recording, annealed, rng=rng), -FARTHEST, FARTHEST)
     # What is not annealed is drawn for the effects' sake alone: the noise is then that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
-    sigma = law.scale(law(residuals.T), floor=floor)
+    sigma = law.scale(law(residuals.T))
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
@@ -160,7 +159,7 @@ def sample_model(
 
 
 def _posterior_draws(
-    found: Fit, noise: NoiseEvidence, recording: Recording, floor: float, annealed: bool, *, rng: np.random.Generator
+    found: Fit, noise: NoiseEvidence, recording: Recording, annealed: bool, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then carried to the posterior."""
     law, model = noise.law, found.model
@@ -179,9 +178,9 @@ def _posterior_draws(
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)
-    problem, usable = JointProblem(model, recording, noise.at_best, floor), recording.usable
+    problem, usable = JointProblem(model, recording, noise.at_best), recording.usable
     quadratic = Quadratic.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
-    near = Surrogate.of(quadratic, center, steps, recording.readings[usable], law, floor)
+    near = Surrogate.of(quadratic, center, steps, recording.readings[usable], law)
 
     def of_laplace(e: FloatArray) -> FloatArray:
         return np.asarray(-0.5 * np.sum(e**2, axis=1))

@@ -29,7 +29,6 @@ class Surrogate:
     center: FloatArray
     steps: FloatArray
     law: NoiseLaw
-    sd_floor: float
     residual: FloatArray
     changes: FloatArray
 
@@ -41,18 +40,17 @@ class Surrogate:
         steps: FloatArray,
         readings: FloatArray,
         law: NoiseLaw,
-        sd_floor: float,
     ) -> Self:
         """Set predictions against readings, (n_points,)."""
         residual = law(readings - quadratic.center)[:, None]
-        residual = law.as_normal(residual, np.maximum(law.scale(residual, floor=sd_floor), 1e-150))
+        residual = law.as_normal(residual, np.maximum(law.scale(residual), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
         normal = law.plain()
-        return cls(quadratic, center, steps, normal, sd_floor, turned[:, -1], turned[:, :-1])
+        return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])
 
     def log_density(self, e: FloatArray) -> FloatArray:
         """Prior and likelihood but for a constant, (n_samples,); minus infinity outside the prior's bounds."""
         z = self.center + e @ self.steps
         whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts(e).T
-        height = log_likelihood_of_whitened(self.law, whitened, self.sd_floor) - 0.5 * np.sum(z**2, axis=1)
+        height = log_likelihood_of_whitened(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
 from probewise.diagnosis.evidence.templates import subsets
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, rough_sd
+from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.effects import NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
@@ -29,20 +29,22 @@ _WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the no
 class Noises:
     """The noise models of one recording: each fault alone, and pairs where one stands out.
 
-    `certain` are effects on the noise that the readings show without doubt, in every model of `models`.
+    `certain` are effects on the noise that the readings show without doubt, in every model of `models`; `least_sd` is
+    the least believable sd of a reading.
     """
 
     recording: Recording
     effects: Mapping[str, NoiseEffect]
     prior: PriorOdds
-    sd_floor: float
+    least_sd: float = field(init=False)
     certain: Names = field(init=False)
     models: dict[Names, NoiseModel] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.least_sd = least_sd(self.recording)
         self._step = lattice_step(self.recording.readings[self.recording.usable])
         # That all readings are multiples of a coarse step is no chance; an effect it is where nobody declared it.
-        seen = self._step > Quantisation.seen_above * rough_sd(self.recording)
+        seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
         self.certain = (Quantisation.name,) if Quantisation.name in self.effects and seen else ()
         self._hidden = hides_the_noise(self._step, self.recording)
         others = [name for name in self.effects if name != Quantisation.name]
@@ -54,7 +56,7 @@ class Noises:
         known = {name: (np.array([[self._step]]), 0.0) for name in self.certain}
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
-        return NoiseModel(effects, self.recording, {**known, **(likely or {})}, rounding)
+        return NoiseModel(effects, self.recording, {**known, **(likely or {})}, rounding, self.least_sd)
 
     def log_prior(self, names: Names) -> float:
         """Log prior of a noise model."""
@@ -67,7 +69,7 @@ class Noises:
 
     def weigh(self, found: Fit) -> dict[Names, NoiseEvidence]:
         """Weigh a fit under every model."""
-        return {names: weigh(found, model, sd_floor=self.sd_floor) for names, model in self.models.items()}
+        return {names: weigh(found, model) for names, model in self.models.items()}
 
     def best(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
         """Give the evidence of the most probable model."""
@@ -87,7 +89,7 @@ class Noises:
             if other == first:
                 continue
             model = self._model(both, likely | self.models[other].every_third())
-            value = weigh(found, model, sd_floor=self.sd_floor).log_z
+            value = weigh(found, model).log_z
             if value + self.log_prior(both) > best - _WORTH_A_PAIR:
                 self.models[both] = model
         return True

@@ -96,11 +96,11 @@ class Refits:
 
     def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
         """Go a few steps from each start, then all the way from the best."""
-        recording, floor = self.noises.recording, self.noises.sd_floor
+        recording = self.noises.recording
         if len(starts) > 1:
-            tried = [fit(model, recording, start, law, sd_floor=floor, max_steps=5) for start in starts]
+            tried = [fit(model, recording, start, law, max_steps=5) for start in starts]
             starts = min(tried, key=lambda f: f.objective).z[None, :]
-        return require_finite(fit(model, recording, starts[0], law, sd_floor=floor, max_steps=max_steps))
+        return require_finite(fit(model, recording, starts[0], law, max_steps=max_steps))
 
     def _of_variant(
         self,
@@ -133,13 +133,13 @@ class Refits:
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
 
 
-def acts(candidate: Candidate, parent: Candidate, sd_floor: float) -> bool:
+def acts(candidate: Candidate, parent: Candidate) -> bool:
     """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
     law = candidate.law
 
     def misfit(found: Fit) -> float:
         whitened = law(found.residuals)[:, None]
-        return float(law.misfit(whitened, law.scale(whitened, floor=sd_floor))[0])
+        return float(law.misfit(whitened, law.scale(whitened))[0])
 
     return 2 * (misfit(parent.found) - misfit(candidate.found)) > 3.0
 

@@ -60,7 +60,6 @@ def search(
     effects: Mapping[str, NamedEffect[Any]],
     *,
     sensor: Null | None,
-    sd_floor: float,
     prior: PriorOdds | None = None,
     max_order: int = 3,
     beam: int = 3,
@@ -76,8 +75,6 @@ def search(
         The vocabulary to search, by name.
     sensor
         What is believed of the sensor, or of any other model; None: calibrated from the recording alone.
-    sd_floor
-        Least believable noise sd.
     prior
         Prior odds.
     max_order
@@ -85,9 +82,7 @@ def search(
     beam, depth
         How many combinations of each size above one are refitted, and the largest size.
     """
-    return _Searcher(
-        recording, effects, sensor, sd_floor, prior or PriorOdds.over(effects), max_order, beam, depth
-    ).run()
+    return _Searcher(recording, effects, sensor, prior or PriorOdds.over(effects), max_order, beam, depth).run()
 
 
 @dataclass(eq=False)
@@ -97,7 +92,6 @@ class _Searcher:
     recording: Recording
     effects: Mapping[str, NamedEffect[Any]]
     sensor: Null | None
-    sd_floor: float
     prior: PriorOdds
     max_order: int
     beam: int
@@ -110,7 +104,7 @@ class _Searcher:
         self.extent = Extent.of(self.recording)
         self.mean_effects = {n: e for n, e in self.effects.items() if e.stage is not Stage.NOISE}
         on_noise = {n: cast(NoiseEffect, e) for n, e in self.effects.items() if e.stage is Stage.NOISE}
-        self.noises = Noises(self.recording, on_noise, self.prior, self.sd_floor)
+        self.noises = Noises(self.recording, on_noise, self.prior)
         self.refits = Refits(self.sensor, self.noises, self.templates)
         self.candidates: dict[tuple[int, Names], Candidate] = {}
         self.sensors: dict[int, Null] = {}
@@ -168,7 +162,6 @@ class _Searcher:
                 self._screened(),
                 self.unknown.log_z,
                 self.prior,
-                self.sd_floor,
                 self.unknown.covariates,
                 self.unknown.bases,
                 self.unknown.shares,
@@ -205,7 +198,7 @@ class _Searcher:
 
     def _null_fits(self) -> None:
         """Fit the null with SSFs of one Gaussian, of free form, and of more Gaussians; one more is always a rival."""
-        plan, law = self.recording.plan, white(self.n_points)
+        plan, law = self.recording.plan, white(self.n_points, least=self.noises.least_sd)
         if self.sensor is not None:
             self.sensors[self.sensor.n_gaussians] = self.sensor
             self._keep(self.refits.weighed(Model(self.sensor, (), plan), self.sensor.starts, law))
@@ -334,7 +327,7 @@ class _Searcher:
         """Refit a candidate with one more effect and keep it, or note that the effect is not felt."""
         against = 0.0 if parent.names else self._coincidence(parent.worth)
         candidate, scores = self.refits.extended(parent, self.mean_effects[added], against)
-        if acts(candidate, parent, self.sd_floor):
+        if acts(candidate, parent):
             return self._keep(candidate)
         # Laplace fails where an effect is too small to be felt and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
@@ -419,5 +412,5 @@ class _Searcher:
         )
         log_share = source.log_share + self._coincidence(source.worth) - self._coincidence(sensor.worth)
         candidate = candidate.as_share(log_share, source.weights)
-        if acts(candidate, null, self.sd_floor):
+        if acts(candidate, null):
             self._keep(candidate)

@@ -116,7 +116,7 @@ def _weigh(
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = JointProblem(candidate.found.model, search.recording, evidence, search.sd_floor)
+    problem = JointProblem(candidate.found.model, search.recording, evidence)
     once = folded(problem, candidate.found.z)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
@@ -167,7 +167,7 @@ def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.rando
 def _of_laplace(candidate: Candidate, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
     """Draw from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
-    root = covariance_root(evidence.law(found.slopes), found.sd**2)
+    root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.information)
     draws = rng.standard_normal((_N_SAMPLES, len(found.z)))
     return np.clip(found.z + draws @ root.T, -FARTHEST, FARTHEST)
 

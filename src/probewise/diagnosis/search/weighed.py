@@ -79,6 +79,11 @@ class Candidate:
         return self.found.model.sensor.n_gaussians
 
     @property
+    def sd(self) -> float:
+        """Sd of a whitened reading, a tail aside, rounding with it."""
+        return self.found.sd * self.law.widening
+
+    @property
     def worth(self) -> int:
         """How many Gaussians its SSF is as free as."""
         return self.found.model.sensor.worth
@@ -113,7 +118,6 @@ class Search:
     screened: Mapping[tuple[Names, Names], float]  # (mean, noise) -> log evidence
     unknown: Mapping[tuple[int, Names, Names], float]  # (order, mean, noise) -> log evidence
     prior: PriorOdds
-    sd_floor: float
     covariates: tuple[Covariate, ...]
     unknown_bases: Bank
     unknown_shares: Mapping[str, float]
@@ -181,7 +185,7 @@ def nats_apart(first: Candidate, second: Candidate) -> float:
     Half of the squared distance between their predictions, in sds of the noise as the first has it.
     """
     apart = first.law((first.found.residuals - second.found.residuals)[:, None])
-    return 0.5 * float(np.sum(apart**2)) / (first.found.sd * first.law.widening) ** 2
+    return 0.5 * float(np.sum(apart**2)) / first.sd**2
 
 
 def in_vocabulary(noise: Names) -> Names:

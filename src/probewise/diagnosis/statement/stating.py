@@ -134,8 +134,9 @@ def _size(search: Search, holder: Candidate, name: str, noise: Names) -> float:
     model, stay = found.model.without(name)
     noise_free = Recording(search.recording.plan, clean).unlimited()
     # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
-    refit = fit(model, noise_free, found.z[stay], law, sd_floor=found.sd, max_steps=12, tolerance=0.02)
-    return float(np.linalg.norm(law(refit.residuals))) / found.sd * math.sqrt(law.information)
+    sigma = float(law.scale(law(found.residuals)[:, None])[0])
+    refit = fit(model, noise_free, found.z[stay], law.at_least(sigma), max_steps=12, tolerance=0.02)
+    return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.information)
 
 
 def noise_found(

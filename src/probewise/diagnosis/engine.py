@@ -187,7 +187,7 @@ class _Diagnoser:
             written = ensemble.averaged(best, {best.names: 1 - share, (): share})
         elif verdict in ("named", "cannot_tell") and best.names:
             written = ensemble.averaged(best, ensemble.likely(best))
-        elif verdict in ("unknown", "cannot_tell") and not (few or fails):
+        elif not (few or fails):
             written = self._left_open(ensemble, null, noise_of, p_value)
         null_samples = samples if best is null else ensemble.of(null)
         effects = effects_found(self.search, hypotheses, best, samples, noise_of, rng=self.rng)

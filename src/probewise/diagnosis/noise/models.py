@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.flat import Flat
 from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
-from probewise.effects import NoiseEffect, NoiseRows, lattice_step
+from probewise.effects import Dropouts, NoiseEffect, NoiseRows, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseLevel
@@ -147,8 +147,9 @@ class NoiseModel:
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._cell, 1.0)
+            (dropouts,) = (effect for effect in self.effects if isinstance(effect, Dropouts))
             # The value is one of the cells of the range; then each reading that is lost is in that cell.
-            log_extra = n_lost * math.log(lost_share / self._cell) - math.log(cells)
+            log_extra = n_lost * math.log(lost_share / self._cell) + dropouts.log_value(value, cells)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd)
 

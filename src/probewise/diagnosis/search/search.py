@@ -8,7 +8,7 @@ Laplace weighs.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -32,7 +32,7 @@ from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.refits import Refits, acts
 from probewise.diagnosis.search.unknown import Unknown
 from probewise.diagnosis.search.unnamed import give_way
-from probewise.diagnosis.search.weighed import STEERING, Candidate, Search, weighed
+from probewise.diagnosis.search.weighed import STEERING, Candidate, Search, outside, weighed
 from probewise.effects import EFFECTS, UNNAMED, Extent, NamedEffect, NoiseEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -47,8 +47,10 @@ _WORTH_GROWING = 20.0  # nats behind the best of its size: nothing more grows fr
 _WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
 _WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
 _SINGLES = 6  # effects that are refitted alone
+_UNNAMED = 3  # combinations of one size that are refitted with something outside the vocabulary
 _WORTH_REFITTING = 6.0  # nats behind the best so far: screening about a fit that one effect has bent is so far off
 _TAKEN_APART = 3  # leading combinations, of which each effect is left out in turn
+_SWAPPED = 2  # other effects that are tried in its stead
 _FAINT = 0.35  # of a trace; where a null leaves no more to first order, a large effect may show in another way
 _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 _LEAST_ELSEWHERE = 1e-4  # probability of such a combination
@@ -62,7 +64,7 @@ def search(
     sensor: Null | None,
     prior: PriorOdds | None = None,
     max_order: int = 3,
-    beam: int = 3,
+    beam: int = 8,
     depth: int = 3,
 ) -> Search:
     """Weigh every combination of effects.
@@ -111,6 +113,7 @@ class _Searcher:
         self.about_null: dict[tuple[Names, Names], float] = {}  # (mean, noise) -> log evidence
         self.about_parts: dict[tuple[Names, Names], float] = {}
         self.not_felt: set[Names] = set()
+        self.grown: set[tuple[Candidate, str]] = set()  # what was refitted from where
         self.spoken_for: set[Names] = set()  # without a name, and not to be told from what has one
 
     def run(self) -> Search:
@@ -264,28 +267,33 @@ class _Searcher:
             for parent in grown:
                 self._wish(parent, wishes)
             if size == 2:
-                self._wish_for_pairs(grown, wishes)
+                self._wish_for_pairs(wishes)
             odds = {names: score + self._log_prior(names) for names, (score, _, _) in wishes.items()}
-            ranked = sorted(odds, key=lambda names: -odds[names])
-            best_so_far = max(c.log_z + self._log_prior(c.names) for c in grown)
-            grown = []
             # A user's own effect was named to be tried, however far it leads from where screening is linear; and
             # screening says nothing of what the null takes up all but a little of to first order.
             always = (self.mean_effects.keys() - EFFECTS) | self._faint(best) if size == 1 else set()
-            own = [names for names in ranked if names[0] in always]
-            width, behind = (_SINGLES, _WORTH_REFITTING) if size == 1 else (self.beam, STEERING)
-            for rank, names in enumerate(dict.fromkeys([*ranked[:width], *own])):
-                # A combination that screening puts this far behind cannot come to matter.
-                if odds[names] < best_so_far - behind and (size > 1 or rank > 0) and names not in own:
-                    continue
+            grown = []
+            for names in self._worth_refitting(odds, size, always):
                 _, parent, added = wishes[names]
                 candidate = self._refit(parent, added)
                 if candidate is not None:
                     grown.append(candidate)
             if not grown:
                 break
-            best_grown = max(c.log_z for c in grown)
-            grown = [c for c in grown if c.log_z > best_grown - _WORTH_GROWING]
+            grown = [c for c in grown if c.log_z > max(r.log_z for r in _rivals(c.names, grown)) - _WORTH_GROWING]
+
+    def _worth_refitting(self, odds: Mapping[Names, float], size: int, always: set[str]) -> list[Names]:
+        """Choose which combinations are refitted, by the odds that screening gives them; `always` are effects alone."""
+        ranked = sorted(odds, key=lambda names: -odds[names])
+        named, rest = [n for n in ranked if not outside(n)], [n for n in ranked if outside(n)]
+        behind = _WORTH_REFITTING if size == 1 else STEERING
+        chosen = ranked[:1] if size == 1 else []
+        for names in [*named[: _SINGLES if size == 1 else self.beam], *rest[:_UNNAMED]]:
+            rivals = _rivals(names, self.candidates.values())
+            # A combination that screening puts this far behind cannot come to matter.
+            if odds[names] >= max(c.log_z + self._log_prior(c.names) for c in rivals) - behind:
+                chosen.append(names)
+        return list(dict.fromkeys([*chosen, *(names for names in ranked if names[0] in always)]))
 
     def _wish(self, parent: Candidate, wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
         """Screen every effect that a fit does not hold yet, by its templates about the null of the same SSF."""
@@ -313,22 +321,22 @@ class _Searcher:
         left = bank.surviving(Linearised.of(null.found, null.law))
         return {name for name, members in bank.members.items() if left[members].max() < _FAINT}
 
-    def _wish_for_pairs(self, grown: list[Candidate], wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
-        """Add pairs of which neither effect leads alone."""
-        held = {c.names: c for c in grown}
+    def _wish_for_pairs(self, wishes: dict[Names, tuple[float, Candidate, str]]) -> None:
+        """Wish for pairs by what they promise together, where neither effect leads alone."""
         for (names, _), value in self.about_null.items():
-            if len(names) == 2 and value > wishes.get(names, (-np.inf,))[0]:
-                for part, added in ((names[:1], names[1]), (names[1:], names[0])):
-                    if part in held:
-                        wishes[names] = (value, held[part], added)
-                        break
+            if names in wishes and value > wishes[names][0]:
+                wishes[names] = (value, *wishes[names][1:])
 
     def _refit(self, parent: Candidate, added: str) -> Candidate | None:
-        """Refit a candidate with one more effect and keep it, or note that the effect is not felt."""
+        """Refit a candidate with one more effect and keep the best of its kind, or note that the effect is not felt."""
         against = 0.0 if parent.names else self._coincidence(parent.worth)
         candidate, scores = self.refits.extended(parent, self.mean_effects[added], against)
+        self.grown.add((parent, added))
+        known = self.candidates.get((candidate.n_gaussians, candidate.names), candidate)
         if acts(candidate, parent):
-            return self._keep(candidate)
+            return self._keep(max(known, candidate, key=lambda c: c.log_z))
+        if known is not candidate:
+            return known
         # Laplace fails where an effect is too small to be felt and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
         names = tuple(sorted((*parent.names, added)))
@@ -351,13 +359,32 @@ class _Searcher:
             self._reach(max(still_open, key=lambda n: merged[n]))
 
     def _take_apart(self) -> None:
-        """Refit the leading combinations less one effect: what screening put first may be superfluous."""
+        """Refit the leading combinations less one effect, and grow them again from there.
+
+        What screening put first may be superfluous, or have stood for another effect while there was but one. And the
+        scans that an effect is bound to, or the place it is at, were chosen while it stood for both.
+        """
         ranked = sorted(self.candidates.values(), key=lambda c: -(c.log_z + self._log_prior(c.names)))
-        for candidate in [c for c in ranked if len(c.names) > 1][:_TAKEN_APART]:
-            for rest in itertools.combinations(candidate.names, len(candidate.names) - 1):
-                refitted = {names for _, names in self.candidates}
-                if rest not in refitted | self.not_felt:
-                    self._reach(rest)
+        several = [c for c in ranked if len(c.names) > 1]
+        named, rest = [c for c in several if not outside(c.names)], [c for c in several if outside(c.names)]
+        for candidate in [*named[:_TAKEN_APART], *rest[:1]]:
+            for left_out in candidate.names:
+                others = tuple(name for name in candidate.names if name != left_out)
+                if others not in {names for _, names in self.candidates} | self.not_felt:
+                    self._reach(others)
+                held = self.candidates.get((candidate.n_gaussians, others))
+                if held is not None:
+                    self._grow_again(held, candidate.names)
+
+    def _grow_again(self, held: Candidate, names: Names) -> None:
+        """Refit a candidate with what makes it these names, and with what leads beside it."""
+        wishes: dict[Names, tuple[float, Candidate, str]] = {}
+        self._wish(held, wishes)
+        odds = {key: score + self._log_prior(key) for key, (score, _, _) in wishes.items()}
+        chosen = [names, *self._worth_refitting(odds, len(names), set())[:_SWAPPED]]
+        for added in [wishes[key][2] for key in chosen if key in wishes]:
+            if (held, added) not in self.grown:
+                self._refit(held, added)
 
     def _reach(self, names: Names) -> None:
         """Refit a combination, from the largest of its parts that is."""
@@ -377,27 +404,28 @@ class _Searcher:
         """Refit the leading hypotheses at the SSF orders that could rival the one of the search."""
         if self.sensor is not None:
             return
-        first = self._weighed_up()
-        ranked = sorted(first.probabilities, key=lambda key: -first.probabilities[key])
-        leaders = list(dict.fromkeys(mean for mean, _ in ranked if mean and mean != ("unknown",)))[:_AT_OTHER_ORDERS]
-        for names in leaders:
+        by_mean = self._weighed_up().by_mean
+        # What has no name may lead at an order at which no name was tried yet: that must not keep the names from it.
+        known = sum(p for names, p in by_mean.items() if names != ("unknown",))
+        leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
+        for names in leaders[:_AT_OTHER_ORDERS]:
             held = [c for (_, key), c in self.candidates.items() if key == names]
-            p = sum(p for (mean, _), p in first.probabilities.items() if mean == names)
-            if held and p >= _LEAST_ELSEWHERE:
+            if held and by_mean[names] >= _LEAST_ELSEWHERE * known:
                 source = max(held, key=lambda c: c.log_z)
                 for n in self._rival_orders(source):
                     self._carry_over(source, n)
 
     def _rival_orders(self, source: Candidate) -> list[int]:
         """List the SSF orders at which what is refitted at one is worth another refit."""
-        behind = self.candidates[source.n_gaussians, ()].log_z - _WORTH_REFITTING
+        own = self.candidates[source.n_gaussians, ()].log_z
+        behind = own - _WORTH_REFITTING
         return [
             n
             for n, sensor in self.sensors.items()
             if (n, source.names) not in self.candidates
-            and sensor.worth <= source.worth + 1
             # A freer SSF that does not pay by itself does not pay beside an effect.
             and (sensor.worth < source.worth or self.candidates[n, ()].log_z > behind)
+            and (sensor.worth <= source.worth + 1 or self.candidates[n, ()].log_z > own)
         ]
 
     def _carry_over(self, source: Candidate, n: int) -> None:
@@ -414,3 +442,8 @@ class _Searcher:
         candidate = candidate.as_share(log_share, source.weights)
         if acts(candidate, null):
             self._keep(candidate)
+
+
+def _rivals(names: Names, among: Iterable[Candidate]) -> list[Candidate]:
+    """List those that a combination competes with: what has no name does not keep names from being tried."""
+    return [c for c in among if outside(names) or not outside(c.names)]

@@ -17,7 +17,7 @@ from probewise.diagnosis.evidence.laplace import weigh
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw, Tail, white
 from probewise.diagnosis.noise.models import NoiseModel, rough_sd
-from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
+from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Extent, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -137,6 +137,32 @@ def test_readings_lost_to_one_value_are_no_wide_ones():
     assert log_z["Dropouts"] > log_z["Outliers"] + 3 > plain + 50
     law = weigh(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6)).law
     np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
+
+
+@pytest.mark.parametrize("value", [0.0, 100.0, 37.0])
+def test_one_reading_at_an_end_of_the_declared_range_is_lost(value):
+    """Elsewhere one reading says nothing of what others would be lost to, and is wide."""
+    rng = np.random.default_rng(15)
+    noise = SD * rng.normal(size=N)
+    at = int(np.argmax(np.abs(MEAN - value)))
+    noise[at] = value - MEAN[at]
+    found, recording = found_with(noise)
+    dropouts = Dropouts.for_extent(Extent.of(recording))
+    log_z = {
+        type(e).__name__: weigh(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z for e in (dropouts, Outliers())
+    }
+    if value in dropouts.ends:
+        assert log_z["Dropouts"] > log_z["Outliers"] + 3
+    else:
+        assert log_z["Dropouts"] == -math.inf
+
+
+def test_the_prior_of_what_is_lost_to_sums_to_one():
+    """Of a hundred cells of the range two are its ends, each of them likely."""
+    dropouts = Dropouts(0.0, 100.0, (0.0, 100.0))
+    others = 98 * math.exp(dropouts.log_value(37.0, 100.0))
+    assert others + 2 * math.exp(dropouts.log_value(100.0, 100.0)) == pytest.approx(1.0)
+    assert Dropouts(0.0, 100.0).log_value(100.0, 100.0) == -math.log(100.0)
 
 
 def test_where_nothing_is_lost_there_is_no_such_law():

@@ -308,7 +308,8 @@ class _Searcher:
                 names = tuple(sorted((*parent.names, name)))
                 score = evidence.log_z + log_mean(own) - against
                 known = self.about_parts if parent.names else self.about_null
-                known[names, noise] = max(score, known.get((names, noise), -np.inf))
+                if names not in self.not_felt:  # a refit has said more
+                    known[names, noise] = max(score, known.get((names, noise), -np.inf))
                 if score > wishes.get(names, (-np.inf,))[0]:
                     wishes[names] = (score, parent, name)
 

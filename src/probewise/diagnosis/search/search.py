@@ -373,9 +373,9 @@ class _Searcher:
                 others = tuple(name for name in candidate.names if name != left_out)
                 if others not in {names for _, names in self.candidates} | self.not_felt:
                     self._reach(others)
-                held = self.candidates.get((candidate.n_gaussians, others))
-                if held is not None:
-                    self._grow_again(held, candidate.names)
+                held = [c for (_, key), c in self.candidates.items() if key == others]
+                if held:
+                    self._grow_again(max(held, key=lambda c: c.log_z), candidate.names)
 
     def _grow_again(self, held: Candidate, names: Names) -> None:
         """Refit a candidate with what makes it these names, and with what leads beside it."""

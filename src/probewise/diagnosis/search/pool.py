@@ -1,0 +1,159 @@
+"""All that one search has fitted and screened so far: candidates by SSF order and names, and how another is added."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.odds import PriorOdds
+from probewise.diagnosis.search.refits import Refits, acts
+from probewise.diagnosis.search.weighed import Candidate, outside
+from probewise.effects import NamedEffect
+
+__all__ = ["Pool", "rivals_of"]
+
+Names = tuple[str, ...]
+
+
+@dataclass(eq=False)
+class Pool:
+    """The memory of a search, filled as it goes on.
+
+    Parameters
+    ----------
+    effects
+        On the mean, by name.
+    prior
+        Prior odds.
+    noises
+        The noise models.
+    templates
+        Of effects about fits.
+    refits
+        How the recording is fitted.
+    """
+
+    effects: Mapping[str, NamedEffect[Any]]
+    prior: PriorOdds
+    noises: Noises
+    templates: TemplateMemory
+    refits: Refits
+    candidates: dict[tuple[int, Names], Candidate] = field(default_factory=dict)
+    sensors: dict[int, Null] = field(default_factory=dict)
+    """By SSF order."""
+    about_null: dict[tuple[Names, Names], float] = field(default_factory=dict)
+    """Log evidence of (mean, noise) by screening about a null."""
+    about_parts: dict[tuple[Names, Names], float] = field(default_factory=dict)
+    """The same about a fit that holds all of the mean but one effect."""
+    not_felt: set[Names] = field(default_factory=set)
+    """Combinations of which a refit has shown that one effect does nothing."""
+    grown: set[tuple[Candidate, str]] = field(default_factory=set)
+    """What was refitted: from which candidate, with which effect more."""
+    spoken_for: set[Names] = field(default_factory=set)
+    """Combinations without a name that are not to be told from what has one."""
+
+    @property
+    def nulls(self) -> list[Candidate]:
+        """List the candidates without effects, one an SSF order."""
+        return [c for (_, names), c in self.candidates.items() if not names]
+
+    @property
+    def null(self) -> Candidate:
+        """The best of them."""
+        return max(self.nulls, key=lambda c: c.log_z)
+
+    @property
+    def refitted(self) -> set[Names]:
+        """Combinations that are candidates, at any order."""
+        return {names for _, names in self.candidates}
+
+    def of(self, names: Names) -> list[Candidate]:
+        """List the candidates of one combination, one an SSF order."""
+        return [c for (_, key), c in self.candidates.items() if key == names]
+
+    def odds(self, candidate: Candidate) -> float:
+        """Log evidence of a candidate and log prior odds of its effects."""
+        return candidate.log_z + self.prior.log_mean(candidate.names)
+
+    def bank(self, null: Candidate) -> Bank:
+        """Lay out the templates of all effects about a null."""
+        return self.templates.bank(null.found, list(self.effects.values()))
+
+    def coincidence(self, worth: int, each: float | None = None) -> float:
+        """Give the nats against effects beside an SSF worth so few Gaussians, where the null alone takes more.
+
+        Averaged over the null's orders: what an order wins by chance, by a fraction of a nat, must not count whole.
+        """
+        nulls = self.nulls
+        log_z = np.array([c.log_z for c in nulls])
+        spared = np.array([max(c.worth - worth, 0) for c in nulls])
+        return float(logsumexp(log_z) - logsumexp(log_z - (self.prior.coincidence if each is None else each) * spared))
+
+    def keep(self, candidate: Candidate) -> Candidate:
+        """Take a candidate in, in the place of the one it had."""
+        self.candidates[candidate.n_gaussians, candidate.names] = candidate
+        return candidate
+
+    def refit(self, parent: Candidate, added: str) -> Candidate | None:
+        """Refit a candidate with one more effect and keep the best of its kind, or note that the effect is not felt."""
+        against = 0.0 if parent.names else self.coincidence(parent.worth)
+        candidate, scores = self.refits.extended(parent, self.effects[added], against)
+        self.grown.add((parent, added))
+        known = self.candidates.get((candidate.n_gaussians, candidate.names), candidate)
+        if acts(candidate, parent):
+            return self.keep(max(known, candidate, key=lambda c: c.log_z))
+        if known is not candidate:
+            return known
+        # Laplace fails where an effect is too small to be felt and the closed form does not; but the
+        # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
+        names = tuple(sorted((*parent.names, added)))
+        for noise, value in scores.items():
+            self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
+        self.not_felt.add(names)
+        return None
+
+    def reach(self, names: Names) -> None:
+        """Refit a combination, from the largest of its parts that is."""
+        parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
+        held = max(parts, key=lambda c: (len(c.names), c.log_z))
+        for added in [n for n in names if n not in held.names]:
+            grown = self.refit(held, added)
+            if grown is None:
+                self.not_felt.add(names)
+                for noise, evidence in held.evidence.items():
+                    known = self.about_parts.get((names, noise), np.inf)
+                    self.about_parts[names, noise] = min(known, evidence.log_z)
+                break
+            held = grown
+
+    def screened(self) -> dict[tuple[Names, Names], float]:
+        """Give the log evidence of what was not refitted, by screening.
+
+        About a fit that holds part of it a combination is judged better than about the null; there, what
+        refits have made of its parts since is put right.
+        """
+        refitted = self.refitted
+        out = {}
+        for (names, noise), value in self.about_null.items():
+            parts = [p for p in itertools.combinations(names, len(names) - 1) if p in refitted]
+            gains = [
+                max(c.evidence[noise].log_z for c in self.of(part)) - self.about_null.get((part, noise), np.inf)
+                for part in parts
+            ]
+            out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
+        out |= self.about_parts
+        return {key: value for key, value in out.items() if key[0] not in refitted | self.spoken_for}
+
+
+def rivals_of(names: Names, among: Iterable[Candidate]) -> list[Candidate]:
+    """List those that a combination competes with: what has no name does not keep names from being tried."""
+    return [c for c in among if outside(names) or not outside(c.names)]

@@ -13,9 +13,10 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
 from probewise._version import __version__
+from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.effects import EFFECTS, EdgeShadow
@@ -91,6 +92,9 @@ class FittedSensor(ShowsItself):
         Names of the effects in the model, in the order of their columns.
     patterns
         Names of the patterns that an effect is bound to, by the effect; one that is not here acts on all.
+    absent
+        Samples that do without an effect, (n_samples,), by the effect: a diagnosis has left open whether it is there.
+        One that is not here acts in all.
     scan_noise
         Noise of each scan of the recording.
     fingerprint, source
@@ -113,6 +117,7 @@ class FittedSensor(ShowsItself):
     instrumentation: Instrumentation
     effects: tuple[str, ...] = ()
     patterns: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    absent: Mapping[str, BoolArray] = dataclasses.field(default_factory=dict)
     scan_noise: tuple[ScanNoise, ...] = ()
     fingerprint: str = ""
     source: str = ""
@@ -139,6 +144,9 @@ class FittedSensor(ShowsItself):
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
+        for name, without in self.absent.items():
+            if name not in self.effects or without.shape != (len(samples),):
+                raise ParameterError("absent", name, f"effects of the model, each with {len(samples)} truth values")
         wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
@@ -187,6 +195,30 @@ class FittedSensor(ShowsItself):
         n = self.n_gaussians
         return mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
 
+    def leading(self) -> FittedSensor:
+        """Give the most probable of the hypotheses that a diagnosis has left open: a mean over all is true of none.
+
+        As many samples as it has, those of that hypothesis repeated; itself where it holds but one.
+        """
+        if not self.absent:
+            return self
+        without = np.stack(list(self.absent.values()), axis=1)
+        sets, which, counts = np.unique(without, axis=0, return_inverse=True, return_counts=True)
+        rows = np.resize(np.flatnonzero(which.reshape(-1) == np.argmax(counts)), len(self.samples))
+        left_out = {name for name, out in zip(self.absent, sets[np.argmax(counts)], strict=True) if out}
+        kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] not in left_out]
+        samples = self.samples[rows][:, kept]
+        return dataclasses.replace(
+            self,
+            names=tuple(self.names[k] for k in kept),
+            samples=samples,
+            noise_sd=self.noise_sd[rows],
+            field=mean_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
+            effects=tuple(name for name in self.effects if name not in left_out),
+            patterns={name: own for name, own in self.patterns.items() if name not in left_out},
+            absent={},
+        )
+
     def mean(self) -> dict[str, float]:
         """Posterior mean by parameter."""
         return dict(zip(self.names, self.samples.mean(axis=0).tolist(), strict=True))
@@ -209,7 +241,7 @@ class FittedSensor(ShowsItself):
         form = "an SSF of free form" if bending else f"{n} Gaussian{'s' if n > 1 else ''}"
         lines = [
             f"{form}, {len(self.samples)} posterior samples"
-            + (f", with {', '.join(self.effects)}" if self.effects else ""),
+            + (f", with {', '.join(self._how_often(name) for name in self.effects)}" if self.effects else ""),
             f"noise of a new reading  {self.noise_sd.mean():.4g} ± {self.noise_sd.std():.2g} {unit}",
         ]
         if self.orders:
@@ -231,6 +263,10 @@ class FittedSensor(ShowsItself):
         ]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
+    def _how_often(self, effect: str) -> str:
+        share = 1.0 - self.absent[effect].mean() if effect in self.absent else 1.0
+        return effect if share == 1.0 else f"{effect} in {share:.0%} of them"
+
     def to_json(self) -> str:
         """Write the sensor as strict JSON, format "sensor/1"."""
         mean, sd, interval = self.mean(), self.sd(), self.interval()
@@ -247,6 +283,7 @@ class FittedSensor(ShowsItself):
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
+            "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {
                 "model": self._noise_in_words(),
                 "mean": float(self.noise_sd.mean()),
@@ -293,10 +330,11 @@ class FittedSensor(ShowsItself):
         if found != FORMAT:
             raise FileError(path, f"format {found!r}", f"{FORMAT!r}; calibrate the recording anew with this version")
         read = _Reader(path, document)
+        samples = read.array("samples", ndim=2)
         try:
             sensor = cls(
                 names=tuple(_text(read, p, "name", "parameters") for p in read.items("parameters")),
-                samples=read.array("samples", ndim=2),
+                samples=samples,
                 n_gaussians=read.whole("n_gaussians"),
                 noise_sd=read.array("noise", "sd", ndim=1),
                 field=SSFField(
@@ -307,6 +345,7 @@ class FittedSensor(ShowsItself):
                 instrumentation=_instrumentation(read),
                 effects=tuple(read.texts("effects")),
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
+                absent={name: read.marks(len(samples), "absent", name) for name in document.get("absent", {})},
                 scan_noise=tuple(_record(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")),
                 fingerprint=read.text("recording", "fingerprint"),
                 source=read.text("recording", "source"),
@@ -418,6 +457,15 @@ class _Reader:
         if array.ndim != ndim or not np.isfinite(array).all():
             raise self.wrong(".".join(keys), found, f"finite numbers in {ndim} equal dimensions")
         return array
+
+    def marks(self, n: int, *keys: str) -> BoolArray:
+        """Read the numbers of some of n rows as truth values, (n,)."""
+        found = self.array(*keys, ndim=1)
+        if not np.isin(found, np.arange(n)).all():
+            raise self.wrong(".".join(keys), found.tolist(), f"whole numbers from 0 to {n - 1}")
+        out = np.zeros(n, dtype=np.bool_)
+        out[found.astype(np.int64)] = True
+        return out
 
 
 def _text(read: _Reader, item: Mapping[str, Any], key: str, place: str) -> str:

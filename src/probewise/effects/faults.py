@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -79,9 +78,8 @@ class Dropouts(NoiseEffect):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Take any value within the range of the readings, or a little outside; and the ends of the declared range."""
-        declared = extent.plan.instrumentation
-        ends = tuple(end for end in (declared.min, declared.max) if end is not None)
-        return cls(extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span, ends)
+        low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
+        return cls(low, high, extent.plan.instrumentation.ends)
 
     @cached_property
     def prior(self) -> Product:
@@ -101,21 +99,13 @@ class Dropouts(NoiseEffect):
         """Take the value that most readings far off share at twelve shares, two of them at least or one at an end."""
         far = (rows.predicted + rows.sd * residuals)[np.abs(residuals) > _FAR]
         # As floats differ in their last digits, the value is one of the readings, not their mean.
-        same = np.abs(far[:, None] - far) <= 1e-6 * rows.sd
+        n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
         at_end = (np.abs(far[:, None] - np.array(self.ends)) <= 1e-6 * rows.sd).any(axis=1)
-        n_lost = same.sum(axis=0) + at_end
-        if not far.size or n_lost.max() < 2:
+        if not (at_end | (n_alike > 1)).any():
             return np.zeros((0, 2))
-        value = far[int(np.argmax(n_lost))]
+        value = far[int(np.argmax(n_alike + 0.5 * at_end))]
         shares = LogUniform(2e-3, 0.2).from_unit((np.arange(12) + 0.5) / 12)
         return np.stack([shares, np.full(12, value)], axis=1)
-
-    def log_value(self, value: float, cells: float) -> float:
-        """Give the log prior probability of the value: half is for the ends, half for any cell of the range."""
-        if not self.ends:
-            return -math.log(cells)
-        at_end = any(abs(value - end) <= 1e-9 * (1 + abs(end)) for end in self.ends)
-        return math.log(0.5 * at_end / len(self.ends) + 0.5 / cells)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how many readings are lost, and to which value."""

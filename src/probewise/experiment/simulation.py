@@ -76,9 +76,9 @@ def experiment_for(
     Parameters
     ----------
     sensor
-        As calibrated. The SSF model takes the mixture with the mean and covariance of its mean field, so that
-        closed forms stand in for the sum over pixels, and its effects at their posterior means; the naive
-        model takes its two levels.
+        As calibrated; of what a diagnosis has left open, the most probable. The SSF model takes the mixture with the
+        mean and covariance of its mean field, so that closed forms stand in for the sum over pixels, and its effects
+        at their posterior means; the naive model takes its two levels.
     shape
         What may lie on the field.
     field
@@ -98,6 +98,7 @@ def experiment_for(
         How the sensor may be turned, how often it may read on the spot and how high it may stand, for an arm that
         can do so; heights for the SSF model of a sensor whose description says at which it was calibrated.
     """
+    sensor = sensor.leading()  # a mean over rivals is true of none of them
     means = sensor.mean()
     levels = FixedLevels(means["I_min"], means["I_max"])
     scene = HypothesisScene(shape)

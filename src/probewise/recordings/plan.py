@@ -29,6 +29,11 @@ class Instrumentation:
     controls: tuple[str, ...] = ()
     description: str = ""
 
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """Ends of the range, as far as they are declared."""
+        return tuple(end for end in (self.min, self.max) if end is not None)
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:

@@ -93,6 +93,9 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
     if is_repaired(diagnosis):
         facts.append(("What is left", f"rms {gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} after"))
+    if diagnosis.left_open:
+        shares = ", ".join(f"{name.replace('_', ' ')} in {share:.0%}" for name, share in diagnosis.left_open.items())
+        facts.append(("What its predictions leave open", f"{shares} of the samples in sensor.json"))
     facts.append(("What to do next", _next_in_words(diagnosis)))
     return facts
 

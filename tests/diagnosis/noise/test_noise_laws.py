@@ -16,7 +16,7 @@ from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence.laplace import weigh
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw, Tail, white
-from probewise.diagnosis.noise.models import NoiseModel, rough_sd
+from probewise.diagnosis.noise.models import NoiseModel, log_lost_value, rough_sd
 from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Extent, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
@@ -139,8 +139,8 @@ def test_readings_lost_to_one_value_are_no_wide_ones():
     np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
 
 
-@pytest.mark.parametrize("value", [0.0, 100.0, 37.0])
-def test_one_reading_at_an_end_of_the_declared_range_is_lost(value):
+@pytest.mark.parametrize(("value", "lost"), [(0.0, True), (100.0, True), (37.0, False)])
+def test_one_reading_at_an_end_of_the_declared_range_is_lost(value, lost):
     """Elsewhere one reading says nothing of what others would be lost to, and is wide."""
     rng = np.random.default_rng(15)
     noise = SD * rng.normal(size=N)
@@ -151,18 +151,41 @@ def test_one_reading_at_an_end_of_the_declared_range_is_lost(value):
     log_z = {
         type(e).__name__: weigh(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z for e in (dropouts, Outliers())
     }
-    if value in dropouts.ends:
+    if lost:
         assert log_z["Dropouts"] > log_z["Outliers"] + 3
     else:
         assert log_z["Dropouts"] == -math.inf
 
 
+def test_two_readings_that_agree_say_more_than_one_at_an_end():
+    rng = np.random.default_rng(16)
+    noise = SD * rng.normal(size=N)
+    dark, bright = np.argsort(MEAN)[:1], np.argsort(MEAN)[-2:]
+    noise[dark], noise[bright] = 100.0 - MEAN[dark], 37.0 - MEAN[bright]
+    found, recording = found_with(noise)
+    law = weigh(found, NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)).law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), np.sort(bright))
+
+
 def test_the_prior_of_what_is_lost_to_sums_to_one():
     """Of a hundred cells of the range two are its ends, each of them likely."""
-    dropouts = Dropouts(0.0, 100.0, (0.0, 100.0))
-    others = 98 * math.exp(dropouts.log_value(37.0, 100.0))
-    assert others + 2 * math.exp(dropouts.log_value(100.0, 100.0)) == pytest.approx(1.0)
-    assert Dropouts(0.0, 100.0).log_value(100.0, 100.0) == -math.log(100.0)
+    others = 98 * math.exp(log_lost_value(37.0, 100.0, (0.0, 100.0)))
+    assert others + 2 * math.exp(log_lost_value(100.0, 100.0, (0.0, 100.0))) == pytest.approx(1.0)
+    assert log_lost_value(100.0, 100.0, ()) == -math.log(100.0)
+
+
+def test_an_own_effect_may_lose_readings_too():
+    class Blind(Dropouts):
+        name = "blind"
+
+        def apply(self, value, theta, plan):
+            return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
+
+    noise = SD * np.random.default_rng(5).normal(size=N)
+    noise[[30, 90, 200]] = -MEAN[[30, 90, 200]]
+    found, recording = found_with(noise)
+    law = weigh(found, NoiseModel((Blind(), Dropouts()), recording, least_sd=1e-6)).law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), [30, 90, 200])
 
 
 def test_where_nothing_is_lost_there_is_no_such_law():

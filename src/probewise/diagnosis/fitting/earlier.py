@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.calibration import FittedSensor
 from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, theta_to_natural
 from probewise.diagnosis.fitting.free_form import FreeForm, free_form_to_natural
 from probewise.errors import ParameterError
@@ -64,6 +65,11 @@ class SensorPrior(Protocol):
 
 
 def sensor_of(sensor: SensorPrior) -> CalibratedSensor:
-    """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`."""
+    """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`.
+
+    Of what a diagnosis has left open in it, the most probable: a normal prior holds one hypothesis.
+    """
+    if isinstance(sensor, FittedSensor):
+        sensor = sensor.leading()
     samples = np.asarray(sensor.samples, dtype=np.float64)
     return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -12,12 +12,12 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.flat import Flat
 from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
-from probewise.effects import Dropouts, NoiseEffect, NoiseRows, lattice_step
+from probewise.effects import NoiseEffect, NoiseRows, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["LaidOut", "NoiseModel", "hides_the_noise", "least_sd", "rough_sd"]
+__all__ = ["LaidOut", "NoiseModel", "hides_the_noise", "least_sd", "log_lost_value", "rough_sd"]
 
 _FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
 _MANY = 12  # nodes of one effect that beside another's would be too many
@@ -147,9 +147,9 @@ class NoiseModel:
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._cell, 1.0)
-            (dropouts,) = (effect for effect in self.effects if isinstance(effect, Dropouts))
-            # The value is one of the cells of the range; then each reading that is lost is in that cell.
-            log_extra = n_lost * math.log(lost_share / self._cell) + dropouts.log_value(value, cells)
+            # Each reading that is lost is in the cell of that value.
+            log_extra = n_lost * math.log(lost_share / self._cell)
+            log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd)
 
@@ -170,6 +170,17 @@ class NoiseModel:
     def _lattice(self) -> float:
         """Step of a lattice that all readings are on, 0 where there is none."""
         return lattice_step(self._readings)
+
+
+def log_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
+    """Give the log prior probability of the value that readings are lost to.
+
+    Half is for the ends of the range, where they are declared, and half for any of so many cells.
+    """
+    if not ends:
+        return -math.log(cells)
+    at_end = any(abs(value - end) <= 1e-9 * (1 + abs(end)) for end in ends)
+    return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
 
 
 def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:

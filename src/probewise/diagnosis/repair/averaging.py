@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.effects import NamedEffect
@@ -83,19 +83,21 @@ def over_hypotheses(
     n = len(largest.theta)
     counts = rng.multinomial(n, shares / shares.sum())
     theta, noise_sd = [], []
+    absent: dict[str, list[BoolArray]] = {name: [] for name in effects}
     for part, count in zip(parts, counts, strict=True):
         rows = rng.permutation(n)[:count]
         head = len(part.chain.names) - sum(part.columns(name).shape[1] for name in effects)
         columns = [_halved(part.theta[rows, :head], part.n_gaussians, largest.n_gaussians)]
         for effect in cast(Sequence[NamedEffect[Any]], chain.effects):
+            absent[effect.name].append(np.full(count, effect.name not in part.effects))
             if effect.name in part.effects:
                 columns.append(part.columns(effect.name)[rows])
                 continue
             holder = next(other for other in parts if effect.name in other.effects)
-            absent = holder.columns(effect.name)[rows]
+            idle = holder.columns(effect.name)[rows]
             for k, value in (effect.nothing or {}).items():
-                absent[:, k] = value
-            columns.append(absent)
+                idle[:, k] = value
+            columns.append(idle)
         theta.append(np.concatenate(columns, axis=1))
         noise_sd.append(part.noise_sd[rows])
     order = rng.permutation(n)
@@ -105,6 +107,7 @@ def over_hypotheses(
         theta=np.concatenate(theta)[order],
         noise_sd=np.concatenate(noise_sd)[order],
         effects=tuple(effect.name for effect in chain.effects),
+        absent={name: marks[order] for name, own in absent.items() if (marks := np.concatenate(own)).any()},
     )
 
 

@@ -52,7 +52,7 @@ class Ensemble:
         out: dict[Names, float] = {}
         for names in dict.fromkeys(names for _, names in self.search.candidates):
             log_z = [c.evidence[self.noise].log_z for c in self._of_form(best, names)]
-            # No file holds a user's own effect but that of a user's own model, which is best itself.
+            # No file holds a user's own effect; a user's own model has it where it is best itself.
             if log_z and {*names} <= {*EFFECTS, *best.names}:
                 out[names] = float(np.logaddexp.reduce(log_z)) + self.search.prior.log_mean(names)
         total = np.logaddexp.reduce(list(out.values()))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
@@ -44,7 +44,8 @@ class ModelSamples:
 
     `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
     `effects` names all effects, those on the noise too, in the order of their columns; `nuisance` the
-    parameters that belong to this recording alone; `exchangeable` Gaussians are told by their mass.
+    parameters that belong to this recording alone; `exchangeable` Gaussians are told by their mass; `absent` marks the
+    samples, (n_samples,), that do without an effect.
     """
 
     chain: Predictor
@@ -54,6 +55,7 @@ class ModelSamples:
     n_gaussians: int
     nuisance: tuple[str, ...] = ()
     exchangeable: bool = True
+    absent: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", frozen(self.theta))
@@ -89,6 +91,7 @@ class ModelSamples:
             instrumentation=recording.plan.instrumentation,
             effects=self.effects,
             patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
+            absent=self.absent,
             scan_noise=scan_noise,
             fingerprint=fingerprint(recording),
             source=PurePath(recording.source).name,

@@ -11,7 +11,7 @@ __all__ = ["take_apart"]
 Names = tuple[str, ...]
 
 _TAKEN_APART = 3  # leading combinations, of which each effect is left out in turn
-_SWAPPED = 2  # other effects that are tried in its stead
+_SWAPPED = 2  # that lead beside what is left, what was left out or another
 
 
 def take_apart(pool: Pool) -> None:

@@ -11,7 +11,7 @@ from probewise.diagnosis.search.pool import Pool, rivals_of
 from probewise.diagnosis.search.weighed import STEERING, Candidate, outside
 from probewise.effects import EFFECTS
 
-__all__ = ["WORTH_GROWING", "WORTH_REFITTING", "Wish", "grow", "screen_pairs", "wishes_of", "worth_refitting"]
+__all__ = ["WORTH_GROWING", "WORTH_REFITTING", "Wish", "grow", "wishes_of", "worth_refitting"]
 
 Names = tuple[str, ...]
 
@@ -43,7 +43,7 @@ def grow(pool: Pool, *, beam: int, depth: int) -> None:
     """Refit the best combinations of each size, each grown from the best of the size before."""
     null = pool.null
     if depth > 1:
-        screen_pairs(pool, null)
+        _screen_pairs(pool, null)
     grown = [c for c in pool.nulls if c.log_z > null.log_z - (_RIVAL_ORDER if c.worth <= null.worth else STEERING)]
     for size in range(1, min(depth, len(pool.effects)) + 1):
         wishes: dict[Names, Wish] = {}
@@ -59,7 +59,7 @@ def grow(pool: Pool, *, beam: int, depth: int) -> None:
         grown = [c for c in grown if c.log_z > max(r.log_z for r in rivals_of(c.names, grown)) - WORTH_GROWING]
 
 
-def screen_pairs(pool: Pool, null: Candidate) -> None:
+def _screen_pairs(pool: Pool, null: Candidate) -> None:
     """Weigh all pairs about a null by templates, under the noise models that steer."""
     for noise, evidence in null.steering():
         problem = Linearised.of(null.found, evidence.law)
@@ -100,7 +100,7 @@ def wishes_of(pool: Pool, parent: Candidate, wishes: Mapping[Names, Wish]) -> di
 def worth_refitting(pool: Pool, wishes: Mapping[Names, Wish], *, width: int, behind: float) -> list[Names]:
     """Choose the combinations of the best odds by screening, up to `width` of names alone.
 
-    One that screening puts `behind` nats behind what it competes with cannot come to matter.
+    One that screening puts `behind` nats behind what it competes with is seldom worth its cost.
     """
     odds = {names: wish.score + pool.prior.log_mean(names) for names, wish in wishes.items()}
     ranked = sorted(odds, key=lambda names: -odds[names])

@@ -15,9 +15,10 @@ __all__ = ["fit_nulls"]
 
 
 def fit_nulls(pool: Pool, sensor: Null | None, *, max_order: int) -> None:
-    """Fit what is believed of the sensor, or every order up to `max_order` and one more where the largest wins.
+    """Fit what is believed of the sensor, or each form of the SSF: one Gaussian, the free form, more Gaussians.
 
-    Noises that only show in pairs are added once a null is known.
+    Up to one more than `max_order`, as long as the last is not far behind the best. Noises that only show in pairs are
+    added once a null is known.
     """
     noises, refits = pool.noises, pool.refits
     recording = noises.recording

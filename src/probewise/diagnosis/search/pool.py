@@ -104,7 +104,12 @@ class Pool:
         return candidate
 
     def refit(self, parent: Candidate, added: str) -> Candidate | None:
-        """Refit a candidate with one more effect and keep the best of its kind, or note that the effect is not felt."""
+        """Refit a candidate with one more effect and keep the best of its kind, or note that the effect is not felt.
+
+        Returns
+        -------
+        The best candidate of that kind, an earlier one perhaps; None where there is none.
+        """
         against = 0.0 if parent.names else self.coincidence(parent.worth)
         candidate, scores = self.refits.extended(parent, self.effects[added], against)
         self.grown.add((parent, added))

@@ -28,7 +28,7 @@ from probewise.diagnosis.search.pool import Pool
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.unknown import Unknown
 from probewise.diagnosis.search.unnamed import give_way
-from probewise.diagnosis.search.weighed import Candidate, Search, weighed
+from probewise.diagnosis.search.weighed import Search, weighed
 from probewise.effects import UNNAMED, NamedEffect, NoiseEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -63,7 +63,7 @@ def search(
     prior
         Prior odds.
     max_order
-        Largest SSF order tried without a sensor; one more where the largest wins.
+        Largest number of Gaussians tried without a sensor; one more where that is not far behind.
     beam, depth
         How many combinations of each size above one are refitted, and the largest size.
     """
@@ -75,7 +75,7 @@ def search(
     pool = Pool(on_mean, prior, noises, templates, Refits(sensor, noises, templates))
     fit_nulls(pool, sensor, max_order=max_order)
     null = pool.null
-    unknown = _unknown(pool, null)
+    unknown = _unknown(pool)
 
     def weighed_up() -> Search:
         return weighed(
@@ -117,9 +117,9 @@ def search(
     return weighed_up()
 
 
-def _unknown(pool: Pool, null: Candidate) -> Unknown:
-    """Lay out what has no name about a null."""
-    recording = pool.noises.recording
+def _unknown(pool: Pool) -> Unknown:
+    """Lay out what has no name about the best null."""
+    null, recording = pool.null, pool.noises.recording
     usable = np.flatnonzero(recording.usable)
     level, model, z = null.found.predicted, null.found.model, null.found.z[None, :]
     slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]

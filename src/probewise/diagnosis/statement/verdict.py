@@ -146,6 +146,12 @@ class Diagnosis(ShowsItself):
         shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
+    @property
+    def left_open(self) -> dict[str, float]:
+        """Share of the repaired sensor's samples that hold an effect which only some hold, the largest first."""
+        shares = {name: 1.0 - float(without.mean()) for name, without in self.repaired.absent.items()}
+        return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""
         lines = [f"{self.verdict}: {self.reason}", f"p = {self.p_value:.3g} that nothing is missing from the mean"]
@@ -157,6 +163,9 @@ class Diagnosis(ShowsItself):
             f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats each, "
             f"rms {gain.rms_before:.4g} -> {gain.rms_after:.4g}"
         )
+        if self.left_open:
+            shares = ", ".join(f"{name} in {share:.0%}" for name, share in self.left_open.items())
+            lines.append(f"left open in its samples: {shares}")
         return "\n".join(lines)
 
 

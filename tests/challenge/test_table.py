@@ -192,14 +192,17 @@ def test_what_has_no_name_should_be_unknown_and_nothing_else(make):
 def test_aliases_are_told_apart_by_the_advised_readings(make):
     def alias(verdict, said, p=0.5, settled=None):
         hide = make.hidden("lag", 12.0, cosines={"lag": 1.0, "backlash": 1.0})
-        other = {"verdict": verdict, "settled": settled, "said": said, "p": p}
+        half_of_it = math.sqrt(1 - 1 / 48)  # 1.5 nats in a plan
+        other = {"verdict": verdict, "settled": settled, "said": said, "p": p, "cosine": half_of_it}
         return make.case("alias", 12.0, truth=["lag"], hides=[hide], **other)
 
-    after = {"hypotheses": [[["lag"], 0.99]]}
+    after = {"hypotheses": [[["lag"], 0.99]], "readings": 51}
     results = [alias("cannot_tell", ["backlash"], settled=after), alias("named", ["backlash"], p=0.95)]
     assert row(results, "aliased pair: cannot tell").found.value == 0.5
     assert row(results, "aliased pair: sure of the wrong name").found.value == 0.5
     assert row(results, "right name after the advised readings").found.value == 0.5
+    advised = row(results, "  readings advised, of those that repeating the plan needs").found
+    assert advised.value == pytest.approx(51 / 816)
 
 
 def test_the_processor_time_is_of_each_plan(make):

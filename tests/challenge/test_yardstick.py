@@ -5,7 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from probewise.challenge.yardstick import covariate_by_likeness, name_by_likeness, set_size_by_likeness
+from probewise.challenge.yardstick import (
+    covariate_by_likeness,
+    name_by_likeness,
+    readings_by_repeating,
+    set_size_by_likeness,
+)
 
 
 def hidden(size, **cosines):
@@ -55,3 +60,9 @@ def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law
     alone = np.abs(log_odds) > math.log(19)
     like = {**hidden(size, halo=rho)}
     assert set_size_by_likeness(like) == pytest.approx(2 - alone.mean(), abs=0.06)
+
+
+def test_no_number_of_repeated_plans_parts_two_that_agree(make):
+    alias = make.case("alias", 12.0, truth=["lag"], hides=[make.hidden("lag", 12.0)], cosine=-1.0)
+    assert readings_by_repeating(alias) == math.inf
+    assert readings_by_repeating(alias | {"cosine": 0.5}) == pytest.approx(408 * 3 / 54)

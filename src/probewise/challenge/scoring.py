@@ -9,6 +9,7 @@ from typing import Any
 from probewise.world.challenge import NO_PHYSICS, NOISE_NAMES
 
 __all__ = [
+    "HONEST_NATS",
     "NOISE",
     "accepted",
     "answers",
@@ -26,7 +27,9 @@ __all__ = [
 NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation"}
 """Effects on the noise."""
 
-_HONEST_NATS = 3.0  # below it two effects cannot be told apart (diagnosis, section 3)
+HONEST_NATS = 3.0
+"""Two effects that are less apart cannot be told apart (diagnosis, section 3)."""
+
 _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
 
 Result = Mapping[str, Any]
@@ -38,7 +41,7 @@ def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:
     cosines: Mapping[str, float] = hidden["cosines"]
     if hidden["in_vocabulary"]:
         squared = hidden["size_lambda"] ** 2 / 2
-        return frozenset({hidden["name"], *(n for n, rho in cosines.items() if squared * (1 - rho**2) < _HONEST_NATS)})
+        return frozenset({hidden["name"], *(n for n, rho in cosines.items() if squared * (1 - rho**2) < HONEST_NATS)})
     return frozenset(n for n, rho in cosines.items() if rho >= _LIKE) or frozenset({"unknown"})
 
 

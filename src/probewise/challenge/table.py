@@ -26,7 +26,12 @@ from probewise.challenge.scoring import (
     on_mean,
     stated,
 )
-from probewise.challenge.yardstick import covariate_by_likeness, name_by_likeness, set_size_by_likeness
+from probewise.challenge.yardstick import (
+    covariate_by_likeness,
+    name_by_likeness,
+    readings_by_repeating,
+    set_size_by_likeness,
+)
 
 __all__ = ["Decision", "Row", "by_effect", "score"]
 
@@ -279,6 +284,11 @@ def _aliases(done: list[Result]) -> list[Row]:
         Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
         Row("aliased pair: sure of the wrong name", share([_surely_wrong(r) for r in aliased]), most=0.01),
         Row("right name after the advised readings", share([stated(r)[1] for r in settled]), 0.95),
+        Row(
+            "  readings advised, of those that repeating the plan needs",
+            mean([r["settled"]["readings"] / readings_by_repeating(r) for r in aliased if r["settled"]]),
+            most=0.25,
+        ),
     ]
 
 

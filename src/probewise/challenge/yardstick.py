@@ -16,10 +16,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
-from probewise.challenge.scoring import accepted
+from probewise.challenge.scoring import HONEST_NATS, accepted
 from probewise.effects import VOCABULARY
 
-__all__ = ["covariate_by_likeness", "name_by_likeness", "set_size_by_likeness"]
+__all__ = ["covariate_by_likeness", "name_by_likeness", "readings_by_repeating", "set_size_by_likeness"]
 
 _DRAWS = 400
 _HELD = 0.95
@@ -58,6 +58,13 @@ def set_size_by_likeness(hidden: Hidden) -> float:
     inside = np.cumsum(shares, axis=1) - shares < _HELD
     n_right = np.sum(inside & right[order], axis=1)
     return float(np.mean(inside.sum(axis=1) - np.maximum(n_right - 1, 0)))
+
+
+def readings_by_repeating(result: Mapping[str, Any]) -> float:
+    """Tell how many readings of the same plan would set an aliased pair 3 nats apart (inf, if alike)."""
+    size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
+    apart = size**2 * (1 - rho**2) / 2
+    return float(result["readings"]) * HONEST_NATS / apart if apart > 0 else np.inf
 
 
 def _against_the_hardest(hidden: Hidden, right: Set[str]) -> float:

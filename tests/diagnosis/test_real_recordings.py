@@ -1,4 +1,4 @@
-"""Recordings by real instruments, where they are at hand: what docs/explanation/diagnosis.md says of them."""
+"""Recordings by real instruments, where they are at hand: what docs/explanation/diagnosis-measured.md says of them."""
 
 import os
 from pathlib import Path

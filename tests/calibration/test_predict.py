@@ -138,6 +138,17 @@ def test_another_unit_is_warned_of(sensor: FittedSensor) -> None:
         predict(sensor, plan)
 
 
+def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_sensor: Callable[..., FittedSensor]) -> None:
+    plain = make_sensor()
+    columns = np.append(plain.samples, np.full((len(plain.samples), 1), 0.05), axis=1)
+    names = (*plain.names, "battery_sag.per_volt")
+    sags = replace(plain, names=names, samples=columns, effects=("battery_sag",))
+    plan = paper_plan()
+    predict(sags, plan)  # knows its battery
+    with pytest.warns(DoubtfulResultWarning, match="no column battery_mv, which battery_sag reads"):
+        predict(sags, replace(plan, covariates={}))
+
+
 def test_readings_that_do_not_match_the_plan_are_refused(sensor: FittedSensor) -> None:
     with pytest.raises(ShapeError, match="one a row"):
         predict(sensor, _disc_plan(), np.zeros(3))

@@ -24,7 +24,7 @@ def set_all(path, reading):
 
 
 @pytest.mark.parametrize(
-    ("harm", "said"), [("one reading", "1 usable readings are too few"), ("few", "are too few"), ("equal", "are equal")]
+    ("harm", "said"), [("one reading", "1 usable reading is too few"), ("few", "are too few"), ("equal", "are equal")]
 )
 def test_too_little_to_say_anything_is_a_verdict_of_its_own(harm, said, recording_file, tmp_path, capsys):
     match harm:

@@ -390,13 +390,36 @@ def test_joined_recordings_keep_scans_and_patterns_apart():
         },
         patterns={"edge": Uniform(1.0)},
     )
-    joined = join([first, Recording(other, second.readings), first])
+    third = Recording(first.plan, first.readings + 1.0)
+    joined = join([first, Recording(other, second.readings), third])
     assert len(joined) == 8 + 6 + 8
     assert joined.plan.scan_names == ("s0", "s1", "s0 (2)", "s1 (2)", "s0 (3)", "s1 (3)")
     assert joined.plan.pattern_names == ("edge", "edge (2)")
     np.testing.assert_array_equal(joined.plan.pattern, [0] * 8 + [1] * 6 + [0] * 8)
     assert joined.plan.patterns["edge (2)"] == Uniform(1.0)
     assert join([first]) is first
+
+
+def test_a_recording_is_not_counted_twice():
+    with pytest.raises(ParameterError, match=r"number 1\) and .* \(number 3"):
+        join([line(4), line(3), line(4)])
+
+
+def test_a_covariate_that_a_later_recording_lacks_stays_as_it_was_last_known():
+    first, second = line(4), line(3)
+    battery = np.append(np.linspace(8300.0, 8290.0, len(first) - 1), np.nan)
+    measured = Recording(replace(first.plan, covariates={"battery_mv": battery}), first.readings, "one.csv")
+    warm = Recording(
+        replace(second.plan, covariates={"heat_c": np.full(len(second), 21.0)}), second.readings, "two.csv"
+    )
+    joined = join([measured, warm])
+    assert (joined.plan.covariates["battery_mv"][len(first) :] == 8290.0).all()
+    assert np.isnan(joined.plan.covariates["battery_mv"][len(first) - 1])
+    assert set(joined.plan.covariates) == {"battery_mv"}
+    assert [note.split(":")[0] for note in joined.notes] == [
+        "two.csv has no column battery_mv",
+        "column heat_c of two.csv left out",
+    ]
 
 
 def test_recordings_of_other_units_are_not_joined():

@@ -98,7 +98,7 @@ def test_numbers_are_written_as_people_write_them():
 def test_labels_carry_units():
     assert covariate_label("level", "LEGO") == "predicted reading (LEGO units)"
     assert covariate_label("place", "V", "edge_0") == "place along the scans, scan edge_0 (mm)"
-    assert covariate_label("battery_mv", "V") == "battery mv"
+    assert covariate_label("battery_mv", "V") == "battery (mV)"
 
 
 def test_residuals_are_averaged_in_even_steps_with_their_chance():

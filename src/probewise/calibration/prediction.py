@@ -57,7 +57,7 @@ def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[fl
     Warns
     -----
     DoubtfulResultWarning
-        If the plan declares another unit than the sensor was calibrated in.
+        If the plan declares another unit than the sensor was calibrated in, or lacks a column that an effect reads.
     """
     recorded = np.full(len(plan), np.nan) if readings is None else np.asarray(readings, dtype=np.float64)
     if recorded.shape != (len(plan),):
@@ -73,6 +73,13 @@ def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[fl
     step = plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
     model = chain if sensor.effects else DistinctRows(chain, plan)
+    for effect in sensor.carried_effects:
+        for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
+            warnings.warn(
+                f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
+                DoubtfulResultWarning,
+                stacklevel=2,
+            )
     theta = sensor.carried_samples
     n_samples, n_points = len(theta), len(plan)
     per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))

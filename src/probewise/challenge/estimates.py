@@ -56,6 +56,8 @@ def resampled(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Est
     """
     if not len(rows):
         return _NOTHING
+    if len(rows) == 1:
+        return Estimate(statistic(rows), -math.inf, math.inf, 1)
     rng = np.random.default_rng(len(rows))
     draws = [statistic(rows[rng.integers(len(rows), size=len(rows))]) for _ in range(_DRAWS)]
     value, (low, high) = statistic(rows), np.quantile(draws, [0.025, 0.975])

@@ -8,9 +8,9 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise.cli._common import a_path
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def add_geometry(parser: argparse.ArgumentParser) -> None:
     """Add --geometry."""
     parser.add_argument(
         "--geometry",
-        type=Path,
+        type=a_path,
         metavar="ARM.toml",
         help="the arm as built: lengths, gears, ports, limits (default: the file that ships)",
     )

@@ -47,7 +47,7 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
         low, high = settings["options"]["reading_range"]
         declared = [None if value is None else float(value) for value in (step, low, high)]
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"unusable options ({error!r})", "as explore writes them", row=1) from error
+        raise FileError(path, f"unusable options: {_words(error)}", "options as explore writes them", row=1) from error
     return replace(sensor.instrumentation, step=declared[0], min=declared[1], max=declared[2])
 
 
@@ -61,10 +61,14 @@ def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
         written, size = settings["shape"], settings["field"]
         field = Field(float(size["width_mm"]), float(size["height_mm"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"unusable settings ({error!r})", allowed, row=1) from error
+        raise FileError(path, f"unusable settings: {_words(error)}", allowed, row=1) from error
     for n in range(1, len(SHAPES) + 1):
         for names in itertools.permutations(SHAPES, n):
             shape: Shape = shape_named(names, field)
             if repr(shape) == written:
                 return shape
     raise FileError(path, f"shape {written}", allowed, row=1, column="shape")
+
+
+def _words(error: Exception) -> str:
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error)

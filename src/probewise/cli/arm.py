@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, asker, geometry_of, open_nxt, parse_arm, parse_place, telling_what_is_kept
-from probewise.cli._common import OneLineParser, Verb, add_quiet, check_out_file, positive_int, say
+from probewise.cli._common import OneLineParser, Verb, a_path, add_quiet, positive_int, say
+from probewise.cli._output import check_out_file
 from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
 
     check = _task(tasks, "check", "Check a geometry file; say and draw how far the arm reaches.")
-    check.add_argument("--out", type=Path, metavar="REACH.png", help="where the drawing goes (default: none is made)")
+    check.add_argument("--out", type=a_path, metavar="REACH.png", help="where the drawing goes (default: none is made)")
 
     jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
     jog.add_argument(
@@ -51,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record.add_argument(
         "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER}, the paper's"
     )
-    record.add_argument("--out", type=Path, required=True, metavar="REC.csv", help="where the recording goes")
+    record.add_argument("--out", type=a_path, required=True, metavar="REC.csv", help="where the recording goes")
     record.add_argument(
         "--origin-mm", metavar="X,Y", help="where on the field the plan's origin lies (default: the field's middle)"
     )

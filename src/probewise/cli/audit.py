@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_quiet, check_out_directory, say, staged
+from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._output import check_out_directory, staged
 
 if TYPE_CHECKING:
     from probewise.diagnosis import PlanAudit
@@ -16,13 +17,16 @@ __all__ = ["VERB"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
-    parser.add_argument("plan", type=Path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
+    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
     parser.add_argument(
-        "--sensor", type=Path, metavar="S.json", help="the sensor as calibrated; without, a typical one is expected"
+        "--sensor",
+        type=a_path,
+        metavar="S.json",
+        help="the sensor as calibrated; without, a typical one is expected",
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=a_path,
         metavar="DIR",
         help="directory for audit.json, audit.png, report.html and the plan that cures; without, only the text",
     )

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from probewise.cli._common import (
-    Verb,
-    add_common,
-    add_out_directory,
-    check_live,
-    check_out_directory,
-    positive_int,
-    say,
-    staged,
-)
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, check_live, positive_int, say
+from probewise.cli._output import check_out_directory, staged
 
 __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
-    parser.add_argument("recording", type=Path, metavar="REC.csv", help="recording, its JSON beside it")
+    parser.add_argument("recording", type=a_path, metavar="REC.csv", help="recording, its JSON beside it")
     add_out_directory(parser)
     parser.add_argument(
         "--orders",

@@ -6,8 +6,9 @@ import argparse
 import shlex
 from typing import Any
 
-from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, positive_int, say, staged
+from probewise.cli._common import Verb, add_common, add_out_directory, positive_int, say
 from probewise.cli._executor import add_executor, executor_of
+from probewise.cli._output import check_out_directory, staged
 
 __all__ = ["VERB"]
 

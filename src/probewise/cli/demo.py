@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, say, staged
+from probewise.cli._common import Verb, add_common, add_out_directory, say
+from probewise.cli._output import check_out_directory, staged
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_common, add_out_directory, check_out_directory, say, staged
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, say
 from probewise.cli._journal import is_journal, journal_recording
+from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -17,18 +18,24 @@ if TYPE_CHECKING:
 
 __all__ = ["VERB", "write_results"]
 
+NEXT_PLAN = "next_plan.csv"
+_OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
     parser.add_argument(
         "recordings",
-        type=Path,
+        type=a_path,
         nargs="+",
         metavar="REC.csv",
         help="recording, its JSON beside it, or the journal.jsonl of an explore run; several are diagnosed together",
     )
     parser.add_argument(
-        "--sensor", type=Path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
+        "--sensor",
+        type=a_path,
+        metavar="S.json",
+        help="an earlier calibration, whose posterior becomes the prior",
     )
     parser.add_argument(
         "--thorough",
@@ -81,17 +88,25 @@ def run(arguments: argparse.Namespace) -> int:
     audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
     drawn = report.figures(diagnosis)
     source = ", ".join(path.name for path in arguments.recordings)
-    with staged(out) as stage:
-        write_results(diagnosis, drawn, stage, rng=files_rng)
+    with staged(out, inputs=_to_be_kept(arguments, out), outdated=_OF_ONE_RUN) as stage:
+        write_results(diagnosis, drawn, stage.folder, rng=files_rng)
         page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
         (stage / "report.html").write_text(page, encoding="utf-8")
     for note in joined.notes:
         say(f"note: {note}", quiet=arguments.quiet)
-    if diagnosis.next_measurement is None:
-        for name in ("next_plan.csv", "next_plan.json"):  # of an earlier run: nobody asks for it now
-            (out / name).unlink(missing_ok=True)
+    for path, now in stage.kept.items():
+        say(f"note: what was {path} is now {now}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:
+    """List what must not be lost: all that was read, and a plan of an earlier run that was filled in with readings."""
+    read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
+    filled_in = out / NEXT_PLAN
+    if filled_in.is_file() and "reading" in filled_in.read_text(encoding="utf-8-sig").partition("\n")[0].split(","):
+        read.append(filled_in)
+    return [path for csv in read for path in (csv, csv.with_suffix(".json"))]
 
 
 def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *, rng: np.random.Generator) -> None:
@@ -107,7 +122,7 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *
     write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), folder / "sensor.json")
     write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), folder / "calibrated.json")
     if diagnosis.next_measurement is not None:
-        write_plan(diagnosis.next_measurement.plan, folder / "next_plan.csv")
+        write_plan(diagnosis.next_measurement.plan, folder / NEXT_PLAN)
     for name, png in drawn.items():
         (folder / name).write_bytes(png)
 

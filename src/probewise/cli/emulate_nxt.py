@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_common, check_out_file, say
+from probewise.cli._common import Verb, a_path, add_common, say
+from probewise.cli._output import check_out_file
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -33,12 +34,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sensor",
-        type=Path,
+        type=a_path,
         metavar="S.json",
         help="the light sensor, as calibrate writes it (default: that of the shipped recordings)",
     )
     parser.add_argument(
-        "--geometry", type=Path, metavar="ARM.toml", help="the arm's numbers (default: those of the arm that ships)"
+        "--geometry",
+        type=a_path,
+        metavar="ARM.toml",
+        help="the arm's numbers (default: those of the arm that ships)",
     )
     parser.add_argument(
         "--fault",
@@ -57,9 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)",
     )
     parser.add_argument(
-        "--link", type=Path, metavar="PATH", help="a symbolic link to keep on the device, also after a disconnection"
+        "--link",
+        type=a_path,
+        metavar="PATH",
+        help="a symbolic link to keep on the device, also after a disconnection",
     )
-    parser.add_argument("--log", type=Path, metavar="FILE", help="write every telegram and mishap to a file")
+    parser.add_argument("--log", type=a_path, metavar="FILE", help="write every telegram and mishap to a file")
     add_common(parser)
 
 

@@ -9,15 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, geometry_of, open_nxt, parse_arm, telling_what_is_kept
-from probewise.cli._common import (
-    Verb,
-    add_common,
-    add_out_directory,
-    check_out_directory,
-    positive_int,
-    say,
-    staged,
-)
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, positive_int, say
+from probewise.cli._output import check_out_directory, staged
 from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
@@ -32,7 +25,7 @@ SHAPE_NAMES = ("circle", "ellipse", "rectangle", "triangle", "hexagon")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
-    parser.add_argument("--sensor", type=Path, required=True, metavar="S.json", help="sensor model")
+    parser.add_argument("--sensor", type=a_path, required=True, metavar="S.json", help="sensor model")
     add_out_directory(parser)
     parser.add_argument("--model", choices=("ssf", "naive"), default="ssf", help="what the robot takes its sensor for")
     parser.add_argument(

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from probewise.cli._common import Verb, add_quiet, check_out_file, say
+from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._output import check_out_file
 
 __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
-    parser.add_argument("sensor", type=Path, metavar="S.json", help="sensor model, as calibrate and diagnose write it")
-    parser.add_argument("plan", type=Path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
-    parser.add_argument("--out", type=Path, required=True, metavar="P.csv", help="where the prediction goes")
+    parser.add_argument(
+        "sensor", type=a_path, metavar="S.json", help="sensor model, as calibrate and diagnose write it"
+    )
+    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
+    parser.add_argument("--out", type=a_path, required=True, metavar="P.csv", help="where the prediction goes")
     add_quiet(parser)
 
 

@@ -6,8 +6,9 @@ import argparse
 import shlex
 from typing import TYPE_CHECKING, Any
 
-from probewise.cli._common import Verb, add_out_directory, add_quiet, check_out_directory, positive_int, say, staged
+from probewise.cli._common import Verb, add_out_directory, add_quiet, positive_int, say
 from probewise.cli._executor import add_executor, executor_of
+from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:

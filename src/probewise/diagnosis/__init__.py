@@ -6,6 +6,7 @@ the gain is shown on readings kept back.
 """
 
 from probewise.diagnosis.advice.aliases import Alias
+from probewise.diagnosis.advice.commands import MOST_READINGS
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.audit.document import CURE_PLAN, audit_json
 from probewise.diagnosis.audit.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
@@ -17,7 +18,7 @@ from probewise.diagnosis.joining import join
 from probewise.diagnosis.repair.chosen import model_with
 from probewise.diagnosis.repair.mending import Improvement
 from probewise.diagnosis.repair.repaired import ModelSamples
-from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
@@ -30,10 +31,13 @@ from probewise.diagnosis.statement.verdict import (
     ParameterFound,
     Verdict,
 )
+from probewise.diagnosis.statement.words import p_in_words
 from probewise.diagnosis.unknown_shape import SensorAndShape
 
 __all__ = [
+    "ALARM",
     "CURE_PLAN",
+    "MOST_READINGS",
     "Alias",
     "Cure",
     "Diagnosis",
@@ -65,5 +69,6 @@ __all__ = [
     "diagnosis_schema",
     "join",
     "model_with",
+    "p_in_words",
     "weigh_thoroughly",
 ]

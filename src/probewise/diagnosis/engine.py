@@ -14,7 +14,7 @@ from probewise.diagnosis.advice.rivals import next_readings
 from probewise.diagnosis.evidence.convergence import require_converged
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
-from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.fitting.earlier import SensorPrior, require_same_unit, sensor_of
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
@@ -92,7 +92,8 @@ def diagnose(
     Raises
     ------
     ParameterError
-        If there is no usable reading, or units differ, or both a sensor and a null are given.
+        If there is no usable reading, or units differ, or two recordings are the same, or both a sensor and a null are
+        given.
     NotConvergedError
         If the fit of the null did not arrive anywhere.
     """
@@ -105,6 +106,7 @@ def diagnose(
     fitted = {name: kind.for_extent(extent) for name, kind in {**effects, **UNNAMED, **NUISANCES}.items()}
     known = null
     if sensor is not None:
+        require_same_unit(sensor, everything.plan)
         known = sensor_of(sensor)
     able = {name: effect for name, effect in fitted.items() if effect is not None}
     built = {
@@ -204,6 +206,7 @@ class _Diagnoser:
         candidates = [
             e.sentence(*_moments(samples.columns(e.name))) for e in best.found.model.effects if e.name in UNNAMED
         ]
+        asked = next_readings(self.search, null)
         reason = reason_of(
             self.search,
             verdict,
@@ -214,7 +217,7 @@ class _Diagnoser:
             improvement.p_value_after,
             fails,
             few,
-            pairs,
+            asked,
             where,
             noise,
             candidates,
@@ -236,7 +239,7 @@ class _Diagnoser:
             improvement=improvement,
             aliases=tuple(pairs),
             noise=noise_found(self.search, best, noise_of, after, samples, rng=self.rng),
-            next_measurement=next_readings(self.search, null),
+            next_measurement=asked,
             null=null_samples,
             repaired=written,
             residuals_before=self._spread(null.found.residuals),
@@ -246,6 +249,7 @@ class _Diagnoser:
             order_probabilities=dict(self.search.order_probabilities),
             unknown_shares=self._unknown_shares(),
             weighings=weighings,
+            few=few,
         )
 
     def _judged(self, null: Candidate, best: Candidate, noise: Names, p_value: float) -> tuple[Linearised, Improvement]:

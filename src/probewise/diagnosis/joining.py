@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
+from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import COMMANDED
 
-__all__ = ["join"]
+__all__ = ["join", "join_plans"]
 
 
 def join(recordings: Sequence[Recording]) -> Recording:
     """Set recordings behind each other: scans stay apart, patterns of one name but two descriptions too.
 
-    Only covariates that all recordings have are kept; what is commanded (LED, height) is NaN, as at
-    calibration, where a recording does not say. Times stay as they are in each file.
+    A covariate of the first that another lacks keeps its last known value there, such as a battery's, and one that the
+    first lacks is left out; a note says so. Times stay as they are in each file.
 
     Raises
     ------
     ParameterError
-        If there is none, or their readings are in different units.
+        If there is none, their readings are in different units, or two of them are the same.
     """
     if not recordings:
         raise ParameterError("recordings", (), "one or more")
@@ -37,12 +38,30 @@ def join(recordings: Sequence[Recording]) -> Recording:
             raise ParameterError(
                 "reading unit", other.plan.instrumentation.unit, f"{first.plan.instrumentation.unit!r}, as the first"
             )
+    for (i, one), (j, other) in itertools.combinations(enumerate(recordings), 2):
+        if _same(one, other):
+            found = f"{_name(one, i)} (number {i + 1}) and {_name(other, j)} (number {j + 1})"
+            raise ParameterError("recordings", found, "recordings that differ; these are the same")
+    notes = [note for recording in recordings for note in recording.notes]
+    return Recording(
+        join_plans([recording.plan for recording in recordings]),
+        np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
+        " + ".join(r.source for r in recordings if r.source),
+        (*notes, *_notes_on_covariates(recordings)),
+    )
+
+
+def join_plans(plans: Sequence[Plan]) -> Plan:
+    """Set plans behind each other, with the covariates of the first; what is commanded (LED, height) from all.
+
+    What is commanded is NaN, as at calibration, where a plan does not say; any other covariate as last known.
+    """
+    first = plans[0]
     patterns: dict[str, Pattern] = {}
     names: list[str] = []
     scan_names: list[str] = []
     codes, scans = [], []
-    for number, recording in enumerate(recordings):
-        plan = recording.plan
+    for number, plan in enumerate(plans):
         renamed = []
         for name in plan.pattern_names:
             described = plan.patterns.get(name)
@@ -57,9 +76,8 @@ def join(recordings: Sequence[Recording]) -> Recording:
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
         scan_names += [_unused(s, scan_names) for s in plan.scan_names]
-    plans = [r.plan for r in recordings]
-    shared = set.intersection(*({*p.covariates, *COMMANDED} for p in plans)) & {k for p in plans for k in p.covariates}
-    joined = Plan(
+    commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
+    return Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
         y_mm=np.concatenate([p.y_mm for p in plans]),
         orientation_rad=np.concatenate([p.orientation_rad for p in plans]),
@@ -69,14 +87,47 @@ def join(recordings: Sequence[Recording]) -> Recording:
         pattern=np.concatenate(codes),
         pattern_names=tuple(names),
         patterns=patterns,
-        covariates={
-            k: np.concatenate([p.covariates.get(k, np.full(len(p), np.nan)) for p in plans]) for k in sorted(shared)
-        },
-        instrumentation=first.plan.instrumentation,
+        covariates={name: _column(plans, name) for name in sorted({*first.covariates, *commanded})},
+        instrumentation=first.instrumentation,
     )
-    readings = np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings])
-    joined_recording = Recording(joined, readings, first.source, tuple(n for r in recordings for n in r.notes))
-    return replace(joined_recording, source=" + ".join(r.source for r in recordings if r.source))
+
+
+def _column(plans: Sequence[Plan], name: str) -> FloatArray:
+    """Give a covariate of every row; where a plan lacks it NaN for what is commanded, else its last known value."""
+    columns: list[FloatArray] = []
+    last = math.nan
+    for plan in plans:
+        column = plan.covariates.get(name)
+        if column is None:
+            column = np.full(len(plan), math.nan if name in COMMANDED else last)
+        known = column[np.isfinite(column)]
+        last = float(known[-1]) if known.size else last
+        columns.append(column)
+    return np.concatenate(columns)
+
+
+def _notes_on_covariates(recordings: Sequence[Recording]) -> list[str]:
+    """Say what is made of covariates that not all recordings have."""
+    first, out = recordings[0], []
+    for k, other in enumerate(recordings[1:], 1):
+        for name in sorted({*first.plan.covariates} - {*other.plan.covariates, *COMMANDED}):
+            out.append(f"{_name(other, k)} has no column {name}: taken to be there as it was last known")
+        for name in sorted({*other.plan.covariates} - {*first.plan.covariates, *COMMANDED}):
+            out.append(f"column {name} of {_name(other, k)} left out: {_name(first, 0)} has none")
+    return out
+
+
+def _same(one: Recording, other: Recording) -> bool:
+    """Tell whether two recordings hold the same readings at the same places and times."""
+    return (
+        len(one) == len(other)
+        and np.array_equal(one.readings, other.readings, equal_nan=True)
+        and all(np.array_equal(getattr(one.plan, k), getattr(other.plan, k)) for k in ("x_mm", "y_mm", "time_s"))
+    )
+
+
+def _name(recording: Recording, index: int) -> str:
+    return recording.source or f"recording {index + 1}"
 
 
 def _unused(name: str, taken: Sequence[str]) -> str:

@@ -79,6 +79,7 @@ class BatterySag(NamedEffect[FloatArray]):
     stage: ClassVar[Stage] = Stage.GAIN
     units: ClassVar[tuple[str, ...]] = ("1/V",)
     covariates: ClassVar[tuple[str, ...]] = (_BATTERY,)
+    reads: ClassVar[tuple[str, ...]] = (_BATTERY,)
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
 
     @classmethod

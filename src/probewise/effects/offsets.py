@@ -56,7 +56,7 @@ class AmbientGradient(NamedEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much the reading rises over 100 mm along each axis."""
         return (
-            f"the reading rises by {give_or_take(mean[0], sd[0], factor=100)} per 100 mm along X and by "
+            f"the reading changes by {give_or_take(mean[0], sd[0], factor=100)} per 100 mm along X and by "
             f"{give_or_take(mean[1], sd[1], factor=100)} per 100 mm along Y, black or white: stray light from one side"
         )
 

@@ -48,6 +48,11 @@ class NamedEffect(Effect[V], Protocol[V]):
         ...
 
     @property
+    def reads(self) -> tuple[str, ...]:
+        """Columns of a plan that it reads beside place, time and scan; by default none."""
+        return ()
+
+    @property
     def amplitudes(self) -> tuple[int, ...]:
         """Which parameters are amplitudes: the readings change in proportion to first order, 0 means absent."""
         ...

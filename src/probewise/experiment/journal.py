@@ -176,12 +176,17 @@ def read_journal(path: str | Path) -> Journal:
 
 def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
     try:
-        value = json.loads(line.decode())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        value = json.loads(line.decode(), parse_constant=_no_constant)
+    except ValueError as error:
         raise FileError(path, f"no JSON ({error})", "one JSON object a line", row=row) from error
     if not isinstance(value, dict):
         raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
     return value
+
+
+def _no_constant(name: str) -> float:
+    """Refuse NaN and Infinity, which are no JSON: what is missing is null."""
+    raise ValueError(f"{name} is no number in JSON")
 
 
 def _salvaged(path: str | Path, tail: bytes, index: int) -> Entry | None:
@@ -211,8 +216,10 @@ def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
         covariates = {str(name): _or_nan(number) for name, number in line["covariates"].items()}
         column = "belief"
         belief = _belief(line["belief"]) if "belief" in line else None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FileError(path, f"unusable ({error!r})", "as written", row=row, column=column) from error
+    except KeyError as error:
+        raise FileError(path, f"{error} is missing", "a line as explore writes it", row=row, column=column) from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise FileError(path, f"unusable: {error}", "a line as explore writes it", row=row, column=column) from error
     return Entry(index, Reading(value, pose, time_s, covariates), belief)
 
 

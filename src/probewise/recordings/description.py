@@ -30,6 +30,7 @@ from probewise.recordings.table import LARGEST, read_text
 __all__ = ["Description", "degrees_of", "description_text", "read_description"]
 
 FORMAT = "recording/1"
+_CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,13 @@ def read_description(path: Path) -> Description:
             notes.append(f"pattern {name}: {', '.join(unused)} not used, no field of kind {kind}")
     if not patterns:
         raise FileError(path, "patterns is empty", "at least one pattern by name")
-    return Description(_instrumentation(top), patterns, tuple(notes))
+    instrumentation = _instrumentation(top)
+    notes += [
+        f"controls: {name} is not used, none of {', '.join(_CONTROLS)}"
+        for name in instrumentation.controls
+        if name not in _CONTROLS
+    ]
+    return Description(instrumentation, patterns, tuple(notes))
 
 
 def _instrumentation(top: _Fields) -> Instrumentation:

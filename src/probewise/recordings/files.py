@@ -23,6 +23,7 @@ __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recordin
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
+_FAR_AWAY = 100.0  # times as far as nine in ten of all places lie apart
 PathLike = str | os.PathLike[str]
 
 
@@ -199,8 +200,20 @@ def _read(path: Path) -> tuple[Plan, FloatArray | None, list[str]]:
         covariates=_covariates(table, notes),
         instrumentation=description.instrumentation,
     )
+    notes += [*_far_away(table, "x_mm", plan.x_mm), *_far_away(table, "y_mm", plan.y_mm)]
     readings = _readings(table, description) if "reading" in table.columns else None
     return plan, readings, notes
+
+
+def _far_away(table: Table, name: str, places_mm: FloatArray) -> list[str]:
+    """Note a place that is so far from all others that it looks mistyped."""
+    low, middle, high = np.quantile(places_mm, [0.05, 0.5, 0.95])
+    k = int(np.argmax(np.abs(places_mm - middle)))
+    if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
+        return []
+    return [
+        f"row {table.rows[k]}: {name} is {places_mm[k]:g}, nine in ten of the others {low:g} to {high:g}: mistyped?"
+    ]
 
 
 def _readings(table: Table, description: Description) -> FloatArray:

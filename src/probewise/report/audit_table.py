@@ -32,4 +32,5 @@ def audit_table(effects: Sequence[EffectAudit]) -> Markup:
 
 
 def _smallest(parameter: str, unit: str, amount: float | None) -> str:
-    return f"{parameter.replace('_', ' ')} not at all" if amount is None else f"{parameter} {amount:.2g} {unit}"
+    name = parameter.replace("_", " ")
+    return f"{name} not at all" if amount is None else f"{name} {amount:.2g} {'' if unit == '1' else unit}".rstrip()

@@ -12,6 +12,8 @@ from probewise.report.words import unit_name
 __all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words"]
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
+SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
+"""Units by the last part of a column's own name, such as battery_mv."""
 WORDS = {
     "level": "predicted reading",
     "slope": "slope of the predicted reading along the move",
@@ -32,12 +34,14 @@ def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
 
 def covariate_words(name: str) -> str:
     """Name a covariate."""
-    return WORDS.get(name, name.replace("_", " "))
+    stem, _, suffix = name.rpartition("_")
+    return WORDS.get(name, (stem if stem and suffix in SUFFIXES else name).replace("_", " "))
 
 
 def covariate_unit(name: str, unit: str) -> str:
     """Name its unit, "" where it has none that is known; `unit` is the reading's."""
-    return {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}.get(name, "")
+    known = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
+    return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
 
 
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:

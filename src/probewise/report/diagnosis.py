@@ -5,11 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from probewise.diagnosis import Alias, Diagnosis, EffectFound, ParameterFound, Place, PlanAudit
+from probewise.diagnosis import (
+    ALARM,
+    MOST_READINGS,
+    Alias,
+    Diagnosis,
+    EffectFound,
+    ParameterFound,
+    Place,
+    PlanAudit,
+    p_in_words,
+)
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_unit, covariate_words
-from probewise.report.diagnosis_figures import figures, hypothesis_label, is_repaired
+from probewise.report.diagnosis_figures import figures, hypothesis_label
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.words import count, number, probability, readable, unit_name
 
@@ -23,6 +33,8 @@ OPENING = {
 }
 _MOST_ALIASES = 8
 _LIKELY = 0.05  # of an effect that is spoken of at once
+_CHANCE = 0.05  # p-value above which nobody is surprised
+_TELLS_SOMETHING = 0.5  # nats
 
 
 def answer(diagnosis: Diagnosis) -> str:
@@ -78,9 +90,9 @@ def write_page(
 
 def _first_caption(diagnosis: Diagnosis) -> str:
     where = f" {_where(diagnosis, diagnosis.where[0])}" if diagnosis.where else " Nothing stands out."
-    after = ", blue after the repair" if is_repaired(diagnosis) else ""
+    after = ", blue after the repair" if diagnosis.is_repaired else ""
     return (
-        f"Left: recorded minus predicted, averaged; red as calibrated{after}. The grey band is what chance alone "
+        f"Left: recorded minus predicted, averaged; orange as calibrated{after}. The grey band is what chance alone "
         f"leaves.{where} Right: the explanations with their probabilities."
     )
 
@@ -88,14 +100,13 @@ def _first_caption(diagnosis: Diagnosis) -> str:
 def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Answer, in words that need no statistics: is it real, does the repair help, what to do now."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
-    facts = [("Could it be chance?", _chance(diagnosis.p_value))]
-    if gain.heldout_by_scan and is_repaired(diagnosis):
+    facts = [] if diagnosis.few else [("Could it be chance?", _chance(diagnosis))]
+    if gain.heldout_by_scan and diagnosis.is_repaired:
         facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
-    if is_repaired(diagnosis):
+    if diagnosis.is_repaired:
         facts.append(("What is left", f"rms {gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} after"))
     if diagnosis.left_open:
-        shares = ", ".join(f"{name.replace('_', ' ')} in {share:.0%}" for name, share in diagnosis.left_open.items())
-        facts.append(("What its predictions leave open", f"{shares} of the samples in sensor.json"))
+        facts.append(("What its predictions leave open", _shares(diagnosis.left_open)))
     facts.append(("What to do next", _next_in_words(diagnosis)))
     return facts
 
@@ -107,21 +118,38 @@ def _predicts(nats: float, sd: float) -> str:
     return f"{'No better than before' if nats > -2 * sd else 'Worse than before'}: {measured}."
 
 
-def _chance(p_value: float) -> str:
-    if p_value > 0.05:
-        return (
-            f"Yes: with nothing missing, {100 * p_value:.0f} of 100 recordings look as odd as this (p = {p_value:.2g})."
-        )
-    often = f"1 recording in {1 / p_value:,.0f}" if p_value > 1e-6 else "less than 1 recording in a million"
-    return readable(f"Hardly: with nothing missing, {often} looks as odd as this (p = {p_value:.2g}).")
+def _shares(shares: Mapping[tuple[str, ...], float]) -> str:
+    listed = (f"{' with '.join(names).replace('_', ' ') or 'none of them'} in {p:.0%}" for names, p in shares.items())
+    return f"{', '.join(listed)} of the samples in sensor.json"
+
+
+def _chance(diagnosis: Diagnosis) -> str:
+    p_value, p = diagnosis.p_value, p_in_words(diagnosis.p_value)
+    if p_value > _CHANCE:
+        often = f"with nothing missing, {100 * p_value:.0f} of 100 recordings look as odd as this ({p})"
+    elif p_value > 1e-6:
+        often = f"with nothing missing, 1 recording in {1 / p_value:,.0f} looks as odd as this ({p})"
+    else:
+        often = readable(f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})")
+    if diagnosis.verdict == "noise":
+        gained = f"plain noise explains these readings worse by {diagnosis.improvement.log_evidence:.0f} nats"
+        return f"What is said of the noise, hardly: {gained}. The mean is another matter: {often}."
+    if diagnosis.verdict == "unknown" and p_value > _CHANCE:
+        return f"The mean, yes: {often}. That readings far out lie together is no chance."
+    return f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
 
 
 def _next_in_words(diagnosis: Diagnosis) -> str:
     plan = diagnosis.next_measurement
+    if plan is None and diagnosis.few:
+        return "Scan across an edge, and take more readings: these say nothing."
     if plan is None:
         return "Nothing that this apparatus can do would tell more."
+    told = plan.expected_log_bayes_factor
     said = f"{plan.description.rstrip('.')}: {count(len(plan.plan), 'reading')}, next_plan.csv."
-    return f"{said[:1].upper()}{said[1:]}"
+    if told < _TELLS_SOMETHING:
+        return f"No plan of {MOST_READINGS} readings was found that tells more than {number(told, 1)} nats: {said}"
+    return f"{said[:1].upper()}{said[1:]} Expected to tell {number(told, 1)} nats; 3 are odds of 20 to 1."
 
 
 def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -137,6 +165,7 @@ def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         ),
         paragraph(f"The smallest set that holds 95 %: {', '.join(diagnosis.credible).replace('_', ' ')}."),
         *_candidates(diagnosis),
+        *_carried(diagnosis),
         *_weighings(diagnosis),
         *_effects(diagnosis),
     )
@@ -149,6 +178,14 @@ def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         return ()
     listed = ", ".join(f"{name.replace('_', ' ')} ({probability(p)})" for name, p in likely)
     return (paragraph(f"What has no name may be, or depend on: {listed}."),)
+
+
+def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+    """Say what the repaired sensor carries that no explanation above does."""
+    return tuple(
+        paragraph(_sentence(f"In {share:.0%} of the repaired sensor's samples: {sentence}"))
+        for _, share, sentence in diagnosis.carried
+    )
 
 
 def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -174,7 +211,7 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _before_and_after(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    after = " and repaired" if is_repaired(diagnosis) else ""
+    after = " and repaired" if diagnosis.is_repaired else ""
     return (
         figure(
             drawn["before_after.svg"],
@@ -192,16 +229,19 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
     shown = (
         (figure(drawn["gain.svg"], "Each scan kept back in turn, both models fitted to the others."),)
         if "gain.svg" in drawn
-        else (paragraph("There are fewer than two scans of eight readings or more: none can be kept back."),)
+        else (paragraph(_nothing_kept_back(diagnosis)),)
+    )
+    kept_back = (
+        (
+            "readings kept back",
+            f"{number(gain.heldout_log_density_per_reading, 4)} ± {number(gain.heldout_sd, 4)} nats each",
+        ),
     )
     return (
         *shown,
         definition_list(
             (
-                (
-                    "readings kept back",
-                    f"{number(gain.heldout_log_density_per_reading, 4)} ± {number(gain.heldout_sd, 4)} nats each",
-                ),
+                *(kept_back if gain.heldout_by_scan else ()),
                 ("log evidence", f"{number(gain.log_evidence, 1)} nats"),
                 (
                     "rms of the residuals",
@@ -211,6 +251,12 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
             )
         ),
     )
+
+
+def _nothing_kept_back(diagnosis: Diagnosis) -> str:
+    if not diagnosis.is_repaired:
+        return "The mean is as calibrated: there is no repair to be tested on readings kept back."
+    return "There are fewer than two scans of eight readings or more: none can be kept back."
 
 
 def _noise(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -275,23 +321,26 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
                 " and ".join(a.effects).replace("_", " "),
                 number(a.cosine, 3),
                 a.settle_by,
-                str(a.readings) if a.readings else "–",
+                _readings(a.readings),
             )
             for a in aliases
         ),
     )
 
 
+def _readings(n: int) -> str:
+    """Write how many readings would settle something; more than a plan may have are not counted."""
+    return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
+
+
 def _next(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     plan = diagnosis.next_measurement
     if plan is None:
-        return (
-            paragraph("No further reading that this apparatus can take would tell the leading explanations apart."),
-        )
+        return (paragraph(_next_in_words(diagnosis)),)
     return (
         paragraph(
             f"Next: {plan.description.rstrip('.')}: {count(len(plan.plan), 'reading')}, "
-            f"about {number(plan.minutes, 0)} minutes, "
+            f"about {count(max(round(plan.minutes), 1), 'minute')}, "
             f"expected to tell {number(plan.expected_log_bayes_factor, 1)} nats between the leading hypotheses "
             "(3 nats are odds of 20 to 1). The plan is in next_plan.csv."
         ),
@@ -320,12 +369,14 @@ def _sentence(text: str) -> str:
 
 
 def _where(diagnosis: Diagnosis, place: Place) -> str:
-    what = f"It shows in the {covariate_words(place.covariate)}"
+    shows = "It shows" if place.p_value < ALARM else "What stands out most, as chance may have it, is"
+    what = f"{shows} in the {covariate_words(place.covariate)}"
     if place.covariate == "scan":
-        what = f"It shows in scan {place.scan}"
+        what = f"{shows} in scan {place.scan}"
     elif place.start is not None and place.end is not None:
         unit = covariate_unit(place.covariate, diagnosis.recording.plan.instrumentation.unit)
-        what += f" from {place.start:.4g} to {place.end:.4g} {unit}".rstrip()
+        start, end = f"{place.start:.4g}", f"{place.end:.4g}"
+        what += f" at {start} {unit}".rstrip() if start == end else f" from {start} to {end} {unit}".rstrip()
     if place.scan and place.covariate != "scan":
         what += f", scan {place.scan}"
     return readable(f"{what} (p = {place.p_value:.2g}).")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -14,13 +15,14 @@ from probewise.report.drawing import Band, Bars, Boxes, Dots, Line, Mark, Panel,
 from probewise.report.palette import BLUE, GREY, VERMILLION
 from probewise.report.words import number, signed, unit_name
 
-__all__ = ["figures", "gain_by_scan", "hypothesis_label", "is_repaired", "mean_residuals"]
+__all__ = ["figures", "gain_by_scan", "hypothesis_label", "mean_residuals"]
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
 _MOST_SCANS = 12
 _STEPS = 24
 _LEAST_ROWS = 4
+_LINE = 14.0  # px, of a name's
 _ASIDE = 0.15  # of the place of a value without a scale: how far two means stand from its middle
 _BEFORE, _AFTER = "as calibrated", "repaired"
 
@@ -42,11 +44,6 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     return drawn
 
 
-def is_repaired(diagnosis: Diagnosis) -> bool:
-    """Tell whether the repaired model is another than the calibrated one."""
-    return not np.array_equal(diagnosis.residuals_before, diagnosis.residuals_after, equal_nan=True)
-
-
 def hypothesis_label(effects: Sequence[str]) -> str:
     """Name a hypothesis, an effect a line."""
     if not effects:
@@ -60,6 +57,8 @@ def mean_residuals(
     after: FloatArray | None,
     *,
     sd: float,
+    rho: float = 0.0,
+    scan: IntArray | None = None,
     names: Mapping[float, str] | None = None,
 ) -> tuple[Mark, ...]:
     """Average what the model misses in steps of a covariate, as calibrated and repaired.
@@ -71,6 +70,8 @@ def mean_residuals(
         is none. Without `after` nothing was repaired.
     sd
         Noise of one reading, for the band that chance alone would fill.
+    rho, scan
+        Its correlation with the reading before it in the same scan, and the scan of each reading, (n_points,).
     names
         Names of the values of a covariate without a scale; the marks then stand at 0, 1, 2 ...
 
@@ -81,7 +82,8 @@ def mean_residuals(
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     groups = _groups(covariate[ok], names)
     at = np.arange(len(groups), dtype=np.float64) if names else np.array([covariate[ok][g].mean() for g in groups])
-    chance = 1.96 * sd / np.sqrt(np.array([max(g.size, 1) for g in groups]))
+    scan = np.zeros(len(before), dtype=np.int64) if scan is None else scan
+    chance = 1.96 * sd * np.array([_sd_of_mean(ok[g], scan, rho) for g in groups])
     area = Boxes if names else Band
     out: list[Mark] = [area(at, -chance, chance, "95 % of chance alone")]
     aside = _ASIDE if names and after is not None else 0.0
@@ -90,6 +92,22 @@ def mean_residuals(
             means = np.array([residual[ok][g].mean() for g in groups])
             out.append(Line(at + step, means, f"mean, {name}", colour, knots=True, joined=not names))
     return tuple(out)
+
+
+def _sd_of_mean(rows: IntArray, scan: IntArray, rho: float) -> float:
+    """Give the sd of the mean of readings, of that of one, where each remembers the one before it (AR(1))."""
+    n, own = max(rows.size, 1), np.zeros(len(scan), dtype=bool)
+    own[rows] = True
+    variance = 1.0 / n
+    for lag in range(1, min(_longest_memory(rho), len(scan) - 1) + 1):
+        both = own[lag:] & own[:-lag] & (scan[lag:] == scan[:-lag])
+        variance += 2 * rho**lag * float(both.sum()) / n**2
+    return math.sqrt(max(variance, 0.0))
+
+
+def _longest_memory(rho: float) -> int:
+    """Count the readings over which a correlation falls below a hundredth."""
+    return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0
 
 
 def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float) -> Panel:
@@ -123,7 +141,7 @@ def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float) -> 
 def _first(diagnosis: Diagnosis, values: Mapping[str, FloatArray]) -> bytes:
     """Draw what the model misses where that is worst, before and after, and beside it every explanation."""
     place = diagnosis.where[0] if diagnosis.where else None
-    after = diagnosis.residuals_after if is_repaired(diagnosis) else None
+    after = diagnosis.residuals_after if diagnosis.is_repaired else None
     if place is None:
         label = covariate_label("level", diagnosis.recording.plan.instrumentation.unit)
         missed = _missed(diagnosis, diagnosis.predicted_before, label, after=after)
@@ -131,7 +149,9 @@ def _first(diagnosis: Diagnosis, values: Mapping[str, FloatArray]) -> bytes:
         missed = _missed(diagnosis, *_along_scan(diagnosis, place.scan), after=after)
     else:
         missed = _by_covariate(diagnosis, place, values[place.witness], after=after)
-    return drawing([[replace(missed, title="what the model misses"), _explanations(diagnosis)]], shares=(1.6, 1.0))
+    likely = _explanations(diagnosis)
+    missed = replace(missed, title="what the model misses", height=likely.height)
+    return drawing([[missed, likely]], shares=(1.6, 1.0))
 
 
 def _witness(diagnosis: Diagnosis, place: Place, at: FloatArray) -> bytes:
@@ -173,8 +193,9 @@ def _missed(
 ) -> Panel:
     """Draw mean residuals against values, (n_points,), and each reading's where asked."""
     before, sd = diagnosis.residuals_before, float(diagnosis.repaired.noise_sd.mean())
+    rho = next((p.mean for p in diagnosis.noise.parameters if p.name == "rho"), 0.0)
     each = Dots(_side_by_side(at) if names else at, before, "each reading", opacity=0.35)
-    means = mean_residuals(at, before, after, sd=sd, names=names)
+    means = mean_residuals(at, before, after, sd=sd, rho=rho, scan=diagnosis.recording.plan.scan, names=names)
     return Panel(
         (*((each,) if readings else ()), *means, Rule(0.0)),
         x=label,
@@ -188,6 +209,7 @@ def _explanations(diagnosis: Diagnosis) -> Panel:
     shown = [(hypothesis_label(h.effects), h.probability) for h in listed[:_MOST_BARS]]
     if len(diagnosis.hypotheses) > len(shown):
         shown.append((f"{len(diagnosis.hypotheses) - len(shown)} others", max(1 - sum(p for _, p in shown), 0.0)))
+    lines = max(name.count("\n") + 1 for name, _ in shown)
     return Panel(
         (
             Bars(
@@ -199,7 +221,8 @@ def _explanations(diagnosis: Diagnosis) -> Panel:
         x="probability",
         y_names=[(-float(k), name) for k, (name, _) in enumerate(shown)],
         x_ends=(0.0, 1.25),  # room for the number behind the longest
-        title="what it could be",
+        title="what was believed before" if diagnosis.few else "what it could be",
+        height=max(230.0, len(shown) * (_LINE * lines + 14.0)),
     )
 
 
@@ -252,7 +275,7 @@ def _models(diagnosis: Diagnosis) -> list[tuple[FloatArray, FloatArray, str, str
         (diagnosis.predicted_before, diagnosis.residuals_before, VERMILLION, _BEFORE),
         (diagnosis.predicted_after, diagnosis.residuals_after, BLUE, _AFTER),
     ]
-    return models if is_repaired(diagnosis) else models[:1]
+    return models if diagnosis.is_repaired else models[:1]
 
 
 def _span(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[Span, ...]:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.joining import join
-from probewise.recordings.plan import Plan, Recording
+from probewise.diagnosis.joining import join_plans
+from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
 __all__ = [
@@ -41,6 +41,7 @@ _MOST_SCANS = 6
 _NEAR = 26  # readings around an edge
 _TURN_DEG = 45.0
 _RAISE = 1.25  # of the height that the recording names
+_WORDS = {1: "", 2: " (every second reading, twice as fast)"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +65,12 @@ class Command:
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """Some rows of a scan: a suffix for its name, words to go behind its own."""
+    """Some rows of a scan, every so many: a suffix for its name, words to go behind its own."""
 
     suffix: str
     words: str
     rows: IntArray
+    stride: int = 1
 
 
 def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Excerpt]:
@@ -87,8 +89,8 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
     for stride in [s for s in strides if len(scan[::s]) >= _LEAST_ROWS] or [1]:
         rows = scan[::stride][:MOST_READINGS]
         if rows.size >= _LEAST_ROWS:
-            words = {1: "", 2: " (every second reading)"}.get(stride, f" (every {stride}th reading)")
-            out.append(Excerpt("" if stride == 1 else f"_{stride}", words, rows))
+            words = _WORDS.get(stride, f" (every {stride}th reading, {stride} times as fast)")
+            out.append(Excerpt("" if stride == 1 else f"_{stride}", words, rows, stride))
     if level is not None and scan.size > _NEAR:
         change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(level)))])
         first = int(np.argmax(change[_NEAR - 1 :] - change[: 1 - _NEAR]))
@@ -130,7 +132,7 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
                 ),
                 Command(
                     "respeed",
-                    f"scan {name} forth and back at double speed{every}",
+                    f"scan {name} forth and back {_faster(part)}",
                     rescheduled(plan, both, start_s, gap_s, f"{label}_both"),
                 ),
             ]
@@ -199,6 +201,13 @@ def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: 
     )
 
 
+def _faster(part: Excerpt) -> str:
+    """Say how fast every second reading of an excerpt is taken; a reading takes as long as it did."""
+    if part.stride == 1:
+        return f"at double speed{part.words}"
+    return f"at {2 * part.stride} times the speed (every {2 * part.stride}th reading)"
+
+
 def _named(plan: Plan, how: str) -> Plan:
     return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
 
@@ -240,22 +249,29 @@ def one_after_another(scans: Sequence[Command], after: Plan) -> tuple[Plan, list
     """
     ends = np.cumsum([len(scan.plan) for scan in scans])
     rows = [np.arange(end - len(scan.plan), end) for end, scan in zip(ends.tolist(), scans, strict=True)]
-    plan = _joined(scans)
-    read = {name: _last(after, name) for name in after.covariates if name not in COMMANDED}
-    kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
-    return replace(plan, covariates={**kept, **plan.covariates}), rows
+    return _as_left(_joined(scans), after), rows
 
 
-def in_turn(scans: Sequence[Command]) -> Plan:
-    """Take scans one after the other, with a break before each, a longer one where something has to be laid."""
+def in_turn(scans: Sequence[Command], after: Plan) -> Plan:
+    """Take scans one after the other, with a break before each, a longer one where something has to be laid.
+
+    Covariates that they lack are as expected, as in `one_after_another`: a column to be filled in with what is read.
+    """
     out: list[Command] = []
     for scan in scans:
         out.append(_from(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
-    return _joined(out)
+    return _as_left(_joined(out), after)
+
+
+def _as_left(plan: Plan, after: Plan) -> Plan:
+    """Fill in covariates that nobody commands with what they were at the end of the plan before."""
+    read = {name: _last(after, name) for name in after.covariates if name not in COMMANDED}
+    kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
+    return replace(plan, covariates={**kept, **plan.covariates})
 
 
 def _joined(scans: Sequence[Command]) -> Plan:
-    return join([Recording(scan.plan, np.zeros(len(scan.plan))) for scan in scans]).plan
+    return join_plans([scan.plan for scan in scans])
 
 
 def put_off(scan: Command, plan: Plan) -> Command:

@@ -123,7 +123,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
         return None
     scans = [offered[k] for k in chosen]
     return NextMeasurement(
-        in_turn(scans),
+        in_turn(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
         _expected_log_bayes_factor([outlook.take(taken) for outlook in outlooks], weights),

@@ -7,6 +7,7 @@ the cosine between two survivors, how well they are told apart: by lambda^2 (1 -
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
@@ -22,6 +23,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, Ca
 from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.statement.verdict import Diagnosis
+from probewise.diagnosis.statement.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
@@ -145,10 +147,12 @@ class PlanAudit(ShowsItself):
         if not self.cures:
             cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else "no scan of this arm helps"
             return "\n".join([*lines, f"cure       {cured}"])
-        lines.append(f"cure       {self.extra_readings} more readings, about {self.extra_minutes:.0f} minutes:")
+        minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
+        lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
         for k, cure in enumerate(self.cures, start=1):
             so_that = ", ".join(cure.cured) or "helps the next"
-            lines.append(f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}")
+            said = f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}"
+            lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.sight != "fine"]
         return "\n".join([*lines, *_listed("left", left or ["nothing"])])
 
@@ -200,13 +204,14 @@ def audit_plan(
     if lacking:
         raise ParameterError("pattern", lacking[0], f"one that is described: {', '.join(plan.patterns) or 'none'}")
     expected, said = _expected(plan, sensor, noise_sd)
-    before, cosines = _judged(LaidOut.of(expected, plan, effects), effects)
+    unit = plan.instrumentation.unit
+    before, cosines = _judged(LaidOut.of(expected, plan, effects), effects, unit)
     ailing = [effect.name for effect in before if effect.sight != "fine"]
     chosen = cures_of(plan, expected, effects, ailing)
     steps, current = [before], plan
     for command in chosen:
         current = behind(current, [command.plan])
-        steps.append(_judged(LaidOut.of(expected, current, effects), effects)[0])
+        steps.append(_judged(LaidOut.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)
     n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
     cures = tuple(
@@ -263,7 +268,7 @@ def audit_recorded(
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
-    judged, cosines = _judged(LaidOut.of(expected, plan, effects, most=_SETTINGS), effects)
+    judged, cosines = _judged(LaidOut.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit)
     return PlanAudit(plan, "the sensor as calibrated from these readings", judged, cosines, (), judged)
 
 
@@ -288,7 +293,9 @@ def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) ->
     return Expected(null, z, (low, high), sd), f"{said}, noise {sd:.3g} {plan.instrumentation.unit}".rstrip()
 
 
-def _judged(laid: LaidOut, effects: Mapping[str, type[NamedEffect[Any]]]) -> tuple[tuple[EffectAudit, ...], FloatArray]:
+def _judged(
+    laid: LaidOut, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
+) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Judge every effect, and how well each (row) is imitated by each other (column)."""
     seen = Survivors.of(laid, np.arange(len(laid.slopes)))
     sights = seen.sights()
@@ -307,20 +314,20 @@ def _judged(laid: LaidOut, effects: Mapping[str, type[NamedEffect[Any]]]) -> tup
             share, like = sights[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
-            out.append(_seen(effect, share, like, seen.smallest(effect)))
+            out.append(_seen(effect, share, like, seen.smallest(effect), unit))
         cosines[own, own] = out[-1].share
     return tuple(out), cosines
 
 
 def _seen(
-    effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...]
+    effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...], unit: str
 ) -> EffectAudit:
     if share < LEAST_SHARE:
         reason = "the sensor's own parameters absorb it" if share > 0 else "it leaves no trace here"
         return EffectAudit(effect.name, "invisible", share, reason=reason)
     alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
     smallest = tuple(
-        Smallest(effect.prior.names[k], effect.units[k], amount)
+        Smallest(effect.prior.names[k], unit_in_words(effect.units[k], unit), amount)
         for k, amount in zip(effect.amplitudes, amounts, strict=True)
     )
     return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)

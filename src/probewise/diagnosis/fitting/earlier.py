@@ -13,9 +13,10 @@ from probewise.calibration import FittedSensor
 from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, theta_to_natural
 from probewise.diagnosis.fitting.free_form import FreeForm, free_form_to_natural
 from probewise.errors import ParameterError
+from probewise.recordings.plan import Plan
 from probewise.sensor import is_free_form
 
-__all__ = ["SensorPrior", "sensor_from_posterior", "sensor_of"]
+__all__ = ["SensorPrior", "require_same_unit", "sensor_from_posterior", "sensor_of"]
 
 
 def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
@@ -62,6 +63,15 @@ class SensorPrior(Protocol):
     def samples(self) -> FloatArray:
         """Posterior samples, (n_samples, n_params)."""
         ...
+
+
+def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
+    """Raise ParameterError where readings are in another unit than the sensor was calibrated in; "" is not known."""
+    unit, own = plan.instrumentation.unit, ""
+    if isinstance(sensor, FittedSensor):
+        own = sensor.instrumentation.unit
+    if own and unit and own != unit:
+        raise ParameterError("sensor", f"one that reads in {own!r}", f"one in {unit!r}, as the recording")
 
 
 def sensor_of(sensor: SensorPrior) -> CalibratedSensor:

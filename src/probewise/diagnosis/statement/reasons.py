@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from probewise.diagnosis.advice.aliases import Alias
+from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.search.weighed import Search
 from probewise.diagnosis.statement.verdict import EffectFound, Hypothesis, Verdict
+from probewise.diagnosis.statement.words import p_in_words
 
 __all__ = ["reason_of"]
 
@@ -26,7 +27,7 @@ def reason_of(
     p_value_after: float,
     fails: bool,
     few: bool,
-    pairs: Sequence[Alias],
+    asked: NextMeasurement | None,
     where: Sequence[Place],
     noise: Names,
     candidates: Sequence[str],
@@ -46,8 +47,8 @@ def reason_of(
         Whether what leads predicts readings kept back far worse than the plain sensor does.
     few
         Whether there are too few readings to say anything.
-    pairs
-        What cannot be told apart.
+    asked
+        The readings to take next.
     noise
         The most probable noise model.
     candidates
@@ -55,39 +56,45 @@ def reason_of(
     least_readings
         Fewest readings that a verdict is given on.
     """
-    n = int(search.recording.usable.sum())
+    n, p = int(search.recording.usable.sum()), p_in_words(p_value)
     if few and n >= least_readings:
         return f"All {n} usable readings are equal: there is no signal to diagnose; scan across an edge."
     if few:
-        return f"{n} usable readings are too few to tell; {least_readings} or more are needed."
+        has = "1 usable reading is" if n == 1 else f"{n} usable readings are"
+        return f"{has} too few to tell; {least_readings} or more are needed."
     by_name = {effect.name: effect for effect in effects}
     if verdict == "clean":
         order = max(search.order_probabilities, key=lambda k: search.order_probabilities[k])
         form = search.sensors[order].form
         ssf = f", {form}," if form else ""
-        return f"The model{ssf} explains all {n} readings to within their noise (p = {p_value:.2g})."
+        rare = ", which is rare; nothing that was tried explains them better" if p_value < ALARM else ""
+        return f"The model{ssf} explains all {n} readings to within their noise ({p}{rare})."
     if verdict == "unknown":
         if candidates:
             like = "; ".join(candidates)
-            return f"Something is missing (p = {p_value:.2g}) that has no name; it is most like this: {like}."
+            return f"Something is missing ({p}) that has no name; it is most like this: {like}."
         family = max(search.unknown_shares, key=lambda k: search.unknown_shares[k], default="")
         if family.endswith(FAR_OUT):
             covariate = family.removesuffix(FAR_OUT).replace("_", " ")
-            return f"The readings that are far out lie together in {covariate}: something is missing there, not noise."
+            tail = f"to a test of the mean they are noise with a heavy tail, {p}"
+            together = f"The readings that are far out lie together in {covariate}"
+            return f"{together}: something is missing there, not noise ({tail})."
         place = f" It shows most in {where[0].covariate}." if where else ""
         found = search.beside(noise)
         known = " and ".join(name.replace("_", " ") for name in found.names) if found else ""
         beside = f", beside {known}" if known else ""
-        return f"Something is missing (p = {p_value:.2g}) that no named effect explains{beside}.{place}"
+        return f"Something is missing ({p}) that no named effect explains{beside}.{place}"
     if fails:
         return (
-            f"Something is missing (p = {p_value:.2g}); {hypotheses[0].label} explains these readings best, and "
+            f"Something is missing ({p}); {hypotheses[0].label} explains these readings best, and "
             "predicts those kept back far worse than the sensor without it."
         )
     if verdict == "cannot_tell":
         leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
-        cure = next((f"; to tell: {a.settle_by}" for a in pairs if set(a.effects) & set(combination)), "")
+        cure = "" if asked is None else f"; to tell: {asked.description}"
         return f"These {n} readings are too few to decide between {leading}{cure}."
     said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
-    more = f" Something more is missing: after the repair p = {p_value_after:.2g}." if p_value_after < ALARM else ""
-    return f"{said[0].upper()}{said[1:]} (p = {p_value:.2g}).{more}"
+    if verdict == "noise":
+        return f"{said[0].upper()}{said[1:]}; nothing is missing from the mean ({p})."
+    more = f" Something more is missing: after the repair {p_in_words(p_value_after)}." if p_value_after < ALARM else ""
+    return f"{said[0].upper()}{said[1:]} ({p}).{more}"

@@ -14,6 +14,7 @@ from probewise.diagnosis.noise.law import noise_statistics, steps_within_scans
 from probewise.diagnosis.repair.repaired import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary
 from probewise.diagnosis.statement.verdict import EffectFound, Hypothesis, NoiseFound, ParameterFound
+from probewise.diagnosis.statement.words import unit_in_words
 from probewise.effects import NUISANCES, UNNAMED, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -159,7 +160,7 @@ def noise_found(
 
 def _parameters(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
     return tuple(
-        _parameter(name, _unit(own, unit), values[:, k])
+        _parameter(name, unit_in_words(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
     )
 
@@ -168,11 +169,6 @@ def _scans(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
     """Give the numbers of the scans that an effect is bound to, from 0 in order of taking; its sentence names them."""
     numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
     return (_parameter("scans", "scan", numbers),) if numbers.size else ()
-
-
-def _unit(own: str, unit: str) -> str:
-    """Write the unit with the reading's own for "reading"."""
-    return own.replace("reading", unit) if own.startswith("reading") else own
 
 
 def _parameter(name: str, unit: str, values: FloatArray) -> ParameterFound:

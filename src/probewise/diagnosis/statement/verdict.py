@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast
+
+import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
@@ -14,6 +17,8 @@ from probewise.diagnosis.repair.mending import Improvement
 from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.locate import Place
 from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.statement.words import p_in_words
+from probewise.effects import NamedEffect
 from probewise.recordings.plan import Recording
 
 __all__ = [
@@ -107,6 +112,8 @@ class Diagnosis(ShowsItself):
         If something has no name, the probability that it depends on each covariate.
     weighings
         Hypotheses weighed twice, by Laplace and by nested sampling, where that was asked for.
+    few
+        Whether there are too few readings to say anything, or all are equal.
     """
 
     recording: Recording
@@ -133,6 +140,7 @@ class Diagnosis(ShowsItself):
     order_probabilities: Mapping[int, float]
     unknown_shares: Mapping[str, float]
     weighings: tuple[Weighing, ...] = ()
+    few: bool = False
 
     def __post_init__(self) -> None:
         for name in ("residuals_before", "residuals_after", "predicted_before", "predicted_after"):
@@ -147,24 +155,50 @@ class Diagnosis(ShowsItself):
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
     @property
-    def left_open(self) -> dict[str, float]:
-        """Share of the repaired sensor's samples that hold an effect which only some hold, the largest first."""
-        shares = {name: 1.0 - float(without.mean()) for name, without in self.repaired.absent.items()}
-        return dict(sorted(shares.items(), key=lambda item: -item[1]))
+    def is_repaired(self) -> bool:
+        """Whether the repaired model predicts otherwise than the calibrated one."""
+        return not np.array_equal(self.residuals_before, self.residuals_after, equal_nan=True)
+
+    @property
+    def left_open(self) -> dict[tuple[str, ...], float]:
+        """Share of the repaired sensor's samples by which of the effects they hold that not all hold, largest first."""
+        absent = self.repaired.absent
+        if not absent:
+            return {}
+        held = Counter(zip(*(np.where(marks, "", name).tolist() for name, marks in absent.items()), strict=True))
+        return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
+
+    @property
+    def carried(self) -> tuple[tuple[str, float, str], ...]:
+        """What the repaired sensor carries and no hypothesis with a name has: name, share of the samples, sentence."""
+        stated, out = {effect.name for effect in self.effects}, []
+        for effect in cast(Sequence[NamedEffect[Any]], self.repaired.chain.effects):
+            values = self.repaired.columns(effect.name)
+            marks = self.repaired.absent.get(effect.name)
+            held = values if marks is None else values[~marks]
+            if effect.name not in stated and len(held):
+                sentence = effect.sentence(held.mean(axis=0), held.std(axis=0))
+                out.append((effect.name, len(held) / len(values), sentence))
+        return tuple(out)
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""
-        lines = [f"{self.verdict}: {self.reason}", f"p = {self.p_value:.3g} that nothing is missing from the mean"]
+        lines = [f"{self.verdict}: {self.reason}", f"{p_in_words(self.p_value)} that nothing is missing from the mean"]
         lines += [f"  {h.probability:.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
         lines += [f"{e.name} ({e.probability:.3f}): {e.sentence}" for e in self.effects if e.probability > 0.05]
         gain = self.improvement
-        lines.append(
-            f"repaired: log evidence {gain.log_evidence:+.1f}, readings kept back "
-            f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats each, "
-            f"rms {gain.rms_before:.4g} -> {gain.rms_after:.4g}"
-        )
+        if self.is_repaired:
+            held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats each"
+            kept_back = f"readings kept back {held}" if gain.heldout_by_scan else "no reading could be kept back"
+            lines.append(
+                f"repaired: log evidence {gain.log_evidence:+.1f}, {kept_back}, "
+                f"rms {gain.rms_before:.4g} -> {gain.rms_after:.4g}"
+            )
+        elif self.verdict == "noise":
+            lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f}")
+        lines += [f"in {share:.0%} of its samples: {sentence}" for _, share, sentence in self.carried]
         if self.left_open:
-            shares = ", ".join(f"{name} in {share:.0%}" for name, share in self.left_open.items())
+            shares = ", ".join(f"{' with '.join(n) or 'none'} in {share:.0%}" for n, share in self.left_open.items())
             lines.append(f"left open in its samples: {shares}")
         return "\n".join(lines)
 

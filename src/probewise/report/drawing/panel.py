@@ -19,6 +19,7 @@ __all__ = ["Panel", "drawing"]
 WIDTH = 900  # px of a drawing: that of a page's column
 _PAD, _TICK, _LINE = 8.0, 5.0, 20.0
 _LEGEND = 22.0  # px from the sample of one mark to its name
+_ROUNDING = 1e-6  # of values: what is no further apart is the same
 _SLANT = 35.0  # degrees, of names that do not fit side by side
 
 
@@ -93,7 +94,8 @@ def _ends(values: Sequence[FloatArray], room: float) -> tuple[float, float]:
     joined = np.concatenate([np.ravel(v) for v in values]) if values else np.empty(0)
     joined = joined[np.isfinite(joined)]
     low, high = (float(joined.min()), float(joined.max())) if joined.size else (0.0, 1.0)
-    more = room * (high - low) if high > low else 0.5 * max(abs(low), 1.0)
+    apart = high - low > _ROUNDING * max(abs(low), abs(high))
+    more = room * (high - low) if apart else 0.5 * max(abs(low), 1.0)
     return low - more, high + more
 
 

@@ -46,9 +46,14 @@ def test_an_input_that_nothing_replaces_stays_where_it_is(tmp_path):
 
 def test_a_directory_in_the_way_leaves_everything_as_it_was(tmp_path):
     (tmp_path / "b").mkdir()
-    with pytest.raises(FileError, match="a directory of that name is in the way"), staged(tmp_path) as stage:
-        (stage / "a").write_text("new")
-        (stage / "b").write_text("new")
+
+    def write():
+        with staged(tmp_path) as stage:
+            (stage / "a").write_text("new")
+            (stage / "b").write_text("new")
+
+    with pytest.raises(FileError, match="a directory of that name is in the way"):
+        write()
     assert [p.name for p in tmp_path.iterdir()] == ["b"]
 
 

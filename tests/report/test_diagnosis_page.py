@@ -72,7 +72,7 @@ def test_every_figure_is_svg_that_a_browser_can_read(saturated):
 def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     """Its mean says nothing where the miss changes its sign within the scan."""
     scan = saturated.recording.plan.scan_names[0]
-    place = dataclasses.replace(saturated.where[0], covariate="scan", scan=scan, start=None, end=None)
+    place = dataclasses.replace(saturated.where[0], covariate="scan", scan=scan, start=None, end=None, level=None)
     drawn = page.figures(dataclasses.replace(saturated, where=(place,)))
     shown = drawn[place.witness].decode()
     assert shown.count("each reading") == 2

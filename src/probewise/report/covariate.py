@@ -61,6 +61,8 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
             # Of the covariate `scan` a place names the scan that stands out; all others are shown beside it.
             if covariate.name == place.covariate and (covariate.scan == place.scan or place.covariate == "scan"):
                 values[usable[covariate.rows]] = covariate.values
+        if place.level is not None and len(place.level) == len(usable):
+            values[usable] = place.level
         out[place.witness] = values
     return out
 

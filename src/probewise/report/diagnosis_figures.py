@@ -177,6 +177,8 @@ def _by_covariate(
     """Draw residuals against the covariate of a place, (n_points,), with the place shaded."""
     unit = diagnosis.recording.plan.instrumentation.unit
     label = covariate_label(place.covariate, unit, place.scan)
+    if place.level is not None:
+        label = f"reading to be expected without it ({unit_name(unit)})"
     names = category_names(diagnosis, place)
     panel = _missed(diagnosis, at, label, names=names, after=after, readings=readings)
     return replace(panel, marks=(*_span(place, at, names), *panel.marks))

@@ -36,7 +36,8 @@ class Place:
     """A window of a covariate where the residual stands out, with its witness curve.
 
     `start`, `end` in the covariate's unit, None for a scan; the curve is the residual's mean in bins of
-    the covariate, with the noise sd of that mean.
+    the covariate, with the noise sd of that mean. `level` (n_points,) is what would be read without the effect
+    that is there, where that is the covariate: the calibrated model does not know of it.
     """
 
     covariate: str
@@ -48,8 +49,11 @@ class Place:
     curve_at: FloatArray
     curve_mean: FloatArray
     curve_sd: FloatArray
+    level: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        if self.level is not None:
+            object.__setattr__(self, "level", frozen(self.level))
         for name in ("curve_at", "curve_mean", "curve_sd"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
@@ -237,8 +241,9 @@ def places_of_effect(
     if name is None or not np.any(change):
         return []
     covariate = known[name]
-    if name == "level":
-        covariate = replace(covariate, values=(predicted - change)[covariate.rows])
+    level = predicted - change if name == "level" else None
+    if level is not None:
+        covariate = replace(covariate, values=level[covariate.rows])
     if name == "place":
         covariate = _along_the_strongest(change, plan) or covariate
     curve = _curve(covariate, residuals, sd)
@@ -249,7 +254,7 @@ def places_of_effect(
     # What sets in at a level is there from where it is first felt.
     felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
     values = covariate.values[felt]
-    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve)]
+    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve, level=level)]
 
 
 def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:

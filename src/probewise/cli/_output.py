@@ -33,6 +33,11 @@ class Stage:
     def __truediv__(self, name: str) -> Path:
         return self.folder / name
 
+    @property
+    def notes(self) -> list[str]:
+        """What was set aside, in words."""
+        return [f"what was {path} is now {now}" for path, now in self.kept.items()]
+
 
 def check_out_directory(path: Path) -> Path:
     """Refuse, before any work, a place where no directory can be made."""

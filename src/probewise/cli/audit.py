@@ -46,12 +46,12 @@ def run(arguments: argparse.Namespace) -> int:
     audit = audit_plan(plan, sensor=sensor, noise_sd=noise_sd)
     say(audit.summary(), quiet=arguments.quiet)
     if out is not None:
-        _write(audit, out, arguments.plan.name)
+        _write(audit, out, arguments.plan, quiet=arguments.quiet)
         say(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
-def _write(audit: PlanAudit, out: Path, source: str) -> None:
+def _write(audit: PlanAudit, out: Path, plan: Path, *, quiet: bool) -> None:
     import json
 
     from probewise.diagnosis import CURE_PLAN, audit_json
@@ -59,17 +59,17 @@ def _write(audit: PlanAudit, out: Path, source: str) -> None:
     from probewise.report import audit as report
 
     drawn = report.figures(audit)
-    with staged(out) as stage:
+    cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
+    with staged(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
         text = json.dumps(audit_json(audit), allow_nan=False, indent=1)
         (stage / "audit.json").write_text(text + "\n", encoding="utf-8")
         for name, png in drawn.items():
             (stage / name).write_bytes(png)
-        (stage / "report.html").write_text(report.write_page(audit, drawn, source=source), encoding="utf-8")
+        (stage / "report.html").write_text(report.write_page(audit, drawn, source=plan.name), encoding="utf-8")
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
-    if audit.cure_plan is None:
-        for name in (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name):  # of an earlier run
-            (out / name).unlink(missing_ok=True)
+    for note in stage.notes:
+        say(f"note: {note}", quiet=quiet)
 
 
 VERB = Verb("audit", "Say before any data what a plan cannot see and cannot tell apart.", add_arguments, run)

@@ -94,8 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
         (stage / "report.html").write_text(page, encoding="utf-8")
     for note in joined.notes:
         say(f"note: {note}", quiet=arguments.quiet)
-    for path, now in stage.kept.items():
-        say(f"note: what was {path} is now {now}", quiet=arguments.quiet)
+    for note in stage.notes:
+        say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
@@ -104,8 +104,9 @@ def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:
     """List what must not be lost: all that was read, and a plan of an earlier run that was filled in with readings."""
     read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
     filled_in = out / NEXT_PLAN
-    if filled_in.is_file() and "reading" in filled_in.read_text(encoding="utf-8-sig").partition("\n")[0].split(","):
-        read.append(filled_in)
+    if filled_in.is_file():
+        header = filled_in.read_text(encoding="utf-8-sig", errors="replace").partition("\n")[0]
+        read += [filled_in] if "reading" in header.strip().split(",") else []
     return [path for csv in read for path in (csv, csv.with_suffix(".json"))]
 
 

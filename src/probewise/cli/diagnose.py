@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["VERB", "write_results"]
 
-NEXT_PLAN = "next_plan.csv"
 _OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 
 
@@ -92,9 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         write_results(diagnosis, drawn, stage.folder, rng=files_rng)
         page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
         (stage / "report.html").write_text(page, encoding="utf-8")
-    for note in joined.notes:
-        say(f"note: {note}", quiet=arguments.quiet)
-    for note in stage.notes:
+    for note in (*joined.notes, *stage.notes):
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
@@ -102,6 +99,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:
     """List what must not be lost: all that was read, and a plan of an earlier run that was filled in with readings."""
+    from probewise.diagnosis import NEXT_PLAN
+
     read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
     filled_in = out / NEXT_PLAN
     if filled_in.is_file():
@@ -115,7 +114,7 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *
     import json
 
     from probewise.calibration import write_sensor
-    from probewise.diagnosis import diagnosis_json
+    from probewise.diagnosis import NEXT_PLAN, diagnosis_json
     from probewise.recordings import write_plan
 
     text = json.dumps(diagnosis_json(diagnosis), allow_nan=False, indent=1)

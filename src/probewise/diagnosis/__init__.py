@@ -22,7 +22,7 @@ from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.statement.document import diagnosis_json, diagnosis_schema
+from probewise.diagnosis.statement.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
 from probewise.diagnosis.statement.verdict import (
     Diagnosis,
     EffectFound,
@@ -38,6 +38,7 @@ __all__ = [
     "ALARM",
     "CURE_PLAN",
     "MOST_READINGS",
+    "NEXT_PLAN",
     "Alias",
     "Cure",
     "Diagnosis",

@@ -14,7 +14,7 @@ from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import COMMANDED
 
-__all__ = ["join", "join_plans"]
+__all__ = ["covariates_joined", "join", "join_plans", "last_known"]
 
 
 def join(recordings: Sequence[Recording]) -> Recording:
@@ -76,7 +76,6 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
         scan_names += [_unused(s, scan_names) for s in plan.scan_names]
-    commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
     return Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
         y_mm=np.concatenate([p.y_mm for p in plans]),
@@ -87,9 +86,21 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         pattern=np.concatenate(codes),
         pattern_names=tuple(names),
         patterns=patterns,
-        covariates={name: _column(plans, name) for name in sorted({*first.covariates, *commanded})},
+        covariates=covariates_joined(plans),
         instrumentation=first.instrumentation,
     )
+
+
+def covariates_joined(plans: Sequence[Plan]) -> dict[str, FloatArray]:
+    """Set the covariates of the first plan behind each other, and what is commanded in any; see `join_plans`."""
+    commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
+    return {name: _column(plans, name) for name in sorted({*plans[0].covariates, *commanded})}
+
+
+def last_known(values: FloatArray, otherwise: float = math.nan) -> float:
+    """Give the last value of a covariate that is known."""
+    known = values[np.isfinite(values)]
+    return float(known[-1]) if known.size else otherwise
 
 
 def _column(plans: Sequence[Plan], name: str) -> FloatArray:
@@ -100,8 +111,7 @@ def _column(plans: Sequence[Plan], name: str) -> FloatArray:
         column = plan.covariates.get(name)
         if column is None:
             column = np.full(len(plan), math.nan if name in COMMANDED else last)
-        known = column[np.isfinite(column)]
-        last = float(known[-1]) if known.size else last
+        last = last_known(column, last)
         columns.append(column)
     return np.concatenate(columns)
 

@@ -231,17 +231,13 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
         if "gain.svg" in drawn
         else (paragraph(_nothing_kept_back(diagnosis)),)
     )
-    kept_back = (
-        (
-            "readings kept back",
-            f"{number(gain.heldout_log_density_per_reading, 4)} ± {number(gain.heldout_sd, 4)} nats each",
-        ),
-    )
+    held = f"{number(gain.heldout_log_density_per_reading, 4)} ± {number(gain.heldout_sd, 4)} nats each"
+    kept_back = (("readings kept back", held),) if gain.heldout_by_scan else ()
     return (
         *shown,
         definition_list(
             (
-                *(kept_back if gain.heldout_by_scan else ()),
+                *kept_back,
                 ("log evidence", f"{number(gain.log_evidence, 1)} nats"),
                 (
                     "rms of the residuals",

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.joining import join_plans
+from probewise.diagnosis.joining import covariates_joined, join_plans, last_known
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
@@ -158,7 +158,6 @@ def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
     """
     plans = [plan, *more]
     starts = np.cumsum([0, *(len(p.scan_names) for p in plans)])
-    commanded = {name for p in plans for name in p.covariates if name in COMMANDED}
     names = tuple(dict.fromkeys(name for p in plans for name in p.pattern_names))
     numbers = [np.array([names.index(name) for name in p.pattern_names], dtype=np.int64) for p in plans]
     return replace(
@@ -172,9 +171,7 @@ def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
         pattern=np.concatenate([own[p.pattern] for own, p in zip(numbers, plans, strict=True)]),
         pattern_names=names,
         patterns={name: pattern for p in reversed(plans) for name, pattern in p.patterns.items()},
-        covariates={
-            name: np.concatenate([_covariate(p, name, plan) for p in plans]) for name in {*plan.covariates, *commanded}
-        },
+        covariates=covariates_joined(plans),
     )
 
 
@@ -216,20 +213,6 @@ def _commanded(plan: Plan, name: str, value: float) -> Plan:
     return replace(plan, covariates={**plan.covariates, name: np.full(len(plan), value)})
 
 
-def _covariate(plan: Plan, name: str, first: Plan) -> FloatArray:
-    known = plan.covariates.get(name)
-    if known is not None:
-        return known
-    # Where nothing is commanded the sensor is as it was calibrated, which NaN says.
-    return np.full(len(plan), np.nan if name in COMMANDED else _last(first, name))
-
-
-def _last(plan: Plan, name: str) -> float:
-    """Give the last value of a covariate that is known; NaN where none is."""
-    known = plan.covariates[name][np.isfinite(plan.covariates[name])]
-    return float(known[-1]) if known.size else float("nan")
-
-
 def distinct_scans(plan: Plan) -> list[IntArray]:
     """Row numbers of the first scans of all that move and differ in pattern, orientation or ends."""
     seen: dict[tuple[object, ...], IntArray] = {}
@@ -265,7 +248,7 @@ def in_turn(scans: Sequence[Command], after: Plan) -> Plan:
 
 def _as_left(plan: Plan, after: Plan) -> Plan:
     """Fill in covariates that nobody commands with what they were at the end of the plan before."""
-    read = {name: _last(after, name) for name in after.covariates if name not in COMMANDED}
+    read = {name: last_known(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates})
 

@@ -9,7 +9,7 @@ from typing import Any
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.statement.verdict import Diagnosis, ParameterFound
 
-__all__ = ["diagnosis_json", "diagnosis_schema"]
+__all__ = ["NEXT_PLAN", "diagnosis_json", "diagnosis_schema"]
 
 NEXT_PLAN = "next_plan.csv"
 

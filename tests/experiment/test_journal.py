@@ -100,6 +100,9 @@ def test_a_missing_reading_is_null_and_comes_back_as_nan(tmp_path):
         (b'[1]\n{"index": 1}\n', "JSON list"),
         (b'{"format": "journal/1"}\n{"index": 1}\n', "row 2, column pose"),
         (b'{"format": "journal/1"}\n\xff\xfe\n', "row 2"),
+        (b'{"format": "journal/1", "seed": NaN}\n', "row 1.*NaN is no JSON number"),
+        (b'{"format": "journal/1", "seed": 1, "seed": 2}\n', "row 1.*'seed' comes twice"),
+        (b'{"format": "journal/1"}\n' + b"[" * 100_000 + b"\n", "row 2"),
     ],
 )
 def test_a_damaged_journal_says_which_file_which_row_and_what(tmp_path, content, says):

@@ -21,7 +21,7 @@ from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
-from probewise.recordings import Instrumentation, write_text_atomically
+from probewise.recordings import Instrumentation, strict_json, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
     AnyEffect,
@@ -321,8 +321,8 @@ class FittedSensor(ShowsItself):
             If the text is damaged, incomplete, or of another format or version of it.
         """
         try:
-            document = json.loads(text, parse_constant=_refuse)
-        except ValueError as error:
+            document = strict_json(text)
+        except (ValueError, RecursionError) as error:
             raise FileError(
                 path, f"no strict JSON ({error})", "a sensor.json as `probewise calibrate` writes"
             ) from error
@@ -395,10 +395,6 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
 def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
     a, b, c = (samples[:, k : 6 * n_gaussians : 6] for k in (3, 4, 5))
     return np.where(a > 0, a * b - c * c, -np.inf)
-
-
-def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} stands for a number")
 
 
 class _Reader:

@@ -31,6 +31,7 @@ from probewise.errors import FileError
 from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
+from probewise.recordings.strict_json import strict_json
 
 __all__ = [
     "FORMAT",
@@ -176,17 +177,12 @@ def read_journal(path: str | Path) -> Journal:
 
 def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
     try:
-        value = json.loads(line.decode(), parse_constant=_no_constant)
-    except ValueError as error:
+        value = strict_json(line.decode())
+    except (ValueError, RecursionError) as error:
         raise FileError(path, f"no JSON ({error})", "one JSON object a line", row=row) from error
     if not isinstance(value, dict):
         raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
     return value
-
-
-def _no_constant(name: str) -> float:
-    """Refuse NaN and Infinity, which are no JSON: what is missing is null."""
-    raise ValueError(f"{name} is no number in JSON")
 
 
 def _salvaged(path: str | Path, tail: bytes, index: int) -> Entry | None:

@@ -24,6 +24,7 @@ from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
 from probewise.recordings.prediction import Prediction, read_prediction, write_prediction
 from probewise.recordings.shipping import shipped
+from probewise.recordings.strict_json import strict_json
 
 __all__ = [
     "Disc",
@@ -46,6 +47,7 @@ __all__ = [
     "read_prediction",
     "read_recording",
     "shipped",
+    "strict_json",
     "two_way_plan",
     "write_bytes_atomically",
     "write_plan",

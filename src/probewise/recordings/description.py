@@ -25,6 +25,7 @@ from probewise.recordings.patterns import (
     Uniform,
 )
 from probewise.recordings.plan import Instrumentation
+from probewise.recordings.strict_json import strict_json
 from probewise.recordings.table import LARGEST, read_text
 
 __all__ = ["Description", "degrees_of", "description_text", "read_description"]
@@ -198,7 +199,7 @@ def read_description(path: Path) -> Description:
     """
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     try:
-        content = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
+        content = strict_json(text)
     except json.JSONDecodeError as error:
         found = f"does not parse as JSON: {error.msg} at character {error.colno}"
         raise FileError(path, found, "strict JSON", row=error.lineno) from error
@@ -250,19 +251,6 @@ def _instrumentation(top: _Fields) -> Instrumentation:
         controls=tuple(controls),
         description=top.text("description") if top.has("description") else "",
     )
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in out:
-            raise ValueError(f"the name {name!r} comes twice")
-        out[name] = value
-    return out
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
 
 
 def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:

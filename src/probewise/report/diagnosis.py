@@ -56,7 +56,9 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
         ),
         Section("Before and after", _before_and_after(diagnosis, drawn)),
         Section("Does it predict readings that it has not seen?", _gain(diagnosis, drawn)),
-        Section("What could not be told apart, and what would", (*_aliases(diagnosis), *_next(diagnosis))),
+        Section(
+            "What could not be told apart, and what would", (*_aliases(diagnosis), paragraph(_next_in_words(diagnosis)))
+        ),
         Section("Noise", _noise(diagnosis)),
     ]
 
@@ -146,7 +148,8 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
     if plan is None:
         return "Nothing that this apparatus can do would tell more."
     told = plan.expected_log_bayes_factor
-    said = f"{plan.description.rstrip('.')}: {count(len(plan.plan), 'reading')}, next_plan.csv."
+    asked = f"{count(len(plan.plan), 'reading')}, about {count(max(round(plan.minutes), 1), 'minute')}"
+    said = f"{plan.description.rstrip('.')}: {asked}, next_plan.csv."
     if told < _TELLS_SOMETHING:
         return f"No plan of {MOST_READINGS} readings was found that tells more than {number(told, 1)} nats: {said}"
     return f"{said[:1].upper()}{said[1:]} Expected to tell {number(told, 1)} nats; 3 are odds of 20 to 1."
@@ -243,7 +246,7 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
                     "rms of the residuals",
                     f"{number(gain.rms_before, 3)} before, {number(gain.rms_after, 3)} after ({unit})",
                 ),
-                ("something still missing", readable(f"p = {gain.p_value_after:.2g}")),
+                ("something still missing", readable(p_in_words(gain.p_value_after))),
             )
         ),
     )
@@ -257,7 +260,7 @@ def _nothing_kept_back(diagnosis: Diagnosis) -> str:
 
 def _noise(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     noise = diagnosis.noise
-    said = paragraph(f"Model: {noise.model}; p = {noise.p_value:.2g} that it explains the noise.")
+    said = paragraph(readable(f"Model: {noise.model}; {p_in_words(noise.p_value)} that it explains the noise."))
     if not noise.parameters:
         return (said,)
     rows = ((p.name, p.unit, f"{p.mean:.4g}", f"{p.sd:.2g}") for p in noise.parameters)
@@ -329,20 +332,6 @@ def _readings(n: int) -> str:
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 
-def _next(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    plan = diagnosis.next_measurement
-    if plan is None:
-        return (paragraph(_next_in_words(diagnosis)),)
-    return (
-        paragraph(
-            f"Next: {plan.description.rstrip('.')}: {count(len(plan.plan), 'reading')}, "
-            f"about {count(max(round(plan.minutes), 1), 'minute')}, "
-            f"expected to tell {number(plan.expected_log_bayes_factor, 1)} nats between the leading hypotheses "
-            "(3 nats are odds of 20 to 1). The plan is in next_plan.csv."
-        ),
-    )
-
-
 def _design(audit: PlanAudit) -> tuple[Markup, ...]:
     def listed(names: Sequence[str]) -> str:
         return ", ".join(names).replace("_", " ") or "none"
@@ -375,4 +364,4 @@ def _where(diagnosis: Diagnosis, place: Place) -> str:
         what += f" at {start} {unit}".rstrip() if start == end else f" from {start} to {end} {unit}".rstrip()
     if place.scan and place.covariate != "scan":
         what += f", scan {place.scan}"
-    return readable(f"{what} (p = {place.p_value:.2g}).")
+    return readable(f"{what} ({p_in_words(place.p_value)}).")

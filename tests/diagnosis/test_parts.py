@@ -352,10 +352,20 @@ def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
 
 def test_an_effect_of_one_scan_is_in_that_scan():
     scan = Covariate("scan", np.repeat([0.0, 1.0], 6), np.arange(12), groups=True)
-    effect = VOCABULARY["scan_misplacement"].for_extent(EXTENT).variants()[1]
-    one = np.ones(12)
+    effect = replace(VOCABULARY["scan_misplacement"].for_extent(EXTENT), scans=("s1",))
+    one = np.repeat([0.0, 1.0], 6)
     (found,) = places_of_effect(effect, one, one, line(6).plan, [scan], one, p_value=0.001, size=8.0, sd=0.5)
-    assert (found.covariate, (found.scan,), found.start) == ("scan", effect.scans, None)
+    assert (found.covariate, found.scan, found.start) == ("scan", "s1", None)
+
+
+def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_first():
+    """A scan over white looks the same from any angle: nothing shows there, though its mounting is turned too."""
+    plan = line(6, scans=3).plan
+    scan = Covariate("scan", np.repeat([0.0, 1.0, 2.0], 6), np.arange(18), groups=True)
+    effect = replace(VOCABULARY["scan_angle_error"].for_extent(EXTENT), scans=plan.scan_names)
+    change = np.repeat([0.5, 0.001, -2.0], 6)
+    found = places_of_effect(effect, change, change, plan, [scan], change, p_value=0.001, size=8.0, sd=0.5)
+    assert [place.scan for place in found] == ["s2", "s0"]
 
 
 def test_noise_statistics_see_memory_tails_and_level():

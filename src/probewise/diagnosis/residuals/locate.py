@@ -217,7 +217,7 @@ def places_of_effect(
     Parameters
     ----------
     effect
-        The effect; one that is bound to scans is in those.
+        The effect; one that is bound to scans is in those of them where it is felt.
     change
         What it makes of the readings, (n_points,).
     predicted
@@ -249,12 +249,20 @@ def places_of_effect(
     curve = _curve(covariate, residuals, sd)
     if name == "scan" or (effect.scans and "scan" in effect.covariates and "scan" in known):
         curve = _curve(known["scan"], residuals, sd)
-        return [Place("scan", scan, None, None, p_value, size, *curve) for scan in effect.scans]
+        return [Place("scan", scan, None, None, p_value, size, *curve) for scan in _felt_in(effect.scans, change, plan)]
     strength = np.abs(change[covariate.rows])
     # What sets in at a level is there from where it is first felt.
     felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
     values = covariate.values[felt]
     return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve, level=level)]
+
+
+def _felt_in(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
+    """Keep the scans in which something is felt, the strongest first: a sheet of one albedo looks the same turned."""
+    rows = {scan: plan.scan == plan.scan_names.index(scan) for scan in scans}
+    strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
+    felt = [scan for scan in scans if strength[scan] >= _FELT * max(strength.values())]
+    return sorted(felt, key=lambda scan: -strength[scan])
 
 
 def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:

@@ -92,7 +92,7 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated):
 
 
 def test_numbers_are_written_as_people_write_them():
-    assert readable("(p = 2.2e-07) -0.3 mm in edge-90") == "(p = 2.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
+    assert readable("(p = 2.2e-07) -0.3 mm in edge-90") == "(p\u00a0=\u00a02.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
 
 
 def test_labels_carry_units():

@@ -21,12 +21,13 @@ def signed(value: float, digits: int) -> str:
 
 
 def readable(text: str) -> str:
-    """Write the numbers of a text as people do: 2 × 10⁻⁷ for 2e-07, and a true minus sign."""
+    """Write the numbers of a text as people do: 2 × 10⁻⁷ for 2e-07, a true minus sign, "p = 0.2" on one line."""
 
     def power(found: re.Match[str]) -> str:
         return f"{found[1]}\u00a0×\u00a010{str(int(found[2])).translate(_RAISED)}"
 
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power, text))
+    together = re.sub(r"\bp ([=<]) (?=\d)", "p\u00a0\\1\u00a0", text)
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power, together))
 
 
 def count(n: int, noun: str) -> str:

@@ -236,12 +236,13 @@ class Span:
         return np.array([self.start, self.end]), _NOTHING
 
     def svg(self, frame: Frame) -> str:
-        """Shade; what is narrower than two pixels is drawn as wide."""
+        """Shade; what is narrower than it could be seen is drawn wider."""
         start, end = frame.px_of_x(np.array([self.start, self.end])).tolist()
-        middle, half = (start + end) / 2, max((end - start) / 2, 1.0)
+        middle, half = (start + end) / 2, max((end - start) / 2, _LEAST_SPAN / 2)
         return _box(middle - half, frame.top, 2 * half, frame.height, self.colour, self.opacity)
 
 
+_LEAST_SPAN = 6.0  # px, of what is as pale as a shade
 _MANY = 3000  # dots from which those on one pixel are drawn once
 
 

@@ -1,6 +1,6 @@
 """Does Laplace's approximation weigh hypotheses as nested sampling does, within a nat?
 
-    python benchmarks/laplace_agreement.py --numbers 400 --plan paper --seed 20261202 --workers 2 \
+    python benchmarks/laplace_agreement.py --numbers 400 --plan paper --seed 20270303 --workers 2 \
         --out docs/results/laplace.jsonl
 
 The first so many recordings of a challenge, those in one plan, each diagnosed as `probewise diagnose --thorough` does

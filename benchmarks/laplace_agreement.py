@@ -1,6 +1,6 @@
 """Does Laplace's approximation weigh hypotheses as nested sampling does, within a nat?
 
-    python benchmarks/laplace_agreement.py --numbers 400 --plan paper --seed 20270303 --workers 2 \
+    python benchmarks/laplace_agreement.py --numbers 402 --plan paper --seed 20270303 --workers 2 \
         --out docs/results/laplace.jsonl
 
 The first so many recordings of a challenge, those in one plan, each diagnosed as `probewise diagnose --thorough` does
@@ -77,7 +77,7 @@ def summary(results: Sequence[Result]) -> str:
 def main() -> None:
     """Weigh the cases that are missing in the file, then print the summary."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--numbers", type=int, default=400)
+    parser.add_argument("--numbers", type=int, default=402)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--plan", choices=sorted(PLANS), default="paper")
     parser.add_argument("--workers", type=int, default=1)

@@ -240,6 +240,8 @@ def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
     assert found.improvement.rms_after < found.improvement.rms_before
     assert found.improvement.heldout_log_density_per_reading > 0
     assert (found.where[0].covariate, found.where[0].scan) == ("scan", "edge_90_out")
+    assert found.corrected
+    assert "sensor.json does not carry it" in found.summary()
 
 
 @pytest.mark.slow
@@ -330,6 +332,7 @@ def test_what_has_a_name_of_our_own_is_unknown_and_its_repair_predicts():
     assert found.verdict == "unknown"
     assert found.combination == ("unknown",)
     assert document["unknown_candidates"][0]["name"] == "arm_knock"
+    assert not found.corrected
     assert found.repaired.effects == ("arm_knock",)
     assert found.improvement.rms_after < 1.1 * NOISE_SD
     assert found.improvement.p_value_after > 0.001
@@ -412,3 +415,14 @@ def test_where_nothing_is_found_a_rival_is_imagined_that_would_have_been_seen_he
     assert imagined.probability == 0.0
     apart = (imagined.model.predict(imagined.z[None, :]) - null.model.predict(null.z[None, :]))[0] / NOISE_SD
     assert 1.5 < np.linalg.norm(apart) < 6.0
+
+
+def test_what_is_imagined_is_not_ruled_out_by_the_readings_taken(monkeypatch):
+    """One edge in little noise: the sensor takes up nearly all, and what takes it up is no straight line."""
+    edge = noise_free("paper")
+    edge = edge.take(np.flatnonzero(edge.plan.scan == 0))
+    noise = 0.005 * np.random.default_rng(3).standard_normal(len(edge))
+    rivals, sd, _ = asked_about(monkeypatch, dataclasses.replace(edge, readings=edge.readings + noise))
+    null, imagined = (rival.model.predict(rival.z[None, :])[0] for rival in rivals)
+    assert rivals[1].label.endswith("too weak to be felt so far")
+    assert 0.5 < np.linalg.norm(imagined - null) / sd < 6.5

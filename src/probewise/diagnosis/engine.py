@@ -250,6 +250,7 @@ class _Diagnoser:
             unknown_shares=self._unknown_shares(),
             weighings=weighings,
             few=few,
+            corrected=bool(np.any(change)),
         )
 
     def _judged(self, null: Candidate, best: Candidate, noise: Names, p_value: float) -> tuple[Linearised, Improvement]:

@@ -106,7 +106,9 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     if gain.heldout_by_scan and diagnosis.is_repaired:
         facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
     if diagnosis.is_repaired:
-        facts.append(("What is left", f"rms {gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} after"))
+        left = f"rms {gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} after"
+        only_here = "; what has no name is put right in these readings alone, sensor.json does not carry it"
+        facts.append(("What is left", left + only_here if diagnosis.corrected else left))
     if diagnosis.left_open:
         facts.append(("What its predictions leave open", _shares(diagnosis.left_open)))
     facts.append(("What to do next", _next_in_words(diagnosis)))
@@ -121,7 +123,7 @@ def _predicts(nats: float, sd: float) -> str:
 
 
 def _shares(shares: Mapping[tuple[str, ...], float]) -> str:
-    listed = (f"{' with '.join(names).replace('_', ' ') or 'none of them'} in {p:.0%}" for names, p in shares.items())
+    listed = (f"{' with '.join(names).replace('_', ' ') or 'no effect'} in {p:.0%}" for names, p in shares.items())
     return f"{', '.join(listed)} of the samples in sensor.json"
 
 
@@ -152,7 +154,10 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
     said = f"{plan.description.rstrip('.')}: {asked}, next_plan.csv."
     if told < _TELLS_SOMETHING:
         return f"No plan of {MOST_READINGS} readings was found that tells more than {number(told, 1)} nats: {said}"
-    return f"{said[:1].upper()}{said[1:]} Expected to tell {number(told, 1)} nats; 3 are odds of 20 to 1."
+    *others, last = plan.between
+    rivals = f"{others[0]} from {last}" if len(others) == 1 else f"apart {', '.join(others)} and {last}"
+    by = f"by {number(told, 1)} nats; 3 are odds of 20 to 1"
+    return f"{said[:1].upper()}{said[1:]} Expected to tell {rivals} {by}."
 
 
 def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:

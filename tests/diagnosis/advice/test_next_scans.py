@@ -63,7 +63,7 @@ def rival(name: str, probability: float, settings: list[float], plan: Plan) -> R
     effect = VOCABULARY[name].for_extent(extent)
     model = Model(sensor, (effect,), plan)
     z = np.concatenate([np.zeros(sensor.n_params), model.scores_of(np.array([settings]))[0]])
-    return Rival(model, z, 0.01 * np.eye(len(z)), probability)
+    return Rival(name.replace("_", " "), model, z, 0.01 * np.eye(len(z)), probability)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +81,7 @@ def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
     assert len(asked.plan) <= MOST_READINGS
     assert {asked.plan.pattern_names[k] for k in asked.plan.pattern} - plan.patterns.keys()
     assert asked.expected_log_bayes_factor > 3
+    assert asked.between == tuple(name.replace("_", " ") for name in rivals)
     assert len(set(asked.plan.scan_names)) == len(asked.plan.scan_names)
     assert (np.diff(asked.plan.time_s) > 0).all()
     assert asked.plan.time_s[0] > plan.time_s[-1]

@@ -37,22 +37,24 @@ class NextMeasurement:
     """A plan to take next, and how much it is expected to tell.
 
     `expected_log_bayes_factor`: of the true hypothesis over the one hardest to tell from it, in nats, averaged over
-    which is true.
+    which is true. `between`: what these are, in words.
     """
 
     plan: Plan
     description: str
     minutes: float
     expected_log_bayes_factor: float
+    between: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A hypothesis about the mean: a model at its best point z (n_params,), and its probability.
+    """A hypothesis about the mean: its name in words, a model at its best point z (n_params,), and its probability.
 
     `root` (n_params, n_params): a square root of the covariance there, root root^T.
     """
 
+    label: str
     model: Model
     z: FloatArray
     root: FloatArray
@@ -127,6 +129,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
         _expected_log_bayes_factor([outlook.take(taken) for outlook in outlooks], weights),
+        tuple(rival.label for rival in rivals),
     )
 
 

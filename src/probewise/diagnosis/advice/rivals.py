@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
 from probewise._arrays import FloatArray
@@ -15,6 +17,9 @@ __all__ = ["next_readings"]
 _LEAST_PROBABILITY = 0.01
 _MOST_RIVALS = 5
 _TRIED = 3  # effects that are not felt, as a rival, until some reading tells of one
+_UNFELT = 3.0  # lambda of such an effect
+_SHRUNK = (1.0, 0.25, 0.0625, 0.015625)  # its size, until what it leaves of the readings taken is no more than ...
+_LEFT = 2.0  # times that: what was to take it up is no straight line
 
 
 def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
@@ -38,32 +43,40 @@ def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
     if len(rivals) > 1:
         return next_scans(rivals, sd, plan)
     others = dict.fromkeys(n for names in ranked for n in names if n in search.effects)
-    wanted = (next_scans([*rivals, _imagined(search, null, n)], sd, plan) for n in list(others)[:_TRIED])
+    imagined = (_imagined(search, null, name) for name in others)
+    tried = islice((rival for rival in imagined if rival is not None), _TRIED)
+    wanted = (next_scans([*rivals, rival], sd, plan) for rival in tried)
     return next((asked for asked in wanted if asked is not None), None)
 
 
 def _as_rival(candidate: Candidate, probability: float) -> Rival:
-    return Rival(candidate.found.model, candidate.found.z, _root_of(candidate), probability)
+    label = " with ".join(candidate.names).replace("_", " ") or "the sensor as calibrated"
+    return Rival(label, candidate.found.model, candidate.found.z, _root_of(candidate), probability)
 
 
-def _imagined(search: Search, null: Candidate, name: str) -> Rival:
-    """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here."""
+def _imagined(search: Search, null: Candidate, name: str) -> Rival | None:
+    """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here. None where none can."""
     effect, found = search.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
     templates = search.templates.of(found, effect)
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
-    at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / 3.0))))
+    at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNFELT))))
     setting = templates.settings[at][0].copy()
     for k in effect.amplitudes:
-        setting[k] *= min(3.0 / max(sizes[at], 1e-9), 50.0)
+        setting[k] *= min(_UNFELT / max(sizes[at], 1e-9), 50.0)
     model = found.model.with_effect(templates.variant(at))
-    z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
-    change = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
-    z[: len(found.z)] += problem.absorbed(found, change)  # the sensor as it would then have been fitted
-    root = np.zeros((len(z), len(z)))  # of that size, and no other
+    root = np.zeros((len(found.z) + len(setting), len(found.z) + len(setting)))  # of that size, and no other
     root[: len(found.z), : len(found.z)] = _root_of(null)
-    return Rival(model, z, root, 0.0)
+    for shrunk in _SHRUNK:
+        own = np.where(np.isin(np.arange(len(setting)), effect.amplitudes), shrunk * setting, setting)
+        z = np.concatenate([found.z, model.scores_of(own[None, :])[0]])
+        change = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
+        z[: len(found.z)] += problem.absorbed(found, change)  # the sensor as it would then have been fitted
+        left = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
+        if np.linalg.norm(left) <= _LEFT * _UNFELT * null.sd:
+            return Rival(f"{name.replace('_', ' ')} too weak to be felt so far", model, z, root, 0.0)
+    return None
 
 
 def _root_of(candidate: Candidate) -> FloatArray:

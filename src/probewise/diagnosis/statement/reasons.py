@@ -92,7 +92,7 @@ def reason_of(
     if verdict == "cannot_tell":
         leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(hypotheses, 3))
         cure = "" if asked is None else f"; to tell: {asked.description}"
-        return f"These {n} readings are too few to decide between {leading}{cure}."
+        return f"These {n} readings do not tell apart {leading}{cure}."
     said = "; ".join(by_name[name].sentence for name in combination if name in by_name)
     if verdict == "noise":
         return f"{said[0].upper()}{said[1:]}; nothing is missing from the mean ({p})."

@@ -114,6 +114,8 @@ class Diagnosis(ShowsItself):
         Hypotheses weighed twice, by Laplace and by nested sampling, where that was asked for.
     few
         Whether there are too few readings to say anything, or all are equal.
+    corrected
+        Whether what has no name is repaired by rows: in the predictions after the repair, not in `repaired`.
     """
 
     recording: Recording
@@ -141,6 +143,7 @@ class Diagnosis(ShowsItself):
     unknown_shares: Mapping[str, float]
     weighings: tuple[Weighing, ...] = ()
     few: bool = False
+    corrected: bool = False
 
     def __post_init__(self) -> None:
         for name in ("residuals_before", "residuals_after", "predicted_before", "predicted_after"):
@@ -196,9 +199,11 @@ class Diagnosis(ShowsItself):
             )
         elif self.verdict == "noise":
             lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f}")
+        if self.corrected:
+            lines.append("what has no name is put right in these readings alone: sensor.json does not carry it")
         lines += [f"in {share:.0%} of its samples: {sentence}" for _, share, sentence in self.carried]
         if self.left_open:
-            shares = ", ".join(f"{' with '.join(n) or 'none'} in {share:.0%}" for n, share in self.left_open.items())
+            shares = ", ".join(f"{' with '.join(n) or 'no effect'} in {p:.0%}" for n, p in self.left_open.items())
             lines.append(f"left open in its samples: {shares}")
         return "\n".join(lines)
 

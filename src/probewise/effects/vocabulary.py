@@ -160,5 +160,4 @@ def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:
     if not (np.isfinite(sd) and sd > 0):
         return f"{mean:.4g}"
     digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))
-    rounded = round(mean, digits) + 0.0  # what rounds to zero has no sign
-    return f"{rounded:.{digits}f} ± {sd:.{digits}f}"
+    return f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # what rounds to zero has no sign

@@ -18,8 +18,8 @@ _LEAST_PROBABILITY = 0.01
 _MOST_RIVALS = 5
 _TRIED = 3  # effects that are not felt, as a rival, until some reading tells of one
 _UNFELT = 3.0  # lambda of such an effect
-_SHRUNK = (1.0, 0.25, 0.0625, 0.015625)  # its size, until what it leaves of the readings taken is no more than ...
-_LEFT = 2.0  # times that: what was to take it up is no straight line
+_LEFT = 2.0  # times that it may change the readings taken, all told: what takes it up need not be a straight line
+_SIZES = 4  # tried until it does not, each a quarter of the one before
 
 
 def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
@@ -63,19 +63,21 @@ def _imagined(search: Search, null: Candidate, name: str) -> Rival | None:
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
     at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNFELT))))
     setting = templates.settings[at][0].copy()
-    for k in effect.amplitudes:
-        setting[k] *= min(_UNFELT / max(sizes[at], 1e-9), 50.0)
+    amplitudes = list(effect.amplitudes)
+    setting[amplitudes] *= min(_UNFELT / max(sizes[at], 1e-9), 50.0)
     model = found.model.with_effect(templates.variant(at))
-    root = np.zeros((len(found.z) + len(setting), len(found.z) + len(setting)))  # of that size, and no other
-    root[: len(found.z), : len(found.z)] = _root_of(null)
-    for shrunk in _SHRUNK:
-        own = np.where(np.isin(np.arange(len(setting)), effect.amplitudes), shrunk * setting, setting)
-        z = np.concatenate([found.z, model.scores_of(own[None, :])[0]])
-        change = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
-        z[: len(found.z)] += problem.absorbed(found, change)  # the sensor as it would then have been fitted
-        left = model.predict(z[None, :])[0, search.recording.usable] - found.predicted
-        if np.linalg.norm(left) <= _LEFT * _UNFELT * null.sd:
+
+    def change(z: FloatArray) -> FloatArray:
+        return np.asarray(model.predict(z[None, :])[0, search.recording.usable] - found.predicted)
+
+    for _ in range(_SIZES if amplitudes else 1):
+        z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
+        z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor as it would then have been fitted
+        if np.linalg.norm(change(z)) <= _LEFT * _UNFELT * null.sd:
+            root = np.zeros((len(z), len(z)))  # of that size, and no other
+            root[: len(found.z), : len(found.z)] = _root_of(null)
             return Rival(f"{name.replace('_', ' ')} too weak to be felt so far", model, z, root, 0.0)
+        setting[amplitudes] /= 4
     return None
 
 

@@ -115,7 +115,7 @@ class Diagnosis(ShowsItself):
     few
         Whether there are too few readings to say anything, or all are equal.
     corrected
-        Whether what has no name is repaired by rows: in the predictions after the repair, not in `repaired`.
+        Whether what has no name is repaired by rows: `improvement` counts that, `repaired` does not carry it.
     """
 
     recording: Recording

@@ -68,6 +68,9 @@ PLAIN = {
     "FINDFIRST without a match": ("16 00 01 86 61 2E 62" + zeros(17), "1C 00 02 86 87" + zeros(25)),
     "CLOSE of a closed handle": ("03 00 01 84 00", "04 00 02 84 88 00"),
     "FINDFIRSTMODULE": ("16 00 01 90 2A 2E 6D 6F 64" + zeros(15), "22 00 02 90 90" + zeros(31)),
+    "POLLLENGTH": ("03 00 01 A1 00", "05 00 02 A1 00 00 00"),
+    "POLL of the most that it gives": ("04 00 01 A2 01 79", "7E 00 02 A2 00 01 00" + zeros(121)),
+    "POLL of one byte more": ("04 00 01 A2 01 7A", "05 00 02 A2 8A 01 00"),
     "BOOT over the air": ("15 00 01 97" + zeros(19), "07 00 02 97 8A" + zeros(4)),
     "a reply, which nobody asked the brick for": ("03 00 02 0B 00", ""),
     "a stump": ("01 00 00", ""),
@@ -194,3 +197,37 @@ def test_half_a_frame_is_forgotten_after_a_silence() -> None:
     frames = Frames()
     assert not list(frames.feed(b"\x40\x00\x00", 0.0))
     assert list(frames.feed(framed(b"\x00\x0b"), 1.0)) == [b"\x00\x0b"]
+
+
+def test_half_a_frame_is_forgotten_also_where_somebody_keeps_looking_for_the_rest() -> None:
+    """A terminal is read every 50 ms, mostly in vain."""
+    frames = Frames()
+    assert not list(frames.feed(b"\x0c\x00\x00\x04", 0.0))
+    for k in range(1, 20):
+        assert not list(frames.feed(b"", 0.05 * k))
+    assert list(frames.feed(framed(b"\x00\x0b"), 1.0)) == [b"\x00\x0b"]
+
+
+def test_a_frame_in_slow_pieces_is_whole_in_the_end() -> None:
+    frames, frame = Frames(), framed(b"\x00\x0b")
+    for k, byte in enumerate(frame[:-1]):
+        assert not list(frames.feed(bytes([byte]), 0.5 * k))
+        assert not list(frames.feed(b"", 0.5 * k + 0.4))
+    assert list(frames.feed(frame[-1:], 0.5 * (len(frame) - 1))) == [b"\x00\x0b"]
+
+
+@pytest.mark.parametrize("opcode", COMMANDS)
+def test_no_answer_is_longer_than_a_telegram_may_be(brick: Brick, opcode: int) -> None:
+    """128 bytes over Bluetooth, whatever is asked for, with a long file open to read and a program running."""
+    name = b"long.txt".ljust(20, b"\0")
+    brick.answer(b"\x01\x81" + name + (200).to_bytes(4, "little"))
+    for _ in range(2):
+        brick.answer(b"\x01\x83\x00" + bytes(100))
+    brick.answer(b"\x01\x84\x00")
+    brick.answer(b"\x01\x80" + name)
+    brick.answer(b"\x00\x00" + b"arm.rxe".ljust(20, b"\0"))
+    kind = 1 if opcode >= 0x80 else 0
+    for fill in (b"\x00\xff\xff", b"\xff", b"\x00"):
+        reply = brick.answer(bytes((kind, opcode)) + (fill * 64)[:64])
+        assert reply is not None
+        assert 3 <= len(reply) <= 128

@@ -25,6 +25,7 @@ SLEEP_MIN = (0, 2, 5, 10, 30, 60)
 _FLASH_BYTES = 61440
 _VERSIONS = bytes((124, 1, 31, 1))  # protocol 1.124, firmware 1.31, the smaller number first
 _LONGEST_NAME = 14
+_LONGEST_POLL = 121  # over Bluetooth; more is an error, not a shorter answer
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class Brick:
             0x98: self._rename,
             0x9B: self._device_info,
             0xA1: lambda buffer: bytes((buffer, 0)),
-            0xA2: lambda buffer, wanted: bytes((buffer, 0)) + bytes(wanted),
+            0xA2: self._poll,
             0xA4: self._usb_only,
         }
 
@@ -178,6 +179,11 @@ class Brick:
 
     def _write_map(self, module: int, offset: int, wanted: int, data: bytes) -> bytes:
         raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0))
+
+    def _poll(self, buffer: int, wanted: int) -> bytes:
+        if wanted > _LONGEST_POLL:
+            raise Refused(Status.UNDEFINED_ERROR, bytes((buffer, 0)))
+        return bytes((buffer, 0)) + bytes(wanted)
 
     def _usb_only(self, *fields: bytes) -> bytes:
         raise Refused(Status.UNDEFINED_ERROR)

@@ -126,7 +126,7 @@ COMMANDS: dict[int, Command] = {
     0x9B: Command("GETDEVICEINFO"),
     0xA0: Command("DELETEUSERFLASH"),
     0xA1: Command("POLLLENGTH", "B"),
-    0xA2: Command("POLL", "BB"),
+    0xA2: Command("POLL", "BB", 2),
     0xA4: Command("BLUETOOTHFACTORYRESET"),
 }
 
@@ -177,7 +177,8 @@ class Frames:
         """Yield every telegram that is complete now."""
         if now_s - self._last_s > _PATIENCE_S:
             self._held.clear()
-        self._last_s = now_s
+        if received:  # looking for bytes that have not come is silence too
+            self._last_s = now_s
         self._held += received
         while len(self._held) >= 2:
             end = 2 + int.from_bytes(self._held[:2], "little")

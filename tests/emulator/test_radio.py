@@ -73,6 +73,72 @@ def test_fragments_are_the_whole_reply_in_order(clock: VirtualClock) -> None:
     assert likely(sum(s > 0.0601 for _, s in got), N, 0.5)
 
 
+def test_a_reply_that_waits_comes_in_one_piece_with_the_next(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(merge=0.1, late_s=0.0))
+    assert b"".join(a for a, _ in got).startswith(ANSWER * (N - 2))
+    assert likely(sum(a == b"" for a, _ in got), N, 0.1)
+    assert {len(a) // len(ANSWER) for a, _ in got} >= {0, 1, 2}
+
+
+def test_a_doubled_reply_comes_again_and_overtakes_nothing(clock: VirtualClock) -> None:
+    got = answers(clock, Faults(double=0.1, late_s=0.0))
+    assert {a for a, _ in got} == {ANSWER, ANSWER * 2}
+    assert likely(sum(a == ANSWER * 2 for a, _ in got), N, 0.1)
+
+
+def test_a_corrupted_reply_has_one_other_byte(clock: VirtualClock) -> None:
+    """Anywhere in the frame, its length included."""
+    got = answers(clock, Faults(corrupt=0.2, late_s=0.0))
+    other = [[k for k, (a, b) in enumerate(zip(answer, ANSWER, strict=True)) if a != b] for answer, _ in got]
+    assert {len(places) for places in other} == {0, 1}
+    assert likely(sum(map(len, other)), N, 0.2)
+    assert {places[0] for places in other if places} == set(range(len(ANSWER)))
+
+
+def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock: VirtualClock) -> None:
+    """A brick that got half a request waits 0.61 s for the rest: who asks later than that is heard."""
+    faults = Faults(half=0.2, late_s=1.0)
+    line, radio = link(clock, faults)
+    got = []
+    for _ in range(N):
+        line.write(BATTERY)
+        got.append(line.read(99, 0.7))
+    assert radio.mishaps["half"] == sum(answer != ANSWER for answer in got)
+    assert all(ANSWER.startswith(answer) for answer in got)
+    # A share 0.1 of requests; and 0.1 of the replies to those that arrived.
+    assert likely(sum(answer == b"" for answer in got), N, 0.1)
+    assert likely(sum(b"" < answer < ANSWER for answer in got), N, 0.9 * 0.1)
+
+
+def test_a_brick_that_is_looked_after_all_the_time_hears_again_after_half_a_telegram(clock: VirtualClock) -> None:
+    """As the program at the terminal does, every 50 ms."""
+    _, radio = link(clock, Faults())
+    radio.send(BATTERY[:3])
+    for _ in range(20):
+        clock.sleep(0.05)
+        radio.send(b"")
+    radio.send(BATTERY)
+    clock.sleep(1.0)
+    assert radio.receive() == ANSWER
+
+
+def test_a_request_that_an_error_befalls_is_not_carried_out(clock: VirtualClock) -> None:
+    """The refusal is as long as the firmware makes it; without a reply wanted there is none."""
+    line, radio = link(clock, Faults(error=1.0))
+    line.write(framed(bytes.fromhex("00 04 00 32 01 00 00 20 00 00 00 00")))
+    assert line.read(99, 1.0)[:4] == bytes.fromhex("03 00 02 04")
+    line.write(framed(bytes.fromhex("80 04 00 32 01 00 00 20 00 00 00 00")))
+    line.write(framed(bytes.fromhex("00 06 00")))
+    refusal = line.read(99, 1.0)
+    assert refusal[:4] == bytes.fromhex("19 00 02 06")
+    assert refusal[4] >= 0x80
+    assert refusal[5:] == bytes(22)
+    clock.sleep(1.0)
+    radio.brick.advance()
+    assert radio.brick.outputs.ports[0].tacho_count == 0
+    assert radio.mishaps == {"error": 3}
+
+
 def test_an_unasked_message_comes_before_a_share_of_the_replies(clock: VirtualClock) -> None:
     got = answers(clock, Faults(unasked=0.3, late_s=0.0))
     assert all(a.endswith(ANSWER) for a, _ in got)

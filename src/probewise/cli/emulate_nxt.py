@@ -49,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME[=RATE]",
-        help="fragment, late, drop, silence, deaf, unasked, disconnect: how often of 1; late=RATE,SECONDS; "
-        "sag: mV a minute; may be given several times",
+        help="fragment, merge, double, corrupt, late, drop, half, error, silence, deaf, unasked, disconnect: how often "
+        "of 1; late=RATE,SECONDS; sag: mV per minute; may be given several times",
     )
     parser.add_argument("--name", default="NXT", help="the brick's name, up to 14 characters (default NXT)")
     parser.add_argument(

@@ -19,10 +19,20 @@ class Faults:
     ----------
     fragment
         Probability that a reply comes in pieces, up to 30 ms apart.
+    merge
+        Probability that a reply waits for the next one and comes in one piece with it.
+    double
+        Probability that a reply comes twice, the second time up to 0.1 s later.
+    corrupt
+        Probability that one byte of a reply, its length included, is another.
     late, late_s
         Probability that a reply comes so many seconds late.
     drop
         Probability that a byte of a reply is lost, for each byte.
+    half
+        Probability that the end of a telegram is lost: of a request, or of a reply, which is as likely.
+    error
+        Probability that a request is refused with an error status, and not carried out.
     silence
         Probability that a request is carried out and never answered.
     deaf
@@ -36,9 +46,14 @@ class Faults:
     """
 
     fragment: float = 0.0
+    merge: float = 0.0
+    double: float = 0.0
+    corrupt: float = 0.0
     late: float = 0.0
     late_s: float = 3.0
     drop: float = 0.0
+    half: float = 0.0
+    error: float = 0.0
     silence: float = 0.0
     deaf: float = 0.0
     unasked: float = 0.0
@@ -84,8 +99,13 @@ class Faults:
 
 _USUAL = {
     "fragment": 1.0,
+    "merge": 0.05,
+    "double": 0.05,
+    "corrupt": 0.05,
     "late": 0.05,
     "drop": 0.005,
+    "half": 0.05,
+    "error": 0.05,
     "silence": 0.05,
     "deaf": 0.05,
     "unasked": 0.05,

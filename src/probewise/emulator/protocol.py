@@ -42,6 +42,7 @@ class Status(IntEnum):
     MALFORMED = 0xBF
     OUT_OF_RANGE = 0xC0
     BUS_ERROR = 0xDD
+    NO_ROOM = 0xDE
     CHANNEL_NOT_READY = 0xE0
     NO_PROGRAM = 0xEC
     ILLEGAL_SIZE = 0xED

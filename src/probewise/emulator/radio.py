@@ -16,7 +16,7 @@ import numpy as np
 from probewise.emulator.brick import Brick
 from probewise.emulator.clock import Clock
 from probewise.emulator.faults import Faults
-from probewise.emulator.protocol import COMMANDS, Frames, framed
+from probewise.emulator.protocol import COMMANDS, Frames, Status, framed, parse, reply
 
 __all__ = ["Event", "Radio", "Trace", "no_trace"]
 
@@ -25,6 +25,9 @@ Trace: TypeAlias = Callable[[float, Event, str], None]
 """Called with the time in s, what happened (a telegram to the brick, one from it, a mishap) and its text."""
 
 _TURNAROUND_S = 0.060  # the radio turns from receiving to sending and back
+_PIECE_S = 0.03
+_DOUBLED_S = 0.1
+_STATUSES = (Status.UNDEFINED_ERROR, Status.MALFORMED, Status.OUT_OF_RANGE, Status.NO_ROOM)
 _UNASKED = bytes.fromhex("800900 03 686900")  # a running program writes "hi" to mailbox 0
 
 
@@ -78,6 +81,7 @@ class Radio:
         """Begin a new connection: what was under way is lost, the brick is as it was."""
         self._frames = Frames()
         self._coming: deque[tuple[float, bytes]] = deque()
+        self._held = b""  # a reply that waits for the next one
         self._last_s = 0.0
         self._ended = False
 
@@ -92,7 +96,9 @@ class Radio:
         return self._coming[0][0] if self._coming else None
 
     def send(self, data: bytes) -> None:
-        """Take bytes from the host, in any pieces."""
+        """Take bytes from the host, in any pieces; what comes at once may be cut at its end."""
+        if len(data) > 1 and self._happens("half", self.faults.half / 2):
+            data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
             if self.is_open:
                 self._arrived(telegram)
@@ -108,7 +114,7 @@ class Radio:
         self._note(">", telegram)
         if self._happens("deaf", self.faults.deaf):
             return
-        answer = self.brick.answer(telegram)
+        answer = self._refusal(telegram) if self._happens("error", self.faults.error) else self.brick.answer(telegram)
         if self._happens("disconnect", self.faults.disconnect):
             self._ended = True
             return
@@ -120,11 +126,33 @@ class Radio:
             self._deliver(at_s, framed(_UNASKED))
         if self._happens("late", self.faults.late):
             at_s += self.faults.late_s
-        for piece in self._pieces(
-            bytes(byte for byte in framed(answer) if not self._happens("drop", self.faults.drop))
-        ):
+        frame = self._harmed(framed(answer))
+        if self._happens("merge", self.faults.merge):
+            self._held += frame
+            return
+        frame, self._held = self._held + frame, b""
+        for piece in self._pieces(frame):
             self._deliver(at_s, piece)
-            at_s += self._rng.uniform(0.0, 0.03)
+            at_s += self._rng.uniform(0.0, _PIECE_S)
+        if self._happens("double", self.faults.double):
+            self._deliver(at_s + self._rng.uniform(0.0, _DOUBLED_S), frame)
+
+    def _refusal(self, telegram: bytes) -> bytes | None:
+        """Return a refusal of a request that the brick never sees."""
+        request = parse(telegram)
+        if request is None or not request.wants_reply:
+            return None
+        zeros = 0 if request.command is None else request.command.error_bytes
+        return reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
+
+    def _harmed(self, frame: bytes) -> bytes:
+        """Return what is left of a frame on its way to the host."""
+        if self._happens("corrupt", self.faults.corrupt):
+            at, change = int(self._rng.integers(len(frame))), int(self._rng.integers(1, 256))
+            frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
+        if self._happens("half", self.faults.half / 2):
+            frame = frame[: int(self._rng.integers(1, len(frame)))]
+        return bytes(byte for byte in frame if not self._happens("drop", self.faults.drop))
 
     def _pieces(self, frame: bytes) -> list[bytes]:
         if len(frame) < 2 or not self._happens("fragment", self.faults.fragment):

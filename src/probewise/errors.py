@@ -8,6 +8,7 @@ __all__ = [
     "DoubtfulResultWarning",
     "FileError",
     "LinkError",
+    "LowBatteryWarning",
     "NotConvergedError",
     "NotSavedWarning",
     "ParameterError",
@@ -78,3 +79,7 @@ class DoubtfulResultWarning(UserWarning):
 
 class NotSavedWarning(UserWarning):
     """Warn of a computation that goes on but could not be saved on the way."""
+
+
+class LowBatteryWarning(UserWarning):
+    """Warn of a battery that will not drive the instrument much longer, or not as it should."""

@@ -179,8 +179,10 @@ class PaperBrick:
             return b""
         if opcode == 0x07:
             valid = now_s >= self.input[2]
-            raw = (self.raw_counts if valid else 1000).to_bytes(2, "little")
-            return bytes([body[0], valid, 0, *self.input[:2]]) + raw + bytes(6)
+            raw = self.raw_counts if valid else 1000
+            shown = 1023 - min(max(raw - 200, 0) * 100 // 68, 1023)  # LEGO's firmware, types 05 and 06 in mode 00
+            words = [raw, shown, shown, shown]
+            return bytes([body[0], valid, 0, *self.input[:2]]) + b"".join(word.to_bytes(2, "little") for word in words)
         return {0x0B: b"\xf4\x1c", 0x0D: b"\xc0\x27\x09\x00", 0x88: b"\x7c\x01\x1f\x01"}[opcode]
 
     def read(self, size, timeout_s):

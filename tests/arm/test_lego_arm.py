@@ -229,14 +229,14 @@ def test_a_reading_that_is_there_is_not_lost_when_the_line_dies_on_the_way_up(pa
 
     def run():
         with bench.arm as arm:
-            battery = arm._machine.battery_mv
+            read = arm._machine.read_percent
 
             def then_cut():
-                level = battery()
+                percent = read()
                 paper_brick.is_cut = True
-                return level
+                return percent
 
-            arm._machine.battery_mv = then_cut
+            arm._machine.read_percent = then_cut
             readings.append(arm.measure(bench.pose(*PLACES[0])))
             arm.measure(bench.pose(*PLACES[1]))
 

@@ -141,11 +141,12 @@ class LegoArm:
                 f"orientation_rad {stands:.4f} there: this arm has no wrist, its sensor turns with the base",
             )
         self.go_down(pose.x_mm, pose.y_mm)
+        battery_mv = self._machine.battery_mv()  # before the light: from then on nothing is asked that could lose it
         value = self._machine.read_percent()
         if self.geometry.whole_percent and math.isfinite(value):
             value = math.floor(value)  # the brick cuts fractions off
         time_s = self._clock.monotonic() - self._zero_s
-        covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": self._machine.battery_mv()}
+        covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
         there = self._pose()
         # The reading is here. A line that dies now shows at the next move, which starts with raising.
         with contextlib.suppress(LinkError):

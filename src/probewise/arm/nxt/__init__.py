@@ -10,8 +10,8 @@ from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, Timing
 from probewise.arm.nxt.machine import BrickMachine
 from probewise.arm.nxt.motor import Drive, Guard, Motor, MotorError
 from probewise.arm.nxt.serial_port import SerialPort
-from probewise.arm.nxt.status import BrickError, NotYetError
-from probewise.arm.nxt.telegram import Reply, Request, Sent, decode, encode, framed
+from probewise.arm.nxt.status import BrickError
+from probewise.arm.nxt.telegram import Reply, Request, decode, encode, framed
 from probewise.arm.nxt.wire import TelegramError
 
 __all__ = [
@@ -27,11 +27,9 @@ __all__ = [
     "Motor",
     "MotorError",
     "NoAnswerError",
-    "NotYetError",
     "Reply",
     "Request",
     "SensorError",
-    "Sent",
     "SerialPort",
     "TelegramError",
     "Timing",

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass
 
 from probewise.arm.basics import Clock
 from probewise.arm.nxt.link import Link
-from probewise.arm.nxt.telegram import GetInputValues, Mode, SensorType, SetInputMode
+from probewise.arm.nxt.telegram import GetInputValues, InputValues, Mode, SensorType, SetInputMode
+from probewise.arm.nxt.wire import TelegramError
 from probewise.errors import LinkError, ParameterError
 
 __all__ = ["Light", "LightReading", "SensorError", "normalized_of"]
 
 AD_MAX = 1023
+N_INVALID = 3  # readings at least, for a slow line may take all the time that there is for one
 _BRIGHT_COUNTS = 200  # 800 mV of 5000 mV, as the firmware's whole numbers have it: 5 V is 1023 counts
 _SPAN_PERCENT = 68  # share of the converter's range that lies between bright and dark
 
@@ -90,25 +93,51 @@ class Light:
         ------
         SensorError
             If the brick calls every reading invalid.
+        TelegramError
+            If what the brick says contradicts itself, however often it is asked.
         """
         if self._type is None:
             self.light_up()
         deadline = self._clock.monotonic() + self._valid_s
-        while True:
-            values = self._link.ask(GetInputValues(self.port))
+        for number in itertools.count(1):
+            values = self._link.ask(GetInputValues(self.port), check=_require_sense)
             as_set = (values.type, values.mode) == (self._type, Mode.RAW)
             # An invalid reading still shows the old values.
             if as_set and values.valid:
                 return LightReading(values.raw)
-            if self._clock.monotonic() > deadline:
+            if number >= N_INVALID and self._clock.monotonic() > deadline:
                 raise SensorError(
                     f"input {self.port + 1} gave no valid reading for {self._valid_s:g} s; "
                     "is the light sensor plugged in?"
                 )
             if not as_set:  # a program that starts or stops takes all settings back
                 self.light_up(self._type == SensorType.LIGHT_ACTIVE)
+        raise AssertionError("a count has no end")  # pragma: no cover
 
-    def switch_off(self) -> None:
-        """Switch the LED off and forget the sensor."""
-        self._type = None
-        self._link.ask(SetInputMode(self.port, SensorType.NONE, Mode.RAW))
+    @property
+    def off(self) -> SetInputMode:
+        """The command that switches the LED off and lets the brick forget the sensor."""
+        return SetInputMode(self.port, SensorType.NONE, Mode.RAW)
+
+
+def _require_sense(values: InputValues) -> None:
+    """Refuse values that the firmware never sends: it says each reading four times, converted in one go.
+
+    The radio line has no checksum that this program could see. A byte that was changed on its way breaks the
+    agreement of the four, or changes nothing that is used.
+    """
+    if values.valid not in (0, 1) or values.calibrated or values.raw > AD_MAX:
+        raise TelegramError(
+            f"input {values.port + 1} says valid {values.valid}, calibrated {values.calibrated}, {values.raw} counts; "
+            f"allowed: 0 or 1, 0, 0 to {AD_MAX}"
+        )
+    is_light = values.type in (SensorType.LIGHT_ACTIVE, SensorType.LIGHT_INACTIVE) and values.mode == Mode.RAW
+    if (
+        values.valid
+        and is_light
+        and {values.normalized, values.scaled, values.calibrated_value} != {normalized_of(values.raw)}
+    ):
+        raise TelegramError(
+            f"input {values.port + 1} says {values.raw} counts, and converted {values.normalized}, {values.scaled} and "
+            f"{values.calibrated_value}; allowed: {normalized_of(values.raw)} three times"
+        )

@@ -3,17 +3,19 @@
 Order on the line is kept, so one rule makes answers certain. A command whose answer did not
 come stays *owed*; before anything else is asked, the line is drained and a fence is put up: a
 harmless question with another opcode. When its answer comes, whatever was owed has either been
-read and dropped or will never come. So a late answer is never taken for the next one's.
+read and dropped or will never come. So a late answer is never taken for the next one's. The same
+is done where something lies on the line before a question is sent: an answer that came twice, say.
 """
 
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from probewise.arm.basics import Clock
+from probewise.arm.nxt.status import BrickError
 from probewise.arm.nxt.telegram import (
     LONGEST,
     GetBatteryLevel,
@@ -21,20 +23,18 @@ from probewise.arm.nxt.telegram import (
     KeepAlive,
     Reply,
     Request,
-    Sent,
     decode,
     encode,
     framed,
 )
-from probewise.arm.nxt.wire import Packed, TelegramError
+from probewise.arm.nxt.wire import Answer, TelegramError
 from probewise.errors import LinkError, ParameterError
 
 __all__ = ["ByteStream", "Link", "NoAnswerError", "Timing"]
 
-R = TypeVar("R", bound=Packed)
+A = TypeVar("A", bound=Answer)
 
-FENCES: tuple[Request[Packed], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
-N_PARKED = 32
+FENCES: tuple[Request[Answer], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
 UNKNOWN = -1  # whatever another program asked before this one began
 
 
@@ -88,7 +88,7 @@ class Timing:
     keep_awake_s
         The brick is told to stay awake at least as often as this, or a third of its limit.
     n_repeats
-        How often a question that went unanswered is asked again, where asking twice does no harm.
+        How often a question without a good answer is asked again, where asking twice does no harm.
     """
 
     answer_s: float = 2.0
@@ -132,16 +132,12 @@ class Link:
 
     Attributes
     ----------
-    unasked
-        Telegrams that came without having been asked for, the latest 32, undecoded: a program on the
-        brick may send some.
     n_asked, n_told
         How many questions were sent, and how many commands without an answer.
     """
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
         self._stream, self._clock, self._timing = stream, clock, timing
-        self.unasked: deque[bytes] = deque(maxlen=N_PARKED)
         self.n_asked = self.n_told = 0
         self._owed = {UNKNOWN}
         self._free_at = clock.monotonic()
@@ -152,10 +148,18 @@ class Link:
         """What the line is called."""
         return self._stream.name
 
-    def ask(self, request: Request[R]) -> R:
+    def ask(self, request: Request[A], *, check: Callable[[A], None] | None = None) -> A:
         """Send a command and return the answer.
 
-        A command that may be repeated is, where no answer comes; any other is sent once.
+        A command that may be repeated is, where no answer comes, a garbled one, or a refusal; any other is
+        sent once.
+
+        Parameters
+        ----------
+        request
+            The command.
+        check
+            Raises TelegramError where the answer cannot be true; None: any is taken.
 
         Raises
         ------
@@ -171,16 +175,24 @@ class Link:
         self.keep_awake()
         for n_left in reversed(range(1 + self._timing.n_repeats if request.repeatable else 1)):
             try:
-                if self._owed:
+                self._await_turn()
+                if self._owed or self._stream.read(LONGEST, 0.0):
                     self._clear()
-                return request.answer(self._exchange(request))
+                answer = request.answer(self._exchange(request))
+                if check is not None:
+                    check(answer)
             except (NoAnswerError, TelegramError):
                 self._owed.add(request.OPCODE)
                 if not n_left:
                     raise
+            except BrickError:
+                if not n_left:
+                    raise
+            else:
+                return answer
         raise AssertionError("a question is asked at least once")  # pragma: no cover
 
-    def tell(self, request: Request[R]) -> None:
+    def tell(self, request: Request[A]) -> None:
         """Send a command without wanting an answer; whether the brick took it is not known."""
         self._send(encode(request, wants_reply=False))
         self.n_told += 1
@@ -203,7 +215,7 @@ class Link:
         """Let go of the line."""
         self._stream.close()
 
-    def _exchange(self, request: Request[R]) -> Reply:
+    def _exchange(self, request: Request[A]) -> Reply:
         """Send a command and wait for its reply; until that is here it is owed, whatever happens."""
         self._owed.add(request.OPCODE)
         self._send(encode(request))
@@ -237,29 +249,33 @@ class Link:
             pass
 
     def _send(self, telegram: bytes) -> None:
+        self._await_turn()
+        self._stream.write(framed(telegram))
+
+    def _await_turn(self) -> None:
         wait_s = self._free_at - self._clock.monotonic()
         if wait_s > 0:
             self._clock.sleep(wait_s)
-        self._stream.write(framed(telegram))
 
-    def _reply_to(self, request: Request[R], deadline: float) -> Reply:
+    def _reply_to(self, request: Request[A], deadline: float) -> Reply:
         while True:
             telegram = self._frame(request, deadline)
-            content = _decoded(telegram)
-            if not isinstance(content, Reply):
-                self.unasked.append(telegram)
-            elif content.opcode == request.OPCODE:
-                return content
-            elif content.opcode not in self._owed:
-                raise TelegramError(f"a reply to opcode {content.opcode:02X} came, which was not asked for")
+            try:
+                reply = decode(telegram)
+            except TelegramError:
+                continue  # a program on the brick may send something of its own
+            if reply.opcode == request.OPCODE:
+                return reply
+            if reply.opcode not in self._owed:
+                raise TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")
 
-    def _frame(self, request: Request[R], deadline: float) -> bytes:
+    def _frame(self, request: Request[A], deadline: float) -> bytes:
         length = int.from_bytes(self._exactly(2, request, deadline), "little")
         if not 2 <= length <= LONGEST:
             raise TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {LONGEST}")
         return self._exactly(length, request, deadline)
 
-    def _exactly(self, size: int, request: Request[R], deadline: float) -> bytes:
+    def _exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
         """Read so many bytes, in whatever pieces they come."""
         got = b""
         while len(got) < size:
@@ -271,11 +287,3 @@ class Link:
                 )
             got += self._stream.read(size - len(got), left_s)
         return got
-
-
-def _decoded(telegram: bytes) -> Sent | Reply | None:
-    """Read a telegram; None where it is of a kind that the brick may send and nobody here understands."""
-    try:
-        return decode(telegram)
-    except TelegramError:
-        return None

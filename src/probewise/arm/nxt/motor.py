@@ -5,6 +5,9 @@ stands; at the target it lets go, and the motor runs on, *coasts*, by some count
 target is kept track of here, the coast is learned by direction and power, and every move is
 worked out from the count that was read last: a fast move that stops short, slow ones for the
 rest, always arriving from the same side, so that the play in the gears always lies on the same flank.
+
+No telegram has a checksum. A state that surprises is therefore asked for again, and believed once two in a
+row say the same.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from typing import TypeAlias
 
 from probewise.arm.basics import Clock, Side
 from probewise.arm.nxt.link import Link, NoAnswerError
+from probewise.arm.nxt.status import BrickError
 from probewise.arm.nxt.telegram import (
     GetOutputState,
     OutputMode,
@@ -38,6 +42,8 @@ STUCK, BEYOND = "is stuck at", "runs on beyond its goal, to"
 FAINT_POWER = 1  # a motor needs some 8 to overcome its own friction
 BRAKED = OutputMode.ON | OutputMode.BRAKE
 DRIVEN = BRAKED | OutputMode.REGULATED
+N_ASKED = 6  # so often at most, until two states in a row say the same
+N_UNTAKEN = 3  # so many moves in a row that the brick does not take end it
 
 
 class MotorError(LinkError):
@@ -127,7 +133,8 @@ class Motor:
         self.drive = Drive() if drive is None else drive
         self.last_counts = 0
         self._target: int | None = None  # the firmware's, in rotation counts; None: not known
-        self._datum: int | None = None  # tacho counter minus rotation counter
+        self._datum: tuple[int, int] | None = None  # tacho counter minus rotation and minus block counter
+        self._n_untaken = 0  # moves in a row
         self._arrived: Side | None = None  # from which side it came to where it stands
         self._coast: dict[tuple[int, Side], float] = {}
 
@@ -146,7 +153,7 @@ class Motor:
         self._link.ask(ResetMotorPosition(self.port, 0))
         if self._target is not None:
             self._target -= state.rotation_counts
-        self._datum = state.tacho_counts
+        self._datum = state.tacho_counts, state.tacho_counts - state.block_counts
 
     def hold(self) -> None:
         """Keep it where it is, against a load."""
@@ -178,9 +185,9 @@ class Motor:
             If it does not get there.
         """
         here = self.counts()
-        if self._target is None:
-            here = self._synchronise()
         for _ in range(self.drive.n_moves):
+            if self._target is None:
+                here = self._synchronise()
             ahead = side * (goal - here)
             if abs(ahead) <= self.drive.tolerance_counts and self._arrived == side:
                 return here
@@ -229,7 +236,7 @@ class Motor:
         gently = SetOutputState(self.port, power, BRAKED, Regulation.IDLE, 0, RunState.RUNNING, farthest)
         while not self._start(start + side * farthest, side, gently):
             start = self._synchronise()
-        trouble = self._await_idle(start, side * (farthest + self.drive.runaway_counts))
+        trouble = self._await_idle(start, side * (farthest + self.drive.runaway_counts), start + side * farthest)
         here = self.rest()
         self._target = None  # it lies behind the stop
         if trouble != STUCK:
@@ -279,7 +286,7 @@ class Motor:
         if not self._start(target, side, self._command(side * power, side * (target - self._known_target))):
             return self.rest()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
-        trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here)
+        trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, target)
         here = self.rest()
         if trouble:
             self._target = None
@@ -287,17 +294,32 @@ class Motor:
                 f"motor {self.letter} {trouble} {here} counts at power {power}; is it plugged in, and its way free?"
             )
         ran_on = side * (here - target)
+        if ran_on < -self.drive.tolerance_counts:
+            self._target = None  # it stopped short of the target, which must lie elsewhere
+            return here
         learned = self._coast.get((power, side), ran_on)
         self._coast[power, side] = (learned + ran_on) / 2
         return here
 
     def _start(self, target: int, side: Side, command: SetOutputState) -> bool:
-        """Order a limited move, once and no more; tell whether the brick took it."""
+        """Order a limited move, once and no more; tell whether the brick took it.
+
+        Raises
+        ------
+        LinkError
+            If it took none of several in a row.
+        """
         try:
             self._link.ask(command)
-        except (NoAnswerError, TelegramError):
-            if self._state().limit_counts != command.limit_counts:
+        except (NoAnswerError, TelegramError, BrickError) as error:
+            # Holding sets the limit to 0 after every move: this one's is the brick's own word that it took it.
+            took = self._state(lambda state: False).limit_counts == command.limit_counts
+            if not took or self._target is None:
+                self._n_untaken += 1
+                if self._n_untaken >= N_UNTAKEN:
+                    raise error
                 return False
+        self._n_untaken = 0
         self._target = target
         self._arrived = side
         return True
@@ -308,19 +330,29 @@ class Motor:
         It is driven with a power that does not turn it, so that nothing happens if the line dies here, and
         that sending it twice does no harm.
         """
+
+        def is_faint(state: OutputState) -> bool:
+            return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RunState.RUNNING, 0)
+
         faint = SetOutputState(self.port, FAINT_POWER, BRAKED, Regulation.IDLE, 0, RunState.RUNNING, 0)
         self._link.ask(faint)
         self._clock.sleep(self.drive.settle_s)
-        state = self._state()
-        if (state.power, state.run_state, state.limit_counts) != (FAINT_POWER, RunState.RUNNING, 0):
+        state = self._state(is_faint)
+        if not is_faint(state):
             raise MotorError(f"motor {self.letter} is not driven as it was told; does a program run on the brick?")
         self._target = state.rotation_counts
         return self.rest()
 
-    def _await_idle(self, start: int, farthest: int) -> str:
+    def _await_idle(self, start: int, farthest: int, target: int) -> str:
         """Wait for a limited move to end; say what is wrong where it sticks, or goes farther than it may."""
+        side = 1 if farthest > 0 else -1
+
+        def is_likely(state: OutputState) -> bool:
+            # The firmware lets go of a motor at its target and not before.
+            return state.run_state == RunState.RUNNING or side * (state.rotation_counts - target) >= 0
+
         here, changed_at = start, self._clock.monotonic()
-        while (state := self._state()).run_state != RunState.IDLE:
+        while (state := self._state(is_likely)).run_state != RunState.IDLE:
             now = self._clock.monotonic()
             if state.rotation_counts != here:
                 here, changed_at = state.rotation_counts, now
@@ -330,14 +362,38 @@ class Motor:
                 return STUCK
         return ""
 
-    def _state(self) -> OutputState:
-        state = self._link.ask(GetOutputState(self.port))
+    def _state(self, is_likely: Callable[[OutputState], bool] = lambda state: True) -> OutputState:
+        """Ask what the motor is doing; where that is not likely, or a counter jumped, until two in a row agree.
+
+        A byte that was changed on its way shifts one of the three counters against the others.
+        """
+        state, before = self._asked(), None
+        n_asked = 1
+        while (_datum_of(state) != self._datum or not is_likely(state)) and _essence(state) != before:
+            if n_asked == N_ASKED:
+                raise MotorError(
+                    f"motor {self.letter} is told of differently each of {N_ASKED} times; is the brick near?"
+                )
+            before, state = _essence(state), self._asked()
+            n_asked += 1
         self.last_counts = state.rotation_counts
-        datum = state.tacho_counts - state.rotation_counts
-        if datum != self._datum:
+        if _datum_of(state) != self._datum:
             # Somebody else set a counter back: what was known of the target is void.
-            self._target, self._datum = None, datum
+            self._target, self._datum = None, _datum_of(state)
         return state
+
+    def _asked(self) -> OutputState:
+        return self._link.ask(GetOutputState(self.port))
 
     def _command(self, power: int, limit: int) -> SetOutputState:
         return SetOutputState(self.port, power, DRIVEN, Regulation.SPEED, 0, RunState.RUNNING, limit)
+
+
+def _datum_of(state: OutputState) -> tuple[int, int]:
+    """Return how far the counters are apart, which no turning changes."""
+    return state.tacho_counts - state.rotation_counts, state.tacho_counts - state.block_counts
+
+
+def _essence(state: OutputState) -> tuple[object, ...]:
+    """Return all that two states of a motor that turns have in common."""
+    return _datum_of(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from probewise.errors import LinkError
 
-__all__ = ["MEANINGS", "BrickError", "NotYetError", "error_of"]
+__all__ = ["MEANINGS", "OK", "BrickError"]
 
 OK = 0x00
 
@@ -50,8 +50,6 @@ MEANINGS: Mapping[int, str] = {
 }
 """Status bytes by what they mean; 00 is success."""
 
-NOT_YET = (0x20, 0x40)
-
 
 class BrickError(LinkError):
     """Report that the brick refused a command; `status` is its status byte."""
@@ -63,12 +61,3 @@ class BrickError(LinkError):
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.command, self.status)
-
-
-class NotYetError(BrickError):
-    """Report that there is nothing yet: an I2C transaction under way, an empty mailbox. Ask again."""
-
-
-def error_of(command: str, status: int) -> BrickError:
-    """Make the error for a status that is not 00."""
-    return (NotYetError if status in NOT_YET else BrickError)(command, status)

@@ -127,7 +127,8 @@ class PaperMotor:
 class PaperBrick:
     """A brick that does what its telegrams say, after 60 ms; `lose` says what befalls the n-th one sent.
 
-    Its value is "command" (never arrives) or "answer" (never comes back).
+    Its value is "command" (never arrives) or "answer" (never comes back). `alter[n]` changes the n-th answer,
+    `statuses` has the status of each opcode that is refused.
     """
 
     clock: Clock
@@ -135,6 +136,9 @@ class PaperBrick:
     motors: tuple = field(default_factory=lambda: (PaperMotor(), PaperMotor(), PaperMotor()))
     raw_counts: int = 500
     lose: dict = field(default_factory=dict)
+    alter: dict = field(default_factory=dict)
+    statuses: dict = field(default_factory=lambda: {0x11: 0xEC})  # no program runs
+    millivolt: int = 7412
     commands: list = field(default_factory=list)
     input: list = field(default_factory=lambda: [0, 0, 0.0])  # type, mode, valid from
     coming: list = field(default_factory=list)
@@ -145,13 +149,15 @@ class PaperBrick:
         if self.is_cut:
             raise LinkError("the line is cut")
         lost = self.lose.pop(len(self.commands), None)
+        alter = self.alter.pop(len(self.commands), bytes)
         assert int.from_bytes(data[:2], "little") == len(data) - 2
         self.commands.append(data[2:])
         if lost == "command":
             return
-        body = self.carry_out(data[3], data[4:])
+        status = self.statuses.get(data[3], 0)
+        body = b"" if status else self.carry_out(data[3], data[4:])
         if not data[2] & 0x80 and lost != "answer":
-            answer = bytes([2, data[3], 0]) + body
+            answer = alter(bytes([2, data[3], status]) + body)
             self.coming.append((self.clock.now_s + 0.06, len(answer).to_bytes(2, "little") + answer))
 
     def carry_out(self, opcode, body):
@@ -183,7 +189,14 @@ class PaperBrick:
             shown = 1023 - min(max(raw - 200, 0) * 100 // 68, 1023)  # LEGO's firmware, types 05 and 06 in mode 00
             words = [raw, shown, shown, shown]
             return bytes([body[0], valid, 0, *self.input[:2]]) + b"".join(word.to_bytes(2, "little") for word in words)
-        return {0x0B: b"\xf4\x1c", 0x0D: b"\xc0\x27\x09\x00", 0x88: b"\x7c\x01\x1f\x01"}[opcode]
+        if opcode == 0x0B:
+            return self.millivolt.to_bytes(2, "little")
+        return {
+            0x11: b"dance.rxe".ljust(20, b"\0"),
+            0x9B: b"ARM1".ljust(30, b"\0"),
+            0x0D: b"\xc0\x27\x09\x00",
+            0x88: b"\x7c\x01\x1f\x01",
+        }[opcode]
 
     def read(self, size, timeout_s):
         end = self.clock.now_s + timeout_s

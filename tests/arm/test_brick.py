@@ -5,8 +5,18 @@ import sys
 
 import pytest
 
-from probewise.arm.nxt import Brick, Light, LightReading, Link, SensorError, SerialPort, normalized_of
-from probewise.errors import LinkError, ParameterError
+from probewise.arm.nxt import (
+    Brick,
+    BrickError,
+    Light,
+    LightReading,
+    Link,
+    SensorError,
+    SerialPort,
+    TelegramError,
+    normalized_of,
+)
+from probewise.errors import LinkError, LowBatteryWarning, ParameterError
 
 ALL_COAST = bytes.fromhex("04 FF" + 9 * " 00")
 
@@ -75,20 +85,137 @@ def test_a_sensor_that_never_becomes_valid_is_told_of(paper_brick, clock):
         light.read()
 
 
+def changed(at, byte):
+    """Put another byte into an answer."""
+    return lambda answer: answer[:at] + bytes([byte]) + answer[at + 1 :]
+
+
+# Bytes 0 to 2 are type, opcode and status; 3 port, 4 valid, 5 calibrated, 6 type, 7 mode, then four words.
+@pytest.mark.parametrize("at", range(3, 16))
+@pytest.mark.parametrize("byte", [0x03, 0x7F, 0xFF])
+def test_a_byte_of_a_reading_that_was_changed_on_its_way_changes_no_reading(brick, paper_brick, at, byte):
+    light = brick.light(1)
+    assert light.read().raw_counts == 500
+    paper_brick.alter[len(paper_brick.commands)] = changed(at, byte)
+    assert light.read().normalized == normalized_of(500)
+
+
+def test_a_sensor_beyond_its_converter_s_range_is_a_link_error(brick, paper_brick, clock):
+    """It keeps the run: see `test_runs`. The question is asked three times, then given up."""
+    paper_brick.raw_counts = 1024
+    light = brick.light(1)
+    light.light_up()
+    clock.sleep(1.0)
+    before = len([body for body in paper_brick.commands if body[1] == 0x07])
+    with pytest.raises(TelegramError, match=r"input 2 says .* 1024 counts; allowed: 0 or 1, 0, 0 to 1023"):
+        light.read()
+    assert len([body for body in paper_brick.commands if body[1] == 0x07]) - before == 3
+
+
+def test_a_sensor_whose_values_disagree_is_a_link_error(brick, paper_brick, clock):
+    carry_out = paper_brick.carry_out
+
+    def disagreeing(opcode, body):
+        answer = carry_out(opcode, body)
+        return answer[:-2] + b"\0\0" if opcode == 0x07 else answer
+
+    paper_brick.carry_out = disagreeing
+    light = brick.light(1)
+    light._type = 5
+    paper_brick.input = [5, 0, 0.0]
+    with pytest.raises(TelegramError, match="500 counts, and converted 582, 582 and 0; allowed: 582 three times"):
+        light.read()
+
+
 def test_the_battery_is_read_in_millivolt(brick):
     assert brick.battery_mv() == 7412
 
 
-def test_leaving_the_block_stops_and_releases_the_motors(brick, paper_brick):
+def test_a_voltage_that_jumps_is_believed_when_it_is_told_twice(brick, paper_brick):
+    brick.battery_mv()
+    paper_brick.alter[len(paper_brick.commands)] = changed(4, 0x10)
+    assert brick.battery_mv() == 7412
+    paper_brick.millivolt = 6900
+    before = len(paper_brick.commands)
+    assert brick.battery_mv() == 6900
+    assert brick.battery_mv() == 6900
+    assert len(paper_brick.commands) - before == 3
+
+
+def test_a_voltage_that_is_another_every_time_is_told_of(brick, paper_brick):
+    carry_out = paper_brick.carry_out
+
+    def wild(opcode, body):
+        paper_brick.millivolt += 100
+        return carry_out(opcode, body)
+
+    paper_brick.carry_out = wild
+    with pytest.raises(LinkError, match="another battery voltage each of 6 times"):
+        brick.battery_mv()
+
+
+def test_a_battery_below_6_volts_is_warned_of_once(brick, paper_brick):
+    paper_brick.millivolt = 6000
+    assert brick.battery_mv() == 6000
+    paper_brick.millivolt = 5990
+    with pytest.warns(LowBatteryWarning, match=r"the NXT's battery is at 5\.99 V, below 6 V: motors slow down"):
+        assert brick.battery_mv() == 5990
+    paper_brick.millivolt = 5980
+    assert brick.battery_mv() == 5980
+
+
+def test_the_brick_says_who_it_is_and_what_runs_on_it(brick, paper_brick):
+    assert brick.name() == "ARM1"
+    assert (brick.version().firmware_major, brick.version().firmware_minor) == (1, 31)
+    assert brick.program() is None
+    paper_brick.statuses = {}
+    assert brick.program() == "dance.rxe"
+    paper_brick.statuses = {0x11: 0xFB}
+    with pytest.raises(BrickError, match="out of memory"):
+        brick.program()
+
+
+def test_leaving_the_block_stops_and_releases_the_motors_and_switches_the_led_off(brick, paper_brick):
+    """Each once without an answer, which needs nothing to be heard, and once to be sure."""
     with brick:
         brick.motor(0).move_to(500, 1)
         brick.light(2).light_up()
-    stops = [body for body in paper_brick.commands if body[1:] == ALL_COAST]
-    # Once without an answer, which needs nothing to be heard, and once to be sure.
-    assert [body[0] for body in stops] == [0x80, 0x00]
-    assert paper_brick.input[0] == 0  # and the LED is off
+    dark = bytes.fromhex("05 02 00 00")
+    ends = [(body[0], body[1:]) for body in paper_brick.commands[-4:]]
+    assert ends == [(0x80, ALL_COAST), (0x80, dark), (0x00, ALL_COAST), (0x00, dark)]
+    assert paper_brick.input[0] == 0
     assert not paper_brick.is_open
     assert paper_brick.at_rest
+
+
+@pytest.mark.parametrize("refused", [0x04, 0x05])
+def test_a_refusal_of_one_end_keeps_nothing_from_the_other(brick, paper_brick, refused):
+    def run():
+        with brick:
+            brick.light(2).light_up()
+            paper_brick.motors[1].command(100.0, 50, 0x20, 0)
+            paper_brick.statuses = {refused: 0xDE}
+
+    with pytest.raises(BrickError, match="DE"):
+        run()
+    assert paper_brick.at_rest == (refused != 0x04)
+    assert (paper_brick.input[0] == 0) == (refused != 0x05)
+    assert not paper_brick.is_open
+
+
+def test_motors_and_led_are_off_also_where_no_answer_comes(brick, paper_brick):
+    """What is told arrives, though nothing that is asked is answered."""
+
+    def run():
+        with brick:
+            brick.light(2).light_up()
+            paper_brick.motors[1].command(100.0, 50, 0x20, 0)
+            paper_brick.lose = dict.fromkeys(range(len(paper_brick.commands), 10**3), "answer")
+
+    with pytest.raises(LinkError, match="does not answer any more"):
+        run()
+    assert paper_brick.at_rest
+    assert paper_brick.input[0] == 0
 
 
 @pytest.mark.parametrize("error", [KeyError, KeyboardInterrupt, LinkError])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.arm.nxt import Drive, Link, Motor, MotorError, NoAnswerError
+from probewise.arm.nxt import BrickError, Drive, Link, Motor, MotorError, NoAnswerError
 from probewise.errors import LinkError, ParameterError, ReachError
 
 
@@ -105,6 +105,56 @@ def test_counters_that_somebody_else_set_back_are_noticed(motor, paper_brick):
     paper_brick.motors[0].zero = 400
     assert abs(motor.move_to(300, 1) - 300) <= 1
     assert paper_brick.n_sought == 2
+
+
+def changed(at, byte):
+    """Put another byte into an answer, of which bytes 0 to 2 are type, opcode and status."""
+    return lambda answer: answer[:at] + bytes([byte]) + answer[at + 1 :]
+
+
+@pytest.mark.parametrize("at", range(3, 25))
+@pytest.mark.parametrize("byte", [0x00, 0x5A, 0xFF])
+def test_a_byte_of_a_state_that_was_changed_on_its_way_moves_nothing_astray(motor, paper_brick, at, byte):
+    """Fields, three counters and run state, at every third of the questions that a move asks."""
+    motor.move_to(0, 1)
+    for goal in (600, 100):
+        for k in range(4):
+            paper_brick.alter[len(paper_brick.commands) + 3 * k] = lambda answer: (
+                changed(at, byte)(answer) if answer[1] == 0x06 else answer
+            )
+        highest = max(goal, paper_brick.motors[0].position)
+        assert abs(motor.move_to(goal, 1) - goal) <= 1
+        assert motor.last_counts == paper_brick.motors[0].position <= highest + 1
+
+
+def test_a_counter_that_is_another_every_time_is_told_of(motor, paper_brick):
+    motor.move_to(0, 1)
+    for k in range(20):
+        paper_brick.alter[len(paper_brick.commands) + k] = changed(22, k + 1)
+    with pytest.raises(MotorError, match="told of differently each of 6 times"):
+        motor.counts()
+
+
+def test_a_move_that_the_brick_refuses_is_worked_out_anew(motor, paper_brick):
+    """A status may lie: what the brick says of its motor decides whether it took the move."""
+    motor.move_to(0, 1)
+    paper_brick.alter[len(paper_brick.commands) + 1] = changed(2, 0xDE)  # it took it all the same
+    assert abs(motor.move_to(600, 1) - 600) <= 1
+    assert paper_brick.motors[0].position <= 601
+
+
+def test_a_brick_that_refuses_every_move_is_told_of(motor, paper_brick):
+    motor.move_to(0, 1)
+    write = paper_brick.write
+
+    def refusing(data):
+        paper_brick.statuses = {0x04: 0xDE} if data[3] == 0x04 and any(data[10:14]) else {}
+        write(data)
+
+    paper_brick.write = refusing
+    with pytest.raises(BrickError, match="SETOUTPUTSTATE with status DE"):
+        motor.move_to(600, 1)
+    assert abs(paper_brick.motors[0].position) <= 1
 
 
 def test_a_motor_in_whose_way_something_is_is_held_and_told_of(motor, paper_brick):

@@ -11,7 +11,7 @@ from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.calibration import FittedSensor, write_sensor
 from probewise.cli import main
 from probewise.errors import LinkError
-from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan
+from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
 from probewise.sensor import field_of, footprint_of
 
 DARK_COUNTS = 826  # 10 %
@@ -108,6 +108,32 @@ def test_a_recording_that_a_dead_line_ended_goes_on(bricks, plan_file, tmp_path,
     recording = read_recording(out)
     assert len(recording) == 13
     assert (np.diff(recording.plan.time_s) > 1).all()
+
+
+def test_a_light_value_out_of_range_ends_the_recording_and_keeps_it(bricks, plan_file, tmp_path, capsys, monkeypatch):
+    """It is a link error: exit 1, and --resume goes on."""
+    out = tmp_path / "rec.csv"
+    arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
+    monkeypatch.setattr("probewise.recordings.write_recording", then(write_recording, lambda: spoil(bricks)))
+    status, said = run(capsys, *arguments)
+    assert status == 1
+    assert "input 1 says valid 1, calibrated 0, 2000 counts; allowed: 0 or 1, 0, 0 to 1023" in said
+    assert "rec.csv keeps 1 of 13 readings; go on with --resume" in said
+    assert bricks["opened"][0].at_rest
+    monkeypatch.undo()
+    assert len(read_recording(out)) == 1
+
+
+def then(first, after):
+    def both(*arguments):
+        first(*arguments)
+        after()
+
+    return both
+
+
+def spoil(bricks):
+    bricks["opened"][-1].raw_counts = 2000
 
 
 def test_a_recording_goes_on_only_with_its_own_plan(bricks, plan_file, tmp_path, capsys):

@@ -3,6 +3,7 @@
 import pytest
 
 from probewise.arm import shipped_geometry
+from probewise.arm.nxt import Brick, Link
 from probewise.cli import main
 
 TASKS = [["jog", "300,200"], ["home"], ["read"], ["scan", "300,200", "310,200"], ["record", "paper"]]
@@ -26,6 +27,39 @@ def test_check_names_what_is_wrong_with_a_file(tmp_path, capsys):
     error = said(capsys, "arm", "check", "--geometry", path, status=2).err
     assert error.count("\n") == 1
     assert "mine.toml: joints.base.gear_ratio is 0.0" in error
+
+
+@pytest.fixture
+def at_port(paper_brick, clock, monkeypatch):
+    monkeypatch.setattr("probewise.cli.arm.open_brick", lambda port: Brick(Link(paper_brick, clock=clock), clock=clock))
+    return paper_brick
+
+
+def test_check_asks_a_brick_who_it_is_and_moves_nothing(at_port, capsys):
+    out = said(capsys, "arm", "check", "--arm", "nxt:x").out
+    assert "brick        ARM1, firmware 1.31, battery 7.41 V" in out
+    assert "light        56.89 % at port 1, 500 counts" in out
+    assert not at_port.drives()
+    assert not at_port.is_open
+
+
+@pytest.mark.filterwarnings("default::probewise.errors.LowBatteryWarning")
+def test_check_warns_of_an_empty_battery(at_port, capsys):
+    at_port.millivolt = 5900
+    told = said(capsys, "arm", "check", "--arm", "nxt:x")
+    assert "battery 5.90 V" in told.out
+    assert told.err.count("warning: the NXT's battery is at 5.90 V, below 6 V") == 1
+
+
+def test_check_tells_of_a_program_that_runs(at_port, capsys):
+    at_port.statuses = {}
+    assert "the program dance.rxe runs on the brick" in said(capsys, "arm", "check", "--arm", "nxt:x", status=1).err
+
+
+def test_check_of_a_simulated_arm_is_refused_before_anything_is_drawn(tmp_path, capsys):
+    arguments = ["arm", "check", "--arm", "simulated", "--out", tmp_path / "reach.png"]
+    assert "allowed: nxt:PORT" in said(capsys, *arguments, status=2).err
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_arm_that_reaches_no_place_of_its_field_is_no_arm(tmp_path, capsys):

@@ -15,8 +15,18 @@ from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, LegoArm
+    from probewise.arm.nxt import Brick
 
-__all__ = ["add_geometry", "asker", "geometry_of", "open_nxt", "parse_arm", "parse_place", "telling_what_is_kept"]
+__all__ = [
+    "add_geometry",
+    "asker",
+    "geometry_of",
+    "open_brick",
+    "open_nxt",
+    "parse_arm",
+    "parse_place",
+    "telling_what_is_kept",
+]
 
 AWAKE_S = 20.0  # how often a waiting program thinks of the brick's sleep timer
 
@@ -60,9 +70,16 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
 def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
     """Open the line to a brick, with the arm that hangs on it."""
     from probewise.arm import LegoArm
-    from probewise.arm.nxt import Brick, BrickMachine
+    from probewise.arm.nxt import BrickMachine
 
-    return LegoArm(BrickMachine(Brick.open(port), geometry), geometry, start_s=start_s)
+    return LegoArm(BrickMachine(open_brick(port), geometry), geometry, start_s=start_s)
+
+
+def open_brick(port: str) -> Brick:
+    """Open the line to a brick."""
+    from probewise.arm.nxt import Brick
+
+    return Brick.open(port)
 
 
 def asker(arm: LegoArm) -> Callable[[str], None]:

@@ -7,10 +7,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import add_geometry, asker, geometry_of, open_nxt, parse_arm, parse_place, telling_what_is_kept
+from probewise.cli._arm import (
+    add_geometry,
+    asker,
+    geometry_of,
+    open_brick,
+    open_nxt,
+    parse_arm,
+    parse_place,
+    telling_what_is_kept,
+)
 from probewise.cli._common import OneLineParser, Verb, a_path, add_quiet, positive_int, say
 from probewise.cli._output import check_out_file
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, LegoArm, Reading
@@ -25,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
     tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
 
-    check = _task(tasks, "check", "Check a geometry file; say and draw how far the arm reaches.")
+    check = _task(tasks, "check", "Check a geometry file, and a brick; say and draw how far the arm reaches.")
+    _add_arm(check)
     check.add_argument("--out", type=a_path, metavar="REACH.png", help="where the drawing goes (default: none is made)")
 
     jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
@@ -64,11 +74,15 @@ def _task(
 ) -> OneLineParser:
     parser = tasks.add_parser(name, help=summary, description=summary)
     if moves:
-        parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
+        _add_arm(parser)
         parser.add_argument("--dry-run", action="store_true", help="print the moves, from home, and make none")
     add_geometry(parser)
     add_quiet(parser)
     return parser
+
+
+def _add_arm(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -87,6 +101,7 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.report.plots import png, reach_map
 
     out = None if arguments.out is None else check_out_file(arguments.out)
+    port = None if arguments.arm is None else _port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
     held = geometry.holds(places)
@@ -107,6 +122,21 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
         standing = np.where(held, geometry.orientation_rad(places), np.nan).reshape(y_mm.size, x_mm.size)
         write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))
         say(f"drawn        {out}", quiet=arguments.quiet)
+    if port is not None:
+        _check_brick(port, geometry)
+
+
+def _check_brick(port: str, geometry: Geometry) -> None:
+    """Ask the brick who it is and whether it is fit to work; nothing moves."""
+    with open_brick(port) as brick:
+        version = brick.version()
+        firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
+        say(f"brick        {brick.name()}, firmware {firmware}, battery {brick.battery_mv() / 1000:.2f} V")
+        light = brick.light(geometry.sensor_port).read()
+        say(f"light        {light.fine_percent:.2f} % at port {geometry.sensor_port + 1}, {light.raw_counts} counts")
+        program = brick.program()
+        if program is not None:
+            raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
 
 
 def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
@@ -256,12 +286,14 @@ def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 
         return LegoArm(Rehearsal(geometry, say), geometry, start_s=start_s)
     if arguments.arm is None:
         raise ParameterError("--arm", None, "nxt:PORT such as nxt:/dev/rfcomm0; or --dry-run, to print the moves only")
-    port = parse_arm(arguments.arm)
+    return open_nxt(_port(arguments.arm), geometry, start_s=start_s)
+
+
+def _port(arm: str) -> str:
+    port = parse_arm(arm)
     if port is None:
-        raise ParameterError(
-            "--arm", arguments.arm, "nxt:PORT; a simulated arm has no bench, --dry-run prints the moves"
-        )
-    return open_nxt(port, geometry, start_s=start_s)
+        raise ParameterError("--arm", arm, "nxt:PORT; a simulated arm has no bench, --dry-run prints the moves")
+    return port
 
 
 def _asker(arguments: argparse.Namespace, arm: LegoArm) -> Callable[[str], None]:

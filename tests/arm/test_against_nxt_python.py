@@ -5,7 +5,7 @@ import pytest
 from probewise.arm.nxt import decode, encode
 from probewise.arm.nxt import telegram as t
 
-pytest.importorskip("nxt", reason="nxt-python is not installed: pip install 'probewise[test]'")
+pytest.importorskip("nxt", reason="nxt-python is not installed: pip install nxt-python")
 
 from nxt import motor, sensor
 from nxt.brick import Brick

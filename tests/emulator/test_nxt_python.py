@@ -19,7 +19,7 @@ import pytest
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals"),
     pytest.mark.skipif(
-        importlib.util.find_spec("nxt") is None, reason="nxt-python is not installed: pip install 'probewise[test]'"
+        importlib.util.find_spec("nxt") is None, reason="nxt-python is not installed: pip install nxt-python"
     ),
 ]
 

@@ -178,6 +178,13 @@ def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
     assert chance[best] == pytest.approx(by_importance(made, prospect, goal, best), abs=0.06)
 
 
+def test_the_label_of_a_map_names_the_one_quantity_that_it_shows(made):
+    """Near the end the default utility shows a probability, before that bits; a colour bar carries one of them."""
+    near = narrow(made, Goal((2,), 5.0))
+    assert utility_map(near, Finishing()).label == "probability that the run ends"
+    assert utility_map(replace(near, goal=None), Finishing()).label == InformationGain().label
+
+
 def by_importance(made, prospect, goal, design, n=4000):
     """Draw readings from every hypothesis, reweigh all by each, count how often the sds are small enough."""
     level = made.chain(20).predict(prospect.theta, prospect.plan.take(np.array([design])))[:, 0]

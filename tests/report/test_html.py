@@ -1,11 +1,12 @@
 """Pages are self-contained and escape what they are given."""
 
+import re
 from html.parser import HTMLParser
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, table
+from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, slideshow, table
 from probewise.report.words import count, number, probability, signed
 
 PNG = b"\x89PNG fake"
@@ -14,7 +15,7 @@ PNG = b"\x89PNG fake"
 class Reader(HTMLParser):
     """Collect text and addresses, and check that every element is closed in order."""
 
-    VOID = frozenset({"meta", "img", "br"})
+    VOID = frozenset({"meta", "img", "br", "input"})
 
     def __init__(self):
         super().__init__()
@@ -76,3 +77,24 @@ def test_numbers_are_written_as_people_read_them():
     assert signed(-0.01, 1) == "0.0"
     assert (count(1, "reading"), count(2, "reading")) == ("1 reading", "2 readings")
     assert (probability(1e-9), probability(0.5), probability(1.0)) == ("< 0.001", "0.500", "> 0.999")
+
+
+def test_many_sections_are_listed_with_links_that_lead_to_them():
+    sections = [Section(f"chapter {k}", (), (Section("first <part>", ()), Section("second part", ()))) for k in range(2)]
+    made = page("t", answer="a", key_figure=figure(PNG, "key"), sections=sections)
+    reader = read(made)
+    links = [address for address in reader.addresses if address.startswith("#")]
+    assert len(links) == 6
+    assert all(made.count(f'id="{link[1:]}"') == 1 for link in links)
+    assert "<h3>first &lt;part&gt;</h3>" in made
+    assert "<nav" not in page("t", answer="a", key_figure=figure(PNG, "key"), sections=sections[:1])
+
+
+def test_a_slideshow_shows_its_last_picture_where_scripts_are_off():
+    slides = [(PNG, "first"), (PNG, "second"), (PNG, "last")]
+    made = page("t", answer="a", key_figure=slideshow(slides, "steps"), sections=())
+    shown = [part.startswith("<div hidden") for part in re.findall(r'<div[^>]*class="slide"', made)]
+    assert shown == [True, True, False]
+    assert "<label hidden>" in made
+    assert made.count("<script>") == 1
+    assert "<script>" not in page("t", answer="a", key_figure=figure(PNG, "key"), sections=())

@@ -42,7 +42,8 @@ def _cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ParameterError("--scheduler", address, 'the extra: pip install "probewise[cluster]"') from error
+        allowed = "none without the package distributed; install it with: pip install distributed"
+        raise ParameterError("--scheduler", address, allowed) from error
     try:
         client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:

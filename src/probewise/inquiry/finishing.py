@@ -12,13 +12,14 @@ from probewise.inquiry.forecast import spread_levels, thinned
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
 
-__all__ = ["Finishing"]
+__all__ = ["CHANCE", "Finishing"]
 
 _NEAR = 15.0  # times the sd that is asked for: farther off than that no single reading ends a run
 _MOST_ASKED = 800  # hypotheses
 _MOST_DESIGNS = 250  # the best by the other utility
 _PER_SD = 2.0
 _LEAST = 1e-12
+CHANCE = "probability that the run ends"
 
 
 @dataclass(frozen=True)
@@ -45,21 +46,25 @@ class Finishing:
 
     @property
     def label(self) -> str:
-        """The other's, and what stands in its place near the end."""
-        return f"{self.of.label}, or chance to finish"
+        """The other's, and what stands in its place near the end; a map has the label of the one that it shows."""
+        return f"{self.of.label}, or {CHANCE}"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Value every design that can be taken, (n,): all by the one measure or all by the other."""
+        return self.valued(prospect)[0]
+
+    def valued(self, prospect: Prospect) -> tuple[FloatArray, str]:
+        """Value every design, (n,), and label the quantity that these values are."""
         worth = self.of(prospect)
         if prospect.goal is None or not _is_near(prospect, prospect.goal):
-            return worth
+            return worth, self.of.label
         best = np.argsort(-worth, kind="stable")[:_MOST_DESIGNS]
         chance = _ends(prospect, prospect.goal, best)
         if chance.max() < self.least:
-            return worth
+            return worth, self.of.label
         out = np.zeros(len(worth))
         out[best] = chance
-        return out
+        return out, CHANCE
 
 
 def _is_near(prospect: Prospect, goal: Goal) -> bool:

@@ -14,7 +14,7 @@ from probewise.inquiry.forecast import AskedForecast
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.prospect import Prospect
 from probewise.inquiry.readout import Readout
-from probewise.inquiry.utility import ReadingEntropy, Utility
+from probewise.inquiry.utility import ReadingEntropy, SwitchingUtility, Utility
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
@@ -29,12 +29,13 @@ class UtilityMap:
     """Hold the worth of each design.
 
     `values` has shape (n_designs,), bits where the utility is an entropy or an information, 0 where
-    `reachable` is False: nothing can be learned where the arm cannot go.
+    `reachable` is False: nothing can be learned where the arm cannot go. `label` names the quantity with its unit.
     """
 
     designs: Designs
     values: FloatArray
     reachable: BoolArray
+    label: str
 
     @property
     def grid(self) -> Grid:
@@ -83,7 +84,8 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
     ParameterError
         If one of its values is not finite.
     """
-    found = np.asarray(utility(prospect), dtype=np.float64)
+    valued, label = utility.valued(prospect) if isinstance(utility, SwitchingUtility) else (utility(prospect), None)
+    found = np.asarray(valued, dtype=np.float64)
     if found.shape != prospect.rows.shape:
         raise ShapeError(f"the utility gives {found.shape} values; allowed: {prospect.rows.shape}, one a design")
     values = np.zeros(len(prospect.designs))
@@ -91,7 +93,7 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
     values[prospect.rows], reachable[prospect.rows] = found, True
     best_places(values, reachable)  # raises where a value is not finite
     values.flags.writeable = False
-    return UtilityMap(prospect.designs, values, reachable)
+    return UtilityMap(prospect.designs, values, reachable, utility.label if label is None else label)
 
 
 def entropy_map(

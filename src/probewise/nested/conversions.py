@@ -121,6 +121,5 @@ def _optional(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         raise ImportError(
-            f"{name} cannot be imported ({error}); install it with: pip install {name}, "
-            "or pip install 'probewise[convert]'"
+            f"{name} is an optional package that cannot be imported ({error}); install it with: pip install {name}"
         ) from error

@@ -56,7 +56,7 @@ def view(
         levels=levels,
         next_mm=None if pose is None else (pose.x_mm, pose.y_mm),
         truth_mm=truth_mm,
-        utility_label=experiment.utility.label,
+        utility_label=step.map.label,
         title=title or f"after {count(step.number, 'reading')}, {number(step.bits, 1)} bits known",
         ax=ax,
     )

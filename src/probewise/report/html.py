@@ -7,7 +7,20 @@ import html
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-__all__ = ["Markup", "Section", "definition_list", "element", "figure", "fragment", "page", "paragraph", "table"]
+__all__ = [
+    "Markup",
+    "Section",
+    "definition_list",
+    "element",
+    "figure",
+    "fragment",
+    "page",
+    "paragraph",
+    "slideshow",
+    "table",
+]
+
+_FEWEST_LISTED = 4  # sections from which on a page has a list of contents
 
 
 class Markup(str):
@@ -18,15 +31,18 @@ class Markup(str):
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a page under its own heading."""
+    """One part of a page under its own heading; `parts` follow its body under headings a level lower."""
 
     heading: str
     body: tuple[Markup, ...]
+    parts: tuple[Section, ...] = ()
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
-    """Build one element; a trailing underscore of an attribute's name is dropped (`class_`)."""
-    written = "".join(f' {name.rstrip("_")}="{html.escape(value)}"' for name, value in attributes.items())
+    """Build one element; of an attribute's name a trailing underscore is dropped (`class_`), others are hyphens."""
+    written = "".join(
+        f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
+    )
     return Markup(f"<{tag}{written}>{fragment(*children)}</{tag}>")
 
 
@@ -61,16 +77,42 @@ def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
     """Embed a PNG or an SVG; the caption is the text for those who cannot see it unless `alt` is given."""
+    return element("figure", _image(image, alt or caption), element("figcaption", caption))
+
+
+def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
+    """Embed pictures of which a slider shows one; without scripts the last one is shown.
+
+    Parameters
+    ----------
+    slides
+        Picture and one line of text each, in order.
+    caption
+        What all of them show.
+    """
+    *earlier, last = (
+        element("div", _image(image, text), paragraph(text, class_="slide"), class_="slide") for image, text in slides
+    )
+    hidden = (Markup(shown.replace("<div", "<div hidden", 1)) for shown in earlier)
+    n = len(slides)
+    slider = Markup(
+        f'<label hidden>step <input type="range" min="1" max="{n}" value="{n}"> <output>{n} of {n}</output></label>'
+    )
+    return element("figure", slider, *hidden, last, element("figcaption", caption), class_="slideshow")
+
+
+def _image(image: bytes, alt: str) -> Markup:
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}">')
-    return element("figure", shown, element("figcaption", caption))
+    return Markup(f'<img src="{source}" alt="{html.escape(alt)}">')
 
 
 def page(
     title: str, *, answer: str, key_figure: Markup, sections: Sequence[Section], reload_s: int | None = None
 ) -> str:
     """Build a page whose first screen is the answer in one sentence and the picture that shows it.
+
+    Four sections or more are listed before the first, with links.
 
     Parameters
     ----------
@@ -88,7 +130,8 @@ def page(
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
         key_figure,
-        *(element("section", element("h2", s.heading), *s.body) for s in sections),
+        *_contents(sections),
+        *(_section(s, str(k), 2) for k, s in enumerate(sections, start=1)),
     )
     again = () if reload_s is None else (Markup(f'<meta http-equiv="refresh" content="{reload_s}">'),)
     head = fragment(
@@ -97,9 +140,47 @@ def page(
         element("title", title),
         element("style", Markup(_STYLE)),
     )
-    document = element("html", element("head", head), element("body", element("main", body)), lang="en")
+    script = (element("script", Markup(_SLIDER)),) if 'class="slideshow"' in body else ()
+    document = element("html", element("head", head), element("body", element("main", body), *script), lang="en")
     return f"<!doctype html>\n{document}\n"
 
+
+def _section(section: Section, number: str, level: int) -> Markup:
+    parts = (_section(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
+    heading = element(f"h{level}", section.heading)
+    return element("section", heading, *section.body, *parts, id=_address(number))
+
+
+def _contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
+    """List the sections and their parts, with links, where they are many."""
+    if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
+        return ()
+    entries = (_entry(s, str(k)) for k, s in enumerate(sections, start=1))
+    return (element("nav", element("ol", *entries), aria_label="contents"),)
+
+
+def _entry(section: Section, number: str) -> Markup:
+    parts = [_entry(part, f"{number}.{k}") for k, part in enumerate(section.parts, start=1)]
+    link = element("a", section.heading, href=f"#{_address(number)}")
+    return element("li", link, element("ol", *parts)) if parts else element("li", link)
+
+
+def _address(number: str) -> str:
+    return f"part-{number.replace('.', '-')}"
+
+
+# The slider is hidden until this has run: where scripts are off the last slide stands alone.
+_SLIDER = """
+for (const show of document.querySelectorAll("figure.slideshow")) {
+  const slides = show.querySelectorAll("div.slide"), label = show.querySelector("label");
+  const slider = label.querySelector("input"), said = label.querySelector("output");
+  label.hidden = false;
+  slider.addEventListener("input", () => {
+    slides.forEach((slide, k) => { slide.hidden = k !== slider.value - 1; });
+    said.value = `${slider.value} of ${slides.length}`;
+  });
+}
+"""
 
 _STYLE = """
 :root { color-scheme: light; --ink: #1b1b1b; --soft: #5a5a5a; --line: #d8d8d8; --paper: #ffffff; --accent: #0072b2; }
@@ -108,6 +189,13 @@ body { margin: 0; background: var(--paper); color: var(--ink); font: 16px/1.55 s
 main { max-width: 60rem; margin: 0 auto; padding: 1rem 1.1rem 4rem; }
 h1 { font-size: 1.05rem; font-weight: 600; color: var(--soft); margin: .3rem 0 0; }
 h2 { font-size: 1.25rem; margin: 2.4rem 0 .5rem; border-top: 1px solid var(--line); padding-top: 1.1rem; }
+h3 { font-size: 1.02rem; margin: 1.6rem 0 .3rem; }
+nav { margin: 1.4rem 0; padding: .7rem 1rem .8rem; background: #f5f5f5; }
+nav > ol { columns: 2 20rem; margin: 0; padding-left: 1.2rem; } nav li { break-inside: avoid; font-weight: 600; }
+nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; } nav ol ol li { font-weight: 400; font-size: .95rem; }
+a { color: var(--accent); }
+.slideshow label:not([hidden]) { display: flex; gap: .8rem; align-items: center; margin-bottom: .4rem; }
+.slideshow input { flex: 1; max-width: 34rem; } p.slide { margin: .2rem 0; font-variant-numeric: tabular-nums; }
 p.answer { font-size: 1.45rem; line-height: 1.3; font-weight: 600; margin: .3rem 0 1rem; max-width: 46rem; }
 figure { margin: .8rem 0 1.2rem; }
 figure img { display: block; max-width: 100%; height: auto; }
@@ -122,7 +210,14 @@ dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
 @media (max-width: 34rem) {
-  p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
+  h3 { font-size: 1.02rem; margin: 1.6rem 0 .3rem; }
+nav { margin: 1.4rem 0; padding: .7rem 1rem .8rem; background: #f5f5f5; }
+nav > ol { columns: 2 20rem; margin: 0; padding-left: 1.2rem; } nav li { break-inside: avoid; font-weight: 600; }
+nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; } nav ol ol li { font-weight: 400; font-size: .95rem; }
+a { color: var(--accent); }
+.slideshow label:not([hidden]) { display: flex; gap: .8rem; align-items: center; margin-bottom: .4rem; }
+.slideshow input { flex: 1; max-width: 34rem; } p.slide { margin: .2rem 0; font-variant-numeric: tabular-nums; }
+p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
   figure { overflow-x: auto; } figure img[src^="data:image/svg"] { min-width: 42rem; max-width: none; }
 }
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }

@@ -34,7 +34,7 @@ class SerialPort:
             import serial
         except ImportError as error:
             raise LinkError(
-                "the NXT needs pyserial, which is not installed; pip install 'probewise[nxt]' brings it"
+                "the NXT needs pyserial, which is not installed; install it with: pip install pyserial"
             ) from error
         # A radio serial port has no baud rate; a pseudo-terminal on some systems refuses exclusive locks.
         try:

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probewise.cli._common import Verb, add_common, add_out_directory, say
 from probewise.cli._output import check_out_directory, staged
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
+    from collections.abc import Iterable
+    from concurrent.futures import Executor, Future
 
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model
+    from probewise.report.demo import Search
     from probewise.scene import Circle
 
 __all__ = ["VERB"]
 
 MODELS: tuple[Model, ...] = ("naive", "ssf")
+MODEL_NAMES: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
 N_LIVE = 100  # of the calibration; --full takes the paper's 300
 N_LIVE_ROBOT = 100
 MAX_READINGS = 80
@@ -34,19 +37,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Calibrate, search twice, diagnose, report."""
+    """Calibrate, search, diagnose, report."""
     import time
 
     import numpy as np
     from tqdm import tqdm
 
+    from probewise.arm import read_geometry, shipped_geometry
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
     from probewise.cli._workers import workers
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
-    from probewise.scene import outlines
     from probewise.world.shipped import truth as world_behind
 
     started = time.monotonic()
@@ -55,36 +58,30 @@ def run(arguments: argparse.Namespace) -> int:
     truth = hidden_circle(seed)
     with (
         workers(2) as pool,
-        tqdm(total=4, desc="demo", unit=" part", disable=True if arguments.quiet else None) as bar,
+        tqdm(total=6, desc="demo", unit=" part", disable=True if arguments.quiet else None) as bar,
     ):
         diagnosing = pool.submit(_diagnose, seed)
         calibration = _calibrate(seed, arguments.full, pool)
         bar.update()
-        searching = [pool.submit(_search, calibration.sensor, model, truth, seed) for model in MODELS]
-        diagnosis = diagnosing.result()
-        bar.update()
-        runs = []
-        for future in searching:
-            runs.append(future.result())
+        sensor = calibration.sensor
+        starting = [pool.submit(start_alike, sensor, model, truth, seed) for model in MODELS]
+        searching = [pool.submit(_search, sensor, model, truth, seed) for model in MODELS]
+        parts: tuple[Future[Any], ...] = (diagnosing, *starting, *searching)
+        for future in parts:
+            future.result()
             bar.update()
+    diagnosis, alike = diagnosing.result(), [future.result() for future in starting]
+    runs, frames = zip(*(future.result() for future in searching), strict=True)
     recording = read_recording(shipped("paper"))
-    sensor = calibration.sensor
     prediction = predict(sensor, recording.plan, recording.readings)
-    means = sensor.mean()
-    circle = hypothesis()
-    searches = [
-        report.Search(
-            {"naive": "naive", "ssf": "SSF"}[model],
-            run,
-            dict(zip(circle.prior.names, truth, strict=True)),
-            outlines(circle.region(np.array([truth])))[0],
-            (means["I_min"], means["I_max"]),
-        )
-        for model, run in zip(MODELS, runs, strict=True)
-    ]
-    drawn = report.figures(calibration, recording, prediction, searches)
-    diagnosis_drawn = diagnosis_report.figures(diagnosis)
+    searches, started_alike = as_searches(sensor, runs, truth), as_searches(sensor, alike, truth)
+    drawn = report.figures(
+        calibration, recording, prediction, searches, started_alike, read_geometry(shipped_geometry())
+    )
+    drawn |= report.diagnosis_figures(diagnosis)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
+    witnesses = diagnosis_report.figures(diagnosis)
+    diagnosis_page = diagnosis_report.write_page(diagnosis, witnesses, source="concealed.csv", seed=seed)
     seconds = time.monotonic() - started
     with staged(out) as stage:
         write_sensor(sensor, stage / "sensor.json")
@@ -92,26 +89,45 @@ def run(arguments: argparse.Namespace) -> int:
             (stage / name).write_bytes(png)
         (stage / "diagnosis").mkdir()
         rng = np.random.default_rng([seed, 3])
-        diagnose_verb.write_results(diagnosis, diagnosis_drawn, stage / "diagnosis", rng=rng)
+        diagnose_verb.write_results(diagnosis, witnesses, stage / "diagnosis", rng=rng)
+        (stage / "diagnosis" / "report.html").write_text(diagnosis_page, encoding="utf-8")
         page = report.write_page(
             calibration,
             recording,
             prediction,
             searches,
+            started_alike,
+            frames,
+            diagnosis,
             drawn,
-            report.diagnosis_sections(diagnosis, diagnosis_drawn, concealed),
+            concealed=concealed,
             seed=seed,
             seconds=seconds,
         )
         (stage / "report.html").write_text(page, encoding="utf-8")
     for line in (
         *report.comparison_lines(searches),
+        report.answer(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     ):
         say(line, quiet=arguments.quiet)
     return 0
+
+
+def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[float, ...]) -> list[Search]:
+    """Set each model's run beside what lay there."""
+    import numpy as np
+
+    from probewise.report.demo import Search
+    from probewise.scene import outlines
+
+    means, circle = sensor.mean(), hypothesis()
+    known = dict(zip(circle.prior.names, truth, strict=True))
+    outline_mm = outlines(circle.region(np.array([truth])))[0]
+    levels = (means["I_min"], means["I_max"])
+    return [Search(MODEL_NAMES[model], run, known, outline_mm, levels) for model, run in zip(MODELS, runs, strict=True)]
 
 
 def hypothesis() -> Circle:
@@ -144,18 +160,63 @@ def _calibrate(seed: int, full: bool, pool: Executor) -> Calibration:
     )
 
 
-def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
+def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> tuple[Exploration, list[bytes]]:
+    """Find the circle from nothing; the run, and a picture of each step."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run, surface_of
+    from probewise.report import exploration as report
+    from probewise.report.plots import grid_of_axes, png
+    from probewise.report.words import count
+    from probewise.scene import Field, outlines
+    from probewise.world.shipped import truth as world_behind
+
+    field, means = Field(), sensor.mean()
+    experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT)
+    surface = surface_of("circle", np.array(truth), field)
+    with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
+        found = run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
+    outline_mm = outlines(hypothesis().region(np.array([truth])))[0]
+    places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
+    levels = (means["I_min"], means["I_max"])
+    name = MODEL_NAMES[model]
+    frames = [
+        png(
+            report.view(
+                step,
+                experiment,
+                places[: step.number],
+                levels=levels,
+                truth_mm=outline_mm,
+                title=f"{name} model, after {count(step.number, 'reading')}",
+                ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0],
+            ),
+            dpi=90,
+        )
+        for step in found.steps
+    ]
+    return found, frames
+
+
+def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
+    """Find the circle from a first reading at a place on it, the same for every model, by the paper's rule."""
+    import numpy as np
+
+    from probewise.arm import Pose
+    from probewise.experiment import arm_over, experiment_for, run_from, surface_of
+    from probewise.inquiry import ReadingEntropy
     from probewise.scene import Field
     from probewise.world.shipped import truth as world_behind
 
     field = Field()
-    experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT)
+    experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy())
+    x_mm, y_mm, radius_mm = truth
+    away, turn = np.random.default_rng([seed, 5]).random(2)
+    away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn  # anywhere on the circle alike
+    first = Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
     surface = surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
-        return run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
+        return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
 def _diagnose(seed: int) -> Diagnosis:

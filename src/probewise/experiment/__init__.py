@@ -25,6 +25,7 @@ from probewise.experiment.simulation import (
     surface_of,
     world_like,
 )
+from probewise.experiment.start import run_from
 from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "recording_of",
     "require_same_settings",
     "run",
+    "run_from",
     "sensor_prior",
     "shape_named",
     "step",

@@ -1,4 +1,4 @@
-"""The page of the main job: all the paper's figures in one place, and the diagnosis."""
+"""The page of the main job: the sensor, the search with and without knowing it, a mismatch found and repaired."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
 from probewise.experiment import Exploration
@@ -15,9 +16,34 @@ from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import AxesGrid, grid_of_axes, information_gained, png, posterior_widths
-from probewise.report.words import number
+from probewise.report.held_out import most_gained
+from probewise.report.html import (
+    Markup,
+    Section,
+    definition_list,
+    element,
+    figure,
+    page,
+    paragraph,
+    slideshow,
+    table,
+)
+from probewise.report.paper_view import paper_view, window_mm
+from probewise.report.plots import (
+    AxesGrid,
+    arm_and_sensor,
+    before_and_after,
+    grid_of_axes,
+    hypothesis_probabilities,
+    information_gained,
+    png,
+    posterior_widths,
+    quadrant_patterns,
+    residuals_by_scan,
+    sensor_orientations,
+)
+from probewise.report.slides import side_by_side
+from probewise.report.words import count, number
 
 __all__ = [
     "Search",
@@ -25,23 +51,27 @@ __all__ = [
     "comparison_lines",
     "comparison_rows",
     "comparison_table",
-    "diagnosis_sections",
+    "diagnosis_figures",
+    "equal_start",
     "figures",
     "write_page",
 ]
 
 FIRST = 3  # the paper shows the first three measurements side by side
-LATER = 7  # and the map after seven
-AFTER_WHITE = 4  # the telling moment: the circle is met, and not yet known
 HEADER = (
     "sensor model",
     "readings",
     "until the first white",
     "bits",
-    "bits a reading",
+    "bits per reading",
     "the paper's count",
     "largest error",
     "errors",
+)
+_LIKELY = 1e-3
+_SENSOR = (
+    "The sensor sees a blurred patch of the surface. Its spatial sensitivity function (SSF) is the weight that each "
+    "point of the patch has in a reading; a calibration infers it from readings over patterns that are known."
 )
 
 
@@ -72,24 +102,34 @@ class Search:
         seen = [r.value > middle for r in self.run.readings]
         return seen.index(True) + 1 if any(seen) else len(seen)
 
-    def readings_to(self, n_steps: int) -> list[tuple[float, float, float]]:
-        """Place and value of the first readings."""
-        return [(r.pose.x_mm, r.pose.y_mm, r.value) for r in self.run.readings[:n_steps]]
+    def step_at(self, n: int) -> int:
+        """Give the number of the step after `n` readings; a run that has ended stays at its last."""
+        return min(n, len(self.run.steps))
 
 
 def answer(searches: Sequence[Search]) -> str:
-    """Say in one sentence what knowing the sensor was worth in this run."""
-    naive, ssf = searches
-    n_naive, n_ssf = len(naive.run.steps), len(ssf.run.steps)
+    """Say in one sentence what knowing the sensor is worth, from the same first reading on."""
+    naive, ssf = (len(s.run.steps) - 1 for s in searches)
+    how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
     return (
-        f"Once it had met the circle, the robot that knows what its sensor sees needed {n_ssf - ssf.first_white} more "
-        f"readings, the naive one {n_naive - naive.first_white}; in all {n_ssf} and {n_naive}, with errors up to "
-        f"{number(ssf.largest_error_mm, 1)} and {number(naive.largest_error_mm, 1)} mm."
+        f"After the same first reading on white, the robot that knows what its sensor sees needed {ssf} more readings "
+        f"to know the circle to 4 mm; the naive robot needed {naive}{how}."
+    )
+
+
+def equal_start(searches: Sequence[Search]) -> str:
+    """Compare two robots after as many readings as the one that knows its sensor needed."""
+    naive, ssf = searches
+    n = len(ssf.run.steps)
+    widest = naive.run.steps[naive.step_at(n) - 1].widest_mm
+    return (
+        f"After {count(n, 'reading')} each, the naive robot knows the circle to {number(widest, 1)} mm, the other "
+        f"to {number(ssf.run.last.widest_mm, 1)} mm (widest posterior sd)."
     )
 
 
 def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
-    """Fill the comparison: readings, information, errors, a row each sensor model."""
+    """Fill the comparison: readings, information, errors, one row per sensor model."""
     return [
         (
             s.model,
@@ -119,40 +159,83 @@ def comparison_table(searches: Sequence[Search]) -> Markup:
 
 
 def figures(
-    calibration: Calibration, recording: Recording, prediction: Prediction, searches: Sequence[Search]
+    calibration: Calibration,
+    recording: Recording,
+    prediction: Prediction,
+    searches: Sequence[Search],
+    started_alike: Sequence[Search],
+    geometry: Geometry,
 ) -> dict[str, bytes]:
-    """Draw all figures but the diagnosis's: PNG by file name."""
+    """Draw all figures but the diagnosis's: PNG by file name.
+
+    Parameters
+    ----------
+    calibration, recording, prediction
+        The sensor model, what it was made from, what it predicts of that.
+    searches
+        Of both robots, from nothing.
+    started_alike
+        Of both robots, from the same first reading, each next place chosen by the paper's rule.
+    geometry
+        Of the arm.
+    """
     drawn = calibration_report.figures(calibration, recording, prediction)
-    drawn["first_three.png"] = png(_views(searches, [(k, k) for k in range(1, FIRST + 1)]))
-    drawn["found.png"] = png(_views(searches, [tuple(s.first_white + AFTER_WHITE for s in searches)]))
-    drawn["after_seven.png"] = png(_views(searches, [tuple(min(LATER, len(s.run.steps)) for s in searches)]))
+    hidden = started_alike[0].truth_mm
+    drawn["arm.png"] = png(arm_and_sensor(geometry, _at_the_edge(hidden), outline_mm=hidden))
+    drawn["orientations.png"] = png(sensor_orientations(recording))
+    drawn["quadrants.png"] = png(quadrant_patterns(recording))
+    n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
+    drawn["first_three.png"] = png(_views(started_alike, n_first))
+    drawn["equal_readings.png"] = png(_views(started_alike, [len(started_alike[-1].run.steps)]))
     names = [f"{s.model} model" for s in searches]
-    drawn["precision.png"] = png(
-        posterior_widths(
-            {n: np.array([step.widest_mm for step in s.run.steps]) for n, s in zip(names, searches, strict=True)}
-        )
+    axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
+    posterior_widths(
+        {n: np.array([step.widest_mm for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
+        ax=axes[0, 0],
     )
-    drawn["information.png"] = png(
-        information_gained(
-            {n: np.array([step.bits for step in s.run.steps]) for n, s in zip(names, searches, strict=True)}
-        )
+    information_gained(
+        {n: np.array([step.bits for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
+        ax=axes[0, 1],
     )
+    drawn["progress.png"] = png(axes)
     return drawn
 
 
-def _views(searches: Sequence[Search], rows: Sequence[tuple[int, ...]]) -> AxesGrid:
-    axes = grid_of_axes(len(rows), len(searches), size_in=(7.2 * len(searches), 4.0 * len(rows)))
-    for row, counts in zip(axes, rows, strict=True):
-        for ax, search, n in zip(row, searches, counts, strict=True):
-            step = search.run.steps[min(n, len(search.run.steps)) - 1]
-            exploration_report.view(
-                step,
-                search.run.experiment,
-                search.readings_to(step.number),
-                levels=search.levels,
-                truth_mm=search.truth_mm,
-                title=f"{search.model} model, after {step.number} reading{'s' if step.number > 1 else ''}",
-                ax=ax,
+def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
+    """Draw what the page shows of a diagnosis: PNG by file name."""
+    likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
+    recording, before, after = diagnosis.recording, diagnosis.predicted_before, diagnosis.predicted_after
+    drawn = {
+        "explanations.png": png(hypothesis_probabilities([h.label for h in likely], [h.probability for h in likely])),
+        "scans.png": png(residuals_by_scan(recording, before, after)),
+    }
+    best = most_gained(diagnosis)
+    if best is not None:
+        name, gain, rows = best
+        title = f"{name}: {gain:+.2f} nats per reading when it was held out"
+        drawn["before_after.png"] = png(before_and_after(recording, rows, before, after, name=title))
+    return drawn
+
+
+def _at_the_edge(outline_mm: FloatArray) -> tuple[float, float]:
+    """Place on an outline to stand at for a picture."""
+    x_mm, y_mm = outline_mm[0]
+    return float(x_mm), float(y_mm)
+
+
+def _views(searches: Sequence[Search], numbers: Sequence[int]) -> AxesGrid:
+    """Draw the paper's view, a column for each search, after each of these numbers of readings."""
+    window = window_mm([s.run for s in searches], numbers[0])
+    across, up = window[1] - window[0], window[3] - window[2]
+    size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
+    axes = grid_of_axes(len(numbers), len(searches), size_in=size)
+    for row, n in zip(axes, numbers, strict=True):
+        for ax, search in zip(row, searches, strict=True):
+            k = search.step_at(n)
+            step = search.run.steps[k - 1]
+            title = f"{search.model} model, {count(k, 'reading')}: known to {number(step.widest_mm, 1)} mm"
+            paper_view(
+                search.run, k, levels=search.levels, truth_mm=search.truth_mm, window_mm=window, title=title, ax=ax
             )
     return axes
 
@@ -162,64 +245,190 @@ def write_page(
     recording: Recording,
     prediction: Prediction,
     searches: Sequence[Search],
+    started_alike: Sequence[Search],
+    frames: Sequence[Sequence[bytes]],
+    diagnosis: Diagnosis,
     drawn: Mapping[str, bytes],
-    diagnosis: Sequence[Section],
     *,
+    concealed: str,
     seed: int,
     seconds: float,
 ) -> str:
-    """Write the whole page; `diagnosis` holds the sections of its report."""
-    shown = calibration_report.sections(calibration.sensor, recording, prediction, drawn, seed=seed)
-    robot = [
+    """Write the whole page.
+
+    Parameters
+    ----------
+    calibration, recording, prediction, searches, started_alike
+        See `figures`.
+    frames
+        PNG of each step of each search.
+    diagnosis
+        Of the second recording.
+    drawn
+        From `figures` and `diagnosis_figures`.
+    concealed
+        What the world that made the second recording conceals.
+    seed, seconds
+        Of this run.
+    """
+    sections = [
+        _sensor_section(calibration, recording, prediction, drawn, seed),
+        _search_section(searches, started_alike, frames, drawn),
+        _diagnosis_section(diagnosis, drawn, concealed),
         Section(
-            "The comparison",
+            "This run",
             (
-                comparison_table(searches),
-                figure(drawn["precision.png"], "Widest posterior sd after each reading; a run ends below 4 mm."),
-                figure(drawn["information.png"], "Information about the circle after each reading."),
-            ),
-        ),
-        Section(
-            "The first three measurements",
-            (
-                figure(
-                    drawn["first_three.png"],
-                    "Left the naive model, right the SSF model, as in the paper. With the naive model the hypotheses "
-                    "cut the field into cells of equal entropy, at most one bit; with the SSF model their edges "
-                    "are worth most.",
+                definition_list(
+                    (
+                        ("seed", str(seed)),
+                        ("time", f"{number(seconds, 0)} s"),
+                        ("recordings", "the two that ship with the package, both simulated by an independent world"),
+                        ("version", f"probewise {calibration.sensor.version}"),
+                    )
                 ),
-                figure(drawn["after_seven.png"], "The same after seven measurements."),
             ),
         ),
     ]
-    sensor = [
-        Section("The sensor model", (paragraph(calibration_report.answer(calibration.sensor)),)),
-        *shown[:-1],
-    ]
-    closing = Section(
-        "This run",
-        (
-            definition_list(
-                (
-                    ("seed", str(seed)),
-                    ("time", f"{number(seconds, 0)} s"),
-                    ("recordings", "the two that ship with the package, both simulated by an independent world"),
-                    ("version", f"probewise {calibration.sensor.version}"),
-                )
-            ),
-        ),
-    )
     caption = (
-        "The robot's view soon after it met the circle, naive model left, SSF model right: in copper where a "
-        "reading would tell most, blue the 50 circles drawn from what is believed, squares the readings by "
-        "their brightness, green the place chosen next, dashed white the hidden circle; grey is out of the arm's reach."
+        f"{equal_start(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn from the "
+        "posterior. Copper: entropy of the readings that these circles predict; the brighter, the more a reading there "
+        "promises to tell. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
+        "circle."
     )
     return page(
         "Modeling a sensor to improve its efficacy",
-        answer=answer(searches),
-        key_figure=figure(drawn["found.png"], caption),
-        sections=[*robot, *diagnosis, *sensor, closing],
+        answer=answer(started_alike),
+        key_figure=figure(drawn["equal_readings.png"], caption),
+        sections=sections,
     )
+
+
+def _sensor_section(
+    calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], seed: int
+) -> Section:
+    shown = calibration_report.sections(calibration.sensor, recording, prediction, drawn, seed=seed)
+    apparatus = Section(
+        "The arm and its sensor",
+        (
+            figure(
+                drawn["arm.png"],
+                "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the "
+                "links, and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light "
+                "from the photodiode.",
+            ),
+        ),
+    )
+    taken = Section(
+        "How the recording was taken",
+        (
+            figure(
+                drawn["orientations.png"],
+                "The sensor in its four orientations, seen from above through its package, and the symbols of their "
+                "readings below (paper, figure 3). It crosses the edge between black and white in steps of 1 mm.",
+            ),
+            figure(
+                drawn["quadrants.png"],
+                "Four patterns that tell the SSF from its mirror images (paper, figure 4): one reading each at the "
+                "cross, with the sensor at 0°. The number in the white part is the reading.",
+            ),
+        ),
+    )
+    said = calibration_report.answer(calibration.sensor)
+    return Section("The sensor", (paragraph(_SENSOR), paragraph(said)), (apparatus, taken, *shown[:-1]))
+
+
+def _search_section(
+    searches: Sequence[Search],
+    started_alike: Sequence[Search],
+    frames: Sequence[Sequence[bytes]],
+    drawn: Mapping[str, bytes],
+) -> Section:
+    naive, ssf = searches
+    introduction = paragraph(
+        "A white circle lies somewhere on the black field. The naive robot believes that its sensor sees a point, "
+        "black or white. The other predicts each reading with the calibrated SSF. Both choose their own readings and "
+        "stop when centre and radius are known to 4 mm each."
+    )
+    panels = Section(
+        "As in the paper: the first three readings",
+        (
+            figure(
+                drawn["first_three.png"],
+                "Both robots start with the same reading on white and go on by the paper's rule, a place of highest "
+                "entropy (paper, figures 2 and 8). With the naive model (left) the circles cut the field into cells "
+                "of even entropy, at most 1 bit. With the SSF model (right) the circles' edges are bright: a reading "
+                "there also says how much of the edge the sensor sees.",
+            ),
+            comparison_table(started_alike),
+        ),
+    )
+    n_slides = max(len(s.run.steps) for s in searches)
+    texts = [
+        "; ".join(
+            f"{s.model} model, {count(k := s.step_at(n), 'reading')}: {number(s.run.steps[k - 1].widest_mm, 1)} mm"
+            + (" (ended)" if n > len(s.run.steps) else "")
+            for s in searches
+        )
+        for n in range(1, n_slides + 1)
+    ]
+    whole = Section(
+        "A whole search, step by step",
+        (
+            paragraph(
+                f"From an empty field it takes luck to meet the circle, whatever the model: the naive robot met it at "
+                f"reading {naive.first_white} of {len(naive.run.steps)}, the SSF robot at reading {ssf.first_white} of "
+                f"{len(ssf.run.steps)}. These robots choose by the default rule: the expected information of a reading "
+                "and, near the end, the probability that it ends the run. The colour bar says which one is shown."
+            ),
+            slideshow(
+                list(zip(side_by_side(*frames), texts, strict=True)),
+                "Each step of both searches; the length below the picture is the widest posterior sd.",
+            ),
+            figure(
+                drawn["progress.png"],
+                "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the "
+                "circle.",
+            ),
+            comparison_table(searches),
+        ),
+    )
+    return Section("The search", (introduction,), (panels, whole))
+
+
+def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> Section:
+    said = (
+        paragraph(diagnosis_report.answer(diagnosis)),
+        paragraph(
+            f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
+            "not know that."
+        ),
+    )
+    explanations = Section(
+        "What it could be",
+        (figure(drawn["explanations.png"], "Probability of each explanation; all of them together sum to one."),),
+    )
+    gain = diagnosis.improvement
+    repair = [
+        figure(
+            drawn["scans.png"],
+            "Recorded minus predicted along the scans that the repair changes most: each reading, and means of "
+            "neighbours. Orange: the calibrated model. Blue: the repaired model.",
+        )
+    ]
+    if "before_after.png" in drawn:
+        caption = (
+            "The held-out scan on which the repair gains most: readings, and both models as fitted to the whole "
+            "recording; below, recorded minus predicted."
+        )
+        held = (
+            f"Predicting scans that it was not fitted to, the repaired model gains "
+            f"{number(gain.heldout_log_density_per_reading, 3)} ± {number(gain.heldout_sd, 3)} nats per reading. (A "
+            "nat is a unit of log probability: one nat more makes a reading e = 2.7 times as probable.)"
+        )
+        repair = [figure(drawn["before_after.png"], caption), paragraph(held), *repair]
+    link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
+    more = paragraph("Where it shows, what could not be told apart and what to measure next: ", link, ".")
+    return Section("A mismatch, found and repaired", said, (explanations, Section("The repair", (*repair, more))))
 
 
 def comparison_lines(searches: Sequence[Search]) -> list[str]:
@@ -227,15 +436,3 @@ def comparison_lines(searches: Sequence[Search]) -> list[str]:
     rows = [HEADER, *comparison_rows(searches)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEADER))]
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def diagnosis_sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> list[Section]:
-    """Build the sections on the second recording, and say what really was concealed in it."""
-    opening = Section(
-        "A second recording, diagnosed",
-        (
-            paragraph(diagnosis_report.answer(diagnosis)),
-            paragraph(f"The world that made the recording concealed: {concealed.replace('_', ' ')}."),
-        ),
-    )
-    return [opening, *diagnosis_report.sections(diagnosis, drawn)]

@@ -192,7 +192,8 @@ h2 { font-size: 1.25rem; margin: 2.4rem 0 .5rem; border-top: 1px solid var(--lin
 h3 { font-size: 1.02rem; margin: 1.6rem 0 .3rem; }
 nav { margin: 1.4rem 0; padding: .7rem 1rem .8rem; background: #f5f5f5; }
 nav > ol { columns: 2 20rem; margin: 0; padding-left: 1.2rem; } nav li { break-inside: avoid; font-weight: 600; }
-nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; } nav ol ol li { font-weight: 400; font-size: .95rem; }
+nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; }
+nav ol ol li { font-weight: 400; font-size: .95rem; }
 a { color: var(--accent); }
 .slideshow label:not([hidden]) { display: flex; gap: .8rem; align-items: center; margin-bottom: .4rem; }
 .slideshow input { flex: 1; max-width: 34rem; } p.slide { margin: .2rem 0; font-variant-numeric: tabular-nums; }
@@ -210,14 +211,7 @@ dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
 @media (max-width: 34rem) {
-  h3 { font-size: 1.02rem; margin: 1.6rem 0 .3rem; }
-nav { margin: 1.4rem 0; padding: .7rem 1rem .8rem; background: #f5f5f5; }
-nav > ol { columns: 2 20rem; margin: 0; padding-left: 1.2rem; } nav li { break-inside: avoid; font-weight: 600; }
-nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; } nav ol ol li { font-weight: 400; font-size: .95rem; }
-a { color: var(--accent); }
-.slideshow label:not([hidden]) { display: flex; gap: .8rem; align-items: center; margin-bottom: .4rem; }
-.slideshow input { flex: 1; max-width: 34rem; } p.slide { margin: .2rem 0; font-variant-numeric: tabular-nums; }
-p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
+  p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
   figure { overflow-x: auto; } figure img[src^="data:image/svg"] { min-width: 42rem; max-width: none; }
 }
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }

@@ -1,19 +1,23 @@
 """The paper's figures, one function each: data first, then the axes to draw on, and nothing global.
 
-Data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
+The arm and its sensor (figure 1 of the paper), the sensor's orientations and the quadrant patterns (figures 3 and 4),
+data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
 predicted against recorded (figure 7), the entropy map with its hypotheses (figures 2 and 8);
 beside them progress towards the precision asked for, what a diagnosis found, and what judges a
 run of nested sampling.
 """
 
+from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
 from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
+from probewise.report.plots.patterns import quadrant_patterns, sensor_orientations
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
 from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
+from probewise.report.plots.scans import before_and_after, residuals_by_scan
 from probewise.report.plots.scene import playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
 from probewise.report.plots.study import readings_needed, widths_of_runs
@@ -21,7 +25,9 @@ from probewise.report.plots.verdict import hypothesis_probabilities
 
 __all__ = [
     "AxesGrid",
+    "arm_and_sensor",
     "audit_matrix",
+    "before_and_after",
     "calibration_check",
     "confusion_matrix",
     "corner_plot",
@@ -34,12 +40,15 @@ __all__ = [
     "png",
     "posterior_widths",
     "predicted_against_recorded",
+    "quadrant_patterns",
     "reach_map",
     "readings_by_orientation",
     "readings_needed",
     "reliability_diagram",
     "residuals_against",
+    "residuals_by_scan",
     "run_plot",
+    "sensor_orientations",
     "spatial_sensitivity",
     "ssf_by_order",
     "trace_plot",

@@ -1,0 +1,53 @@
+"""Begin at a place that is given: two robots that begin with the same reading differ in what they know, not in luck."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from probewise.arm.instrument import Instrument, Pose
+from probewise.errors import ParameterError
+from probewise.experiment.asking import Field
+from probewise.experiment.loop import begin, step
+from probewise.experiment.setting import Experiment
+from probewise.experiment.values import Exploration, Step
+from probewise.inquiry import prior_entropy
+
+__all__ = ["run_from"]
+
+
+def run_from(
+    first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int = 100
+) -> Exploration:
+    """Run the loop of `explore` with a first place that is given; every other place is chosen by the experiment.
+
+    Parameters
+    ----------
+    first
+        Where the first reading is taken.
+    instrument, experiment
+        As for `explore`.
+    rng
+        Source of randomness of the whole run.
+    max_readings
+        End here if the lengths are not known by then.
+
+    Raises
+    ------
+    ReachError
+        If the arm cannot reach the first place.
+    NotConvergedError
+        If no hypothesis could have given the readings.
+    """
+    if max_readings < 1:
+        raise ParameterError("max_readings", max_readings, "1 or more")
+    field = Field.under(instrument, experiment.grid)
+    prior_bits = prior_entropy(experiment.prior, rng=rng)
+    state = dataclasses.replace(begin(experiment, field, rng=rng), next_pose=first, planned=())
+    steps: list[Step] = []
+    while not steps or steps[-1].stop_reason is None:
+        reading = instrument.measure(state.next_pose)
+        state, info = step(state, reading, experiment, field, prior_bits=prior_bits, rng=rng, max_readings=max_readings)
+        steps.append(info)
+    return Exploration(experiment, tuple(steps))

@@ -1,0 +1,25 @@
+"""The held-out part of a recording on which a repair gains most, row by row."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise.diagnosis import Diagnosis
+from probewise.diagnosis.evidence.gain import parts_kept_back
+
+__all__ = ["most_gained"]
+
+
+def most_gained(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
+    """Find the held-out part with the largest gain: its name, the gain in nats per reading, its rows, (n_rows,).
+
+    None where nothing was repaired, or nothing could be held out.
+    """
+    gains = diagnosis.improvement.heldout_by_scan
+    if not diagnosis.is_repaired or not gains:
+        return None
+    name, gain = max(gains, key=lambda pair: pair[1])
+    part, names = parts_kept_back(diagnosis.recording)
+    rows = np.flatnonzero(diagnosis.recording.usable)[part == names.index(name)]
+    return name, gain, rows

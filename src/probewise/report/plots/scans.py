@@ -1,0 +1,151 @@
+"""One recording by two models: a panel a scan, and one scan from close by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.recordings import Recording
+from probewise.report.plots.canvas import BLACK, BLUE, VERMILLION, AxesGrid, grid_of_axes, tidy
+from probewise.report.plots.readings import Track, tracks
+from probewise.report.words import unit_name
+
+__all__ = ["before_and_after", "residuals_by_scan"]
+
+_MOST_GROUPS, _LEAST_ROWS = 18, 5  # of neighbours that a running mean is made of
+_TELLING = 0.3  # share of the largest change by the repair, beyond which a curve is worth looking at
+_BEFORE, _AFTER = "calibrated model", "repaired model"
+_ALONG = "distance from the edge (mm)"
+_ALONG_OTHERS = "place along the scan (mm)"
+
+
+def residuals_by_scan(
+    recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
+) -> AxesGrid:
+    """Draw recorded minus predicted along each scan by two models, all panels on the same axes.
+
+    Parameters
+    ----------
+    recording
+        What was recorded.
+    before, after
+        Predicted readings by the calibrated and by the repaired model, (n_points,).
+    most
+        How many scans are drawn: those that the repair changes most, in the order of taking.
+    columns
+        How many stand side by side.
+
+    Returns
+    -------
+    Axes, (n_rows, columns); those without a scan are hidden.
+    """
+    found, _ = tracks(recording.plan)
+    change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in found]
+    shown = [found[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
+    n_rows = max(-(-len(shown) // columns), 1)
+    axes = grid_of_axes(n_rows, columns, size_in=(3.6 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
+    for ax, track in zip(axes.flat, shown, strict=False):
+        for predicted, colour in ((before, VERMILLION), (after, BLUE)):
+            along, residual = _residuals(recording, track, predicted)
+            ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
+            ax.plot(*_means(along, residual), color=colour, linewidth=1.8)
+        ax.axhline(0.0, color=BLACK, linewidth=0.7)
+        tidy(ax, x="", y="", title=_title(recording, track))
+    for ax in list(axes.flat)[len(shown) :]:
+        ax.set_visible(False)
+    sheet = axes.flat[0].figure
+    sheet.supxlabel(_ALONG if all(track.from_edge for track in shown) else f"{_ALONG}, or {_ALONG_OTHERS}", fontsize=10)
+    sheet.supylabel(f"recorded − predicted ({unit_name(recording.plan.instrumentation.unit)})", fontsize=10)
+    lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (VERMILLION, BLUE)]
+    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize="small")
+    return axes
+
+
+def before_and_after(
+    recording: Recording, rows: IntArray, before: FloatArray, after: FloatArray, *, name: str = ""
+) -> AxesGrid:
+    """Draw readings with the curves of two models, and below what each leaves, about where the two differ.
+
+    Parameters
+    ----------
+    recording
+        What was recorded.
+    rows
+        Which of its readings, (n_rows,): one scan, or several over one pattern in one orientation.
+    before, after
+        Predicted readings by the calibrated and by the repaired model, (n_points,).
+    name
+        Title.
+
+    Returns
+    -------
+    Axes, (2, 1).
+
+    Raises
+    ------
+    ParameterError
+        If no three of the readings lie along a line.
+    """
+    axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
+    above, below = axes[:, 0]
+    found, _ = tracks(recording.plan.take(rows))
+    if not found:
+        raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
+    for k, track in enumerate(found):
+        order = np.argsort(track.along_mm, kind="stable")
+        at, along = rows[track.rows[order]], track.along_mm[order]
+        ok = recording.usable[at]
+        above.plot(along[ok], recording.readings[at][ok], ".", color=BLACK, markersize=4, label="" if k else "recorded")
+        for predicted, colour, said in ((before, VERMILLION, _BEFORE), (after, BLUE, _AFTER)):
+            above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else said)
+    for predicted, colour in ((before, VERMILLION), (after, BLUE)):
+        sides = [_residuals(recording, Track("", rows[t.rows], t.along_mm, t.from_edge), predicted) for t in found]
+        along = np.concatenate([a for a, _ in sides])
+        residual = np.concatenate([r for _, r in sides])
+        below.plot(along, residual, ".", color=colour, markersize=3, alpha=0.5)
+        below.plot(*_means(along, residual), color=colour, linewidth=1.8)
+    below.axhline(0.0, color=BLACK, linewidth=0.7)
+    below.set_xlim(*_telling(found, rows, np.abs(after - before)))
+    unit = unit_name(recording.plan.instrumentation.unit)
+    above.legend(frameon=False, fontsize="small")
+    tidy(above, x="", y=f"reading ({unit})", title=name)
+    from_edge = all(track.from_edge for track in found)
+    tidy(below, x=_ALONG if from_edge else _ALONG_OTHERS, y=f"recorded − predicted\n({unit})")
+    return axes
+
+
+def _telling(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
+    """Give the ends of the way along which two models differ, with as much again on either side."""
+    along = np.concatenate([track.along_mm for track in found])
+    by_place = np.concatenate([change[rows[track.rows]] for track in found])
+    differs = along[by_place >= _TELLING * max(float(by_place.max()), 1e-300)]
+    margin = float(np.ptp(differs)) + 1.0
+    return max(float(along.min()), float(differs.min()) - margin), min(
+        float(along.max()), float(differs.max()) + margin
+    )
+
+
+def _residuals(recording: Recording, track: Track, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    ok = recording.usable[track.rows]
+    rows = track.rows[ok]
+    return track.along_mm[ok], np.asarray(recording.readings[rows] - predicted[rows])
+
+
+def _means(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means of neighbours along the scan: groups of even width, for readings are dense where a scan is slow."""
+    if along.size == 0:
+        return along, residual
+    edges = np.linspace(along.min(), along.max(), min(_MOST_GROUPS, max(along.size // _LEAST_ROWS, 1)) + 1)
+    group = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(group, minlength=len(edges) - 1)
+    some = count > 0
+    middle = np.bincount(group, along, minlength=len(count))[some] / count[some]
+    return middle, np.bincount(group, residual, minlength=len(count))[some] / count[some]
+
+
+def _title(recording: Recording, track: Track) -> str:
+    return recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])].replace("_", " ")

@@ -1,0 +1,39 @@
+"""Pictures of two runs side by side, step by step, small enough for a page that holds them all."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from itertools import zip_longest
+
+from PIL import Image
+
+__all__ = ["side_by_side"]
+
+_COLOURS = 128
+
+
+def side_by_side(left: Sequence[bytes], right: Sequence[bytes]) -> list[bytes]:
+    """Join the pictures of two runs step by step; the run that ended first stays at its last picture.
+
+    Parameters
+    ----------
+    left, right
+        One PNG or more each.
+
+    Returns
+    -------
+    PNG in few colours, as many as the longer run has.
+    """
+    pairs = zip_longest(left, right)
+    return [_joined(a if a is not None else left[-1], b if b is not None else right[-1]) for a, b in pairs]
+
+
+def _joined(left: bytes, right: bytes) -> bytes:
+    pictures = [Image.open(io.BytesIO(picture)).convert("RGB") for picture in (left, right)]
+    sheet = Image.new("RGB", (sum(p.width for p in pictures), max(p.height for p in pictures)), "white")
+    sheet.paste(pictures[0], (0, 0))
+    sheet.paste(pictures[1], (pictures[0].width, 0))
+    out = io.BytesIO()
+    sheet.quantize(_COLOURS).save(out, "PNG", optimize=True)
+    return out.getvalue()

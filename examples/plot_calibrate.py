@@ -3,7 +3,8 @@ A sensor model from a recording
 ===============================
 
 Shows how many Gaussians the shipped recording asks for, what the sensor sees, and how well the model
-predicts what was recorded (the paper's figures of the data, of the SSF and of the predictions).
+predicts what was recorded. The sensor's spatial sensitivity function (SSF) is the weight of each point below it in a
+reading. The figures are the paper's: how the recording was taken, the data, the SSF, the predictions.
 """
 
 # %%
@@ -17,6 +18,8 @@ from probewise.report import plots
 seed = 1
 print(f"seed {seed}")
 recording = read_recording(shipped("paper"))
+fig, ax = plt.subplots(figsize=(7, 3.5))
+plots.sensor_orientations(recording, ax=ax)
 fig, ax = plt.subplots()
 plots.readings_by_orientation(recording, ax=ax)
 

@@ -3,7 +3,7 @@ What does the model leave out?
 ==============================
 
 Shows how a recording that a plain sensor model does not explain is diagnosed: which physics is missing,
-where it shows, and what the repaired model gains on readings that were kept back.
+where it shows, and what the repaired model gains on held-out readings.
 """
 
 # %%

@@ -3,7 +3,7 @@ The robot finds a circle
 ========================
 
 Shows the robot's view of the field as it chooses its own measurements: the entropy map in copper,
-50 circles drawn from what is believed in blue, readings as squares, the next place in green.
+50 circles drawn from the posterior in blue, readings as squares, the next place in green.
 """
 
 # %%
@@ -26,7 +26,8 @@ world = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]))
 hidden = Disc((600.0, 260.0), 120.0)
 
 # %%
-# The sensor model: one Gaussian, 4 mm by 2.5 mm, and two levels. The world above shares no code with it.
+# The sensor model: its spatial sensitivity function (SSF), one Gaussian of 4 mm by 2.5 mm (sd), and the readings of
+# black and white. The world above shares no code with it.
 circle = Circle(radius_mm=(50.0, 150.0), inside=True)
 mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
 model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))

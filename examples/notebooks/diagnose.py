@@ -13,5 +13,5 @@ diagnosis = diagnose(recording, rng=np.random.default_rng(seed))
 diagnosis
 
 # %%
-# The same in words, with the gain on readings that were kept back.
+# The same in words, with the gain on held-out readings.
 print(diagnosis.summary())

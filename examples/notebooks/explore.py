@@ -33,5 +33,5 @@ with robot:
 found
 
 # %%
-# What is believed in the end.
+# The posterior at the end.
 found.posterior

@@ -283,5 +283,5 @@ def test_a_port_that_is_not_there_is_an_error_in_words(tmp_path):
 
 def test_without_pyserial_the_rest_works_and_opening_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
-    with pytest.raises(LinkError, match="pip install pyserial$"):
+    with pytest.raises(LinkError, match=r"pip install pyserial$"):
         Brick.open("/dev/rfcomm0")

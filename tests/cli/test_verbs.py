@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,10 +145,21 @@ def test_a_diagnosis_keeps_to_its_schema_and_names_its_figures(tmp_path):
 
 @pytest.mark.slow
 def test_the_demo_does_all_of_it(tmp_path, capsys):
+    """Its answers are those that the README quotes, as far as another machine's arithmetic lets them be."""
     out = tmp_path / "out"
     assert run("demo", "--out", out) == 0
     said = capsys.readouterr().out
     assert "naive" in said
+    quoted = json.loads((Path(__file__).parents[2] / "docs" / "_static" / "pictures.json").read_text(encoding="utf-8"))
+    answers = json.loads((out / "answers.json").read_text(encoding="utf-8"))
+    assert answers.keys() == quoted.keys()
+    for name in ("seed", "verdict", "combination", "concealed"):
+        assert answers[name] == quoted[name]
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert page.index("The sensor") < page.index("The search") < page.index("A mismatch, found and repaired")
+    assert page.count("data:image/svg") == 0  # the diagnosis has its own page
+    assert "http" not in page
+    assert (out / "diagnosis" / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")
     assert "SSF" in said
     assert "concealed was" in said
     assert (out / "report.html").stat().st_size > 100_000

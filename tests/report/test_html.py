@@ -80,7 +80,9 @@ def test_numbers_are_written_as_people_read_them():
 
 
 def test_many_sections_are_listed_with_links_that_lead_to_them():
-    sections = [Section(f"chapter {k}", (), (Section("first <part>", ()), Section("second part", ()))) for k in range(2)]
+    sections = [
+        Section(f"chapter {k}", (), (Section("first <part>", ()), Section("second part", ()))) for k in range(2)
+    ]
     made = page("t", answer="a", key_figure=figure(PNG, "key"), sections=sections)
     reader = read(made)
     links = [address for address in reader.addresses if address.startswith("#")]

@@ -1,16 +1,79 @@
-"""The README's example runs as printed."""
+"""What somebody who has just arrived reads is true: the loop, the sentences, the install lines, the words."""
 
+import json
 import re
 from pathlib import Path
 
-README = Path(__file__).parents[2] / "README.md"
+import pytest
+
+from probewise import experiment
+from probewise.experiment import loop
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+INDEX = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+QUOTED = json.loads((ROOT / "docs" / "_static" / "pictures.json").read_text(encoding="utf-8"))
 
 
-def test_the_example_of_the_readme_runs_and_finds_the_circle(capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    names: dict[str, object] = {}
-    exec(compile(code, str(README), "exec"), names)
-    assert "radius_mm" in capsys.readouterr().out
-    posterior = names["posterior"]
-    distance = (posterior.mean()[:2] - [600.0, 260.0]) / posterior.sd()[:2]
-    assert abs(distance).max() < 4
+def plain(text):
+    return " ".join(text.replace("**", "").replace("*", "").replace("> ", "").split())
+
+
+def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
+    """The printed lines and `explore`, given the same randomness, take the same readings to the last bit."""
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    setup, rest = code.split("\nrng = ")
+    printed = {}
+    exec(compile(code, "README.md", "exec"), printed)
+    again = {}
+    exec(compile(setup, "README.md", "exec"), again)
+    rng = eval(rest.splitlines()[0], again)
+    monkeypatch.setattr(loop, "_rng_of", lambda seed, number: rng)
+    found = experiment.run(again["robot"], printed["asked"], rng=rng, max_readings=4)
+    taken = [(r.pose, r.value) for r in printed["state"].readings]
+    assert [(r.pose, r.value) for r in found.readings] == taken[:4]
+    last = printed["info"]
+    assert printed["asked"].is_known(last.sd, last.shapes)
+    assert abs((last.mean - [600.0, 260.0, 90.0]) / last.sd).max() < 4
+
+
+def test_the_readme_quotes_what_the_demo_said_when_its_pictures_were_made():
+    for sentence in (QUOTED["equal_readings"], QUOTED["diagnosis"], f'("{QUOTED["concealed"]}")'):
+        assert plain(sentence) in plain(README)
+    assert plain(QUOTED["equal_readings"]) in plain(INDEX)
+    assert QUOTED["combination"] == QUOTED["concealed"]
+    assert QUOTED["verdict"] == "named"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_pictures_that_the_front_pages_show_are_there(page):
+    shown = re.findall(r"(?:!\[.*?\]\(|```\{figure\} )([^)\s]+)", (ROOT / page).read_text(encoding="utf-8"))
+    assert len(shown) == 2
+    assert all(((ROOT / page).parent / name).is_file() for name in shown)
+
+
+@pytest.mark.parametrize("page", [README, INDEX], ids=["README", "index"])
+@pytest.mark.parametrize(
+    ("word", "meaning"),
+    [
+        (r"\bSSF\b", "spatial sensitivity function"),
+        (r"\blambda\b|λ", "standard deviations of the noise"),
+        (r"\bnats?\b", "unit of natural log probability"),
+        (r"\balias", "same trace"),
+    ],
+    ids=["SSF", "lambda", "nat", "alias"],
+)
+def test_a_word_of_the_trade_is_explained_where_it_first_stands(page, word, meaning):
+    prose = plain(re.sub(r"```\w+\n.*?```|!\[.*?\]|:alt: [^\n]*", "", page, flags=re.DOTALL))
+    first = re.search(word, prose)
+    assert first is not None
+    assert meaning in prose[max(first.start() - 120, 0) : first.end() + 330]
+
+
+def test_no_line_installs_from_an_index_that_does_not_have_this_package():
+    """It is not published: extras are installed from a clone (`-e ".[nxt]"`), packages by their own names."""
+    read = [README, *(p.read_text(encoding="utf-8") for p in ROOT.glob("*.md"))]
+    for folder, kinds in (("docs", "md rst py"), ("examples", "py rst ipynb"), ("src", "py"), ("benchmarks", "py md")):
+        read += [p.read_text(encoding="utf-8") for kind in kinds.split() for p in (ROOT / folder).rglob(f"*.{kind}")]
+    assert not [found for text in read for found in re.findall(r"pip install[^\n]*?['\" ]probewise\b.*", text)]
+    assert not [found for text in read for found in re.findall(r"probewise\[\w+\]", text)]

@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, search, diagnose, report."""
+    import json
     import time
 
     import numpy as np
@@ -105,6 +106,8 @@ def run(arguments: argparse.Namespace) -> int:
             seconds=seconds,
         )
         (stage / "report.html").write_text(page, encoding="utf-8")
+        answers = report.answers(started_alike, diagnosis, concealed=concealed, seed=seed)
+        (stage / "answers.json").write_text(json.dumps(answers, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     for line in (
         *report.comparison_lines(searches),
         report.answer(started_alike),

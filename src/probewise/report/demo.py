@@ -48,6 +48,7 @@ from probewise.report.words import count, number
 __all__ = [
     "Search",
     "answer",
+    "answers",
     "comparison_lines",
     "comparison_rows",
     "comparison_table",
@@ -128,6 +129,21 @@ def equal_start(searches: Sequence[Search]) -> str:
     )
 
 
+def answers(
+    started_alike: Sequence[Search], diagnosis: Diagnosis, *, concealed: str, seed: int
+) -> dict[str, str | int]:
+    """Give what the page says in its first lines, to be quoted elsewhere."""
+    return {
+        "seed": seed,
+        "search": answer(started_alike),
+        "equal_readings": equal_start(started_alike),
+        "verdict": diagnosis.verdict,
+        "combination": "+".join(diagnosis.combination),
+        "concealed": concealed,
+        "diagnosis": diagnosis_report.answer(diagnosis),
+    }
+
+
 def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
     """Fill the comparison: readings, information, errors, one row per sensor model."""
     return [
@@ -145,12 +161,13 @@ def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
     ]
 
 
-def comparison_table(searches: Sequence[Search]) -> Markup:
-    """Build the table of the comparison."""
+def comparison_table(searches: Sequence[Search], caption: str = "") -> Markup:
+    """Build the table of the comparison; without a caption of its own it explains its columns."""
     return table(
         HEADER,
         comparison_rows(searches),
-        caption=(
+        caption=caption
+        or (
             "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
             "the whole search, whatever the run. Errors: estimate minus truth, ± posterior sd (mm). One run each: the "
             "number of readings varies from circle to circle, most of all until the first white reading."
@@ -197,6 +214,7 @@ def figures(
         {n: np.array([step.bits for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
         ax=axes[0, 1],
     )
+    axes[0, 1].set_ylim(top=1.3 * axes[0, 1].get_ylim()[1])  # room for the legend above the lines
     drawn["progress.png"] = png(axes)
     return drawn
 
@@ -204,9 +222,10 @@ def figures(
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     """Draw what the page shows of a diagnosis: PNG by file name."""
     likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
+    labels = [h.label.replace("+", " + ") for h in likely]
     recording, before, after = diagnosis.recording, diagnosis.predicted_before, diagnosis.predicted_after
     drawn = {
-        "explanations.png": png(hypothesis_probabilities([h.label for h in likely], [h.probability for h in likely])),
+        "explanations.png": png(hypothesis_probabilities(labels, [h.probability for h in likely])),
         "scans.png": png(residuals_by_scan(recording, before, after)),
     }
     best = most_gained(diagnosis)
@@ -389,7 +408,7 @@ def _search_section(
                 "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the "
                 "circle.",
             ),
-            comparison_table(searches),
+            comparison_table(searches, "From an empty field; columns as in the table above."),
         ),
     )
     return Section("The search", (introduction,), (panels, whole))

@@ -17,11 +17,8 @@ from probewise.report.plots.canvas import BLACK, GREY, ORANGE, VERMILLION, AxesG
 __all__ = ["arm_and_sensor", "draw_sensor_face"]
 
 _ROD_MM = 26.0  # between the two rods of each parallelogram, as drawn
-_LABEL: dict[str, Any] = {
-    "fontsize": "small",
-    "textcoords": "offset points",
-    "arrowprops": {"arrowstyle": "-|>", "color": BLACK},
-}
+_ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
+_LABEL: dict[str, Any] = {"fontsize": "small", "textcoords": "offset points", "arrowprops": _ARROW}
 
 
 def arm_and_sensor(
@@ -113,13 +110,9 @@ def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float) -> N
     ax.add_patch(Rectangle((eye[0] - 8, eye[1]), 16, geometry.sensor_mm[1] + 6, fc="#9a9a9a", ec=BLACK, zorder=4))
     ax.annotate("base turns about this axis", (0, knee[1] + 40), xytext=(10, 12), **_LABEL)
     ax.annotate("shoulder", (float(joint[0]), float(joint[1])), xytext=(-30, 44), ha="right", **_LABEL)
-    ax.annotate("elbow", (float(knee[0]), float(knee[1]) + _ROD_MM), xytext=(24, 16), **_LABEL)
-    ax.annotate(
-        f"sensor, {geometry.read_height_mm:g} mm above\nthe surface when it reads",
-        (float(eye[0]), float(eye[1])),
-        xytext=(-16, -40),
-        **_LABEL,
-    )
+    ax.annotate("elbow", (float(knee[0]), float(knee[1]) + _ROD_MM), xytext=(30, -2), **_LABEL)
+    said = f"sensor, {geometry.read_height_mm:g} mm above\nthe surface when it reads"
+    ax.annotate(said, (float(eye[0]), float(eye[1])), xytext=(-16, -40), **_LABEL)
     far = float(eye[0])
     ax.set(xlim=(-120, far + 130), ylim=(-110, float(knee[1]) + 110), aspect="equal")
     ax.set_yticks([tick for tick in ax.get_yticks() if 0 <= tick <= knee[1] + 60])

@@ -102,14 +102,15 @@ def before_and_after(
         above.plot(along[ok], recording.readings[at][ok], ".", color=BLACK, markersize=4, label="" if k else "recorded")
         for predicted, colour, said in ((before, VERMILLION, _BEFORE), (after, BLUE, _AFTER)):
             above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else said)
+    low, high = _telling(found, rows, np.abs(after - before))
     for predicted, colour in ((before, VERMILLION), (after, BLUE)):
         sides = [_residuals(recording, Track("", rows[t.rows], t.along_mm, t.from_edge), predicted) for t in found]
-        along = np.concatenate([a for a, _ in sides])
-        residual = np.concatenate([r for _, r in sides])
-        below.plot(along, residual, ".", color=colour, markersize=3, alpha=0.5)
-        below.plot(*_means(along, residual), color=colour, linewidth=1.8)
+        along, residual = (np.concatenate(parts) for parts in zip(*sides, strict=True))
+        shown = (along >= low) & (along <= high)
+        below.plot(along[shown], residual[shown], ".", color=colour, markersize=4, alpha=0.5)
+        below.plot(*_means(along[shown], residual[shown]), color=colour, linewidth=1.8)
     below.axhline(0.0, color=BLACK, linewidth=0.7)
-    below.set_xlim(*_telling(found, rows, np.abs(after - before)))
+    below.set_xlim(low, high)
     unit = unit_name(recording.plan.instrumentation.unit)
     above.legend(frameon=False, fontsize="small")
     tidy(above, x="", y=f"reading ({unit})", title=name)

@@ -1,0 +1,77 @@
+"""The demo's page: what it compares begins alike, its map is that of the circles drawn on it."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from probewise.arm import Pose, SimulatedArm
+from probewise.errors import ParameterError
+from probewise.experiment import Experiment, run_from
+from probewise.inference import GaussianKnown
+from probewise.inquiry import Grid, ReadingEntropy
+from probewise.recordings import Disc
+from probewise.report.paper_view import fine_map, paper_view, window_mm
+from probewise.report.slides import side_by_side
+from probewise.scene import Circle, HypothesisScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.world import Blob, World, gaussian_spot
+
+FIRST = Pose(590.0, 250.0)
+
+
+def searched(max_readings):
+    world = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]))
+    rng = np.random.default_rng(3)
+    hidden = Disc((600.0, 260.0), 90.0)
+    arm = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng))
+    circle = Circle(radius_mm=(50.0, 150.0), inside=True)
+    mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
+    model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
+    grid = Grid(n_x=66, n_y=33)
+    experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, grid, ReadingEntropy(), n_live=60, n_particles=500)
+    return run_from(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return searched(2)
+
+
+def test_a_run_takes_its_first_reading_where_it_is_told_to(found):
+    assert found.readings[0].pose == FIRST
+    assert len(found.steps) == 2
+    assert "max_readings" in found.stop_reason
+    with pytest.raises(ParameterError, match="max_readings"):
+        searched(0)
+
+
+def test_the_fine_map_agrees_with_the_robots_own_where_both_have_a_place(found):
+    drawn = fine_map(found, 1)
+    np.testing.assert_allclose(drawn.image[::2, ::2], found.steps[0].map.image, atol=1e-9)
+
+
+def test_the_view_shows_the_fifty_circles_and_the_place_chosen_from_them(found):
+    window = window_mm([found], 1)
+    outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
+    ax = paper_view(found, 1, levels=(10.0, 60.0), truth_mm=outline, window_mm=window)
+    assert len(ax.collections[0].get_paths()) == 50
+    green = ax.collections[-1].get_offsets()[0]
+    assert tuple(green) == (found.readings[1].pose.x_mm, found.readings[1].pose.y_mm)
+    left, right, low, high = window
+    assert left < green[0] < right
+    assert low < green[1] < high
+
+
+def picture(width, shade):
+    out = io.BytesIO()
+    Image.new("RGB", (width, 10), (shade,) * 3).save(out, "PNG")
+    return out.getvalue()
+
+
+def test_the_run_that_ended_first_stays_at_its_last_picture():
+    slides = side_by_side([picture(20, 0), picture(20, 100)], [picture(30, 200)])
+    opened = [Image.open(io.BytesIO(slide)).convert("RGB") for slide in slides]
+    assert [image.size for image in opened] == [(50, 10)] * 2
+    assert [(image.getpixel((0, 0))[0], image.getpixel((49, 9))[0]) for image in opened] == [(0, 200), (100, 200)]

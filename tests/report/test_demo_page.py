@@ -75,3 +75,14 @@ def test_the_run_that_ended_first_stays_at_its_last_picture():
     opened = [Image.open(io.BytesIO(slide)).convert("RGB") for slide in slides]
     assert [image.size for image in opened] == [(50, 10)] * 2
     assert [(image.getpixel((0, 0))[0], image.getpixel((49, 9))[0]) for image in opened] == [(0, 200), (100, 200)]
+
+
+def test_a_colour_that_few_pixels_have_survives_in_a_slide():
+    """The next place is a green square of some fifty pixels in a map of all copper tones."""
+    tones = np.linspace([42, 26, 18], [255, 217, 168], 400 * 300).round().astype(np.uint8).reshape(300, 400, 3)
+    tones[100:107, 50:57] = (0, 224, 138)
+    out = io.BytesIO()
+    Image.fromarray(tones).save(out, "PNG")
+    (slide,) = side_by_side([out.getvalue()], [picture(5, 0)])
+    shown = Image.open(io.BytesIO(slide)).convert("RGB").getpixel((53, 103))
+    np.testing.assert_allclose(shown, (0, 224, 138), atol=16)

@@ -33,5 +33,5 @@ with robot:
 found
 
 # %%
-# The posterior at the end.
+# What is believed in the end.
 found.posterior

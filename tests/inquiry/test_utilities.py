@@ -1,6 +1,6 @@
 """What a reading is worth, against counting, quadrature and what must hold of any information."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import log2
 
 import numpy as np
@@ -129,11 +129,22 @@ def test_a_flat_map_says_so(made):
     assert not utility_map(made.listed(APART), InformationGain()).flat
 
 
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A utility that gives what it is told to."""
+
+    values: np.ndarray
+    label: str = "given"
+
+    def __call__(self, prospect):
+        return self.values
+
+
 def test_a_utility_of_the_wrong_size_or_not_finite_is_refused(made):
     with pytest.raises(ShapeError, match="one a design"):
-        utility_map(made.listed(APART), lambda prospect: np.zeros(2))
+        utility_map(made.listed(APART), Given(np.zeros(2)))
     with pytest.raises(ParameterError, match="finite"):
-        utility_map(made.listed(APART), lambda prospect: np.full(3, np.nan))
+        utility_map(made.listed(APART), Given(np.full(3, np.nan)))
 
 
 @pytest.mark.parametrize(
@@ -181,7 +192,7 @@ def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
 def test_the_label_of_a_map_names_the_one_quantity_that_it_shows(made):
     """Near the end the default utility shows a probability, before that bits; a colour bar carries one of them."""
     near = narrow(made, Goal((2,), 5.0))
-    assert utility_map(near, Finishing()).label == "probability that the run ends"
+    assert utility_map(near, Finishing()).label == "probability that a reading there ends the run"
     assert utility_map(replace(near, goal=None), Finishing()).label == InformationGain().label
 
 

@@ -12,14 +12,13 @@ from probewise.inquiry.forecast import spread_levels, thinned
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
 
-__all__ = ["CHANCE", "Finishing"]
+__all__ = ["Finishing"]
 
 _NEAR = 15.0  # times the sd that is asked for: farther off than that no single reading ends a run
 _MOST_ASKED = 800  # hypotheses
 _MOST_DESIGNS = 250  # the best by the other utility
 _PER_SD = 2.0
 _LEAST = 1e-12
-CHANCE = "probability that the run ends"
 
 
 @dataclass(frozen=True)
@@ -46,15 +45,15 @@ class Finishing:
 
     @property
     def label(self) -> str:
-        """The other's, and what stands in its place near the end; a map has the label of the one that it shows."""
-        return f"{self.of.label}, or {CHANCE}"
+        """The other's, and what stands in its place near the end."""
+        return f"{self.of.label}, or chance to finish"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Value every design that can be taken, (n,): all by the one measure or all by the other."""
-        return self.valued(prospect)[0]
+        return self.measure(prospect)[0]
 
-    def valued(self, prospect: Prospect) -> tuple[FloatArray, str]:
-        """Value every design, (n,), and label the quantity that these values are."""
+    def measure(self, prospect: Prospect) -> tuple[FloatArray, str]:
+        """Value every design that can be taken, (n,), and say by which of the two measures, as a colour bar does."""
         worth = self.of(prospect)
         if prospect.goal is None or not _is_near(prospect, prospect.goal):
             return worth, self.of.label
@@ -64,7 +63,7 @@ class Finishing:
             return worth, self.of.label
         out = np.zeros(len(worth))
         out[best] = chance
-        return out, CHANCE
+        return out, "probability that a reading there ends the run"
 
 
 def _is_near(prospect: Prospect, goal: Goal) -> bool:

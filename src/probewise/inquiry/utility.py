@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from probewise.errors import ParameterError
 from probewise.inquiry.labels import Label
 from probewise.inquiry.prospect import Prospect
 
-__all__ = ["InformationAbout", "InformationGain", "PerSecond", "ReadingEntropy", "SwitchingUtility"]
-__all__ += ["Utility", "label_entropy"]
+__all__ = ["InformationAbout", "InformationGain", "PerSecond", "ReadingEntropy", "Utility", "label_entropy"]
 
 
 class Utility(Protocol):
@@ -26,15 +25,6 @@ class Utility(Protocol):
 
     def __call__(self, prospect: Prospect) -> FloatArray:
         """Value every design that can be taken, (n,)."""
-        ...
-
-
-@runtime_checkable
-class SwitchingUtility(Utility, Protocol):
-    """A utility that measures one quantity at one stage of a run and another later."""
-
-    def valued(self, prospect: Prospect) -> tuple[FloatArray, str]:
-        """Value every design that can be taken, (n,), and label the quantity that these values are."""
         ...
 
 

@@ -10,11 +10,12 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ReachError, ShapeError
 from probewise.inquiry.choice import best_places, choose
 from probewise.inquiry.designs import Designs
+from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.forecast import AskedForecast
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.prospect import Prospect
 from probewise.inquiry.readout import Readout
-from probewise.inquiry.utility import ReadingEntropy, SwitchingUtility, Utility
+from probewise.inquiry.utility import ReadingEntropy, Utility
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
@@ -29,13 +30,14 @@ class UtilityMap:
     """Hold the worth of each design.
 
     `values` has shape (n_designs,), bits where the utility is an entropy or an information, 0 where
-    `reachable` is False: nothing can be learned where the arm cannot go. `label` names the quantity with its unit.
+    `reachable` is False: nothing can be learned where the arm cannot go. `label` says what the values are, with
+    their unit.
     """
 
     designs: Designs
     values: FloatArray
     reachable: BoolArray
-    label: str
+    label: str = ""
 
     @property
     def grid(self) -> Grid:
@@ -84,8 +86,9 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
     ParameterError
         If one of its values is not finite.
     """
-    valued, label = utility.valued(prospect) if isinstance(utility, SwitchingUtility) else (utility(prospect), None)
-    found = np.asarray(valued, dtype=np.float64)
+    # The one utility with two measures says which of them these values are.
+    worth, label = utility.measure(prospect) if isinstance(utility, Finishing) else (utility(prospect), utility.label)
+    found = np.asarray(worth, dtype=np.float64)
     if found.shape != prospect.rows.shape:
         raise ShapeError(f"the utility gives {found.shape} values; allowed: {prospect.rows.shape}, one a design")
     values = np.zeros(len(prospect.designs))
@@ -93,7 +96,7 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
     values[prospect.rows], reachable[prospect.rows] = found, True
     best_places(values, reachable)  # raises where a value is not finite
     values.flags.writeable = False
-    return UtilityMap(prospect.designs, values, reachable, utility.label if label is None else label)
+    return UtilityMap(prospect.designs, values, reachable, label)
 
 
 def entropy_map(

@@ -77,7 +77,10 @@ def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
     """Embed a PNG or an SVG; the caption is the text for those who cannot see it unless `alt` is given."""
-    return element("figure", _image(image, alt or caption), element("figcaption", caption))
+    kind = "svg+xml" if image.startswith(b"<svg") else "png"
+    source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
+    shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}">')
+    return element("figure", shown, element("figcaption", caption))
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
@@ -90,21 +93,13 @@ def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
     caption
         What all of them show.
     """
-    *earlier, last = (
-        element("div", _image(image, text), paragraph(text, class_="slide"), class_="slide") for image, text in slides
-    )
-    hidden = (Markup(shown.replace("<div", "<div hidden", 1)) for shown in earlier)
+    *earlier, last = (element("div", figure(image, text), class_="slide") for image, text in slides)
+    hidden = (Markup(slide.replace("<div", "<div hidden", 1)) for slide in earlier)
     n = len(slides)
     slider = Markup(
         f'<label hidden>step <input type="range" min="1" max="{n}" value="{n}"> <output>{n} of {n}</output></label>'
     )
-    return element("figure", slider, *hidden, last, element("figcaption", caption), class_="slideshow")
-
-
-def _image(image: bytes, alt: str) -> Markup:
-    kind = "svg+xml" if image.startswith(b"<svg") else "png"
-    source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    return Markup(f'<img src="{source}" alt="{html.escape(alt)}">')
+    return element("div", slider, *hidden, last, paragraph(caption), class_="slideshow")
 
 
 def page(
@@ -171,7 +166,7 @@ def _address(number: str) -> str:
 
 # The slider is hidden until this has run: where scripts are off the last slide stands alone.
 _SLIDER = """
-for (const show of document.querySelectorAll("figure.slideshow")) {
+for (const show of document.querySelectorAll("div.slideshow")) {
   const slides = show.querySelectorAll("div.slide"), label = show.querySelector("label");
   const slider = label.querySelector("input"), said = label.querySelector("output");
   label.hidden = false;
@@ -196,7 +191,7 @@ nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; }
 nav ol ol li { font-weight: 400; font-size: .95rem; }
 a { color: var(--accent); }
 .slideshow label:not([hidden]) { display: flex; gap: .8rem; align-items: center; margin-bottom: .4rem; }
-.slideshow input { flex: 1; max-width: 34rem; } p.slide { margin: .2rem 0; font-variant-numeric: tabular-nums; }
+.slideshow input { flex: 1; max-width: 34rem; } .slide figcaption { font-variant-numeric: tabular-nums; }
 p.answer { font-size: 1.45rem; line-height: 1.3; font-weight: 600; margin: .3rem 0 1rem; max-width: 46rem; }
 figure { margin: .8rem 0 1.2rem; }
 figure img { display: block; max-width: 100%; height: auto; }

@@ -10,8 +10,8 @@ from probewise.diagnosis import ParameterFound, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan
 from probewise.report import diagnosis as page
 from probewise.report.covariate import category_names, covariate_label, covariate_values
-from probewise.report.diagnosis_figures import gain_by_scan, mean_residuals
-from probewise.report.drawing import Bars, Line
+from probewise.report.plots import gain_by_scan
+from probewise.report.residual_means import mean_residuals
 from probewise.report.words import readable
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -40,11 +40,11 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated):
     assert "saturate" in screen
     assert "Hardly: with nothing missing" in screen
     assert "times as probable as before" in screen
-    assert "What to do next" in screen
+    assert "What to measure next" in screen
     assert screen.count("<img") == 1
-    for heading in ("Where it shows", "Before and after", "Noise", "could have shown"):
+    for heading in ("Where it shows", "Before and after", "held-out", "Noise", "could have shown"):
         assert heading in rest
-    assert "not seen at all" in rest
+    assert "not detectable" in rest
 
 
 @pytest.mark.slow
@@ -70,12 +70,12 @@ def test_every_figure_is_svg_that_a_browser_can_read(saturated):
 
 @pytest.mark.slow
 def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
-    """Its mean says nothing where the miss changes its sign within the scan."""
+    """Its mean says nothing where the residual changes its sign within the scan."""
     scan = saturated.recording.plan.scan_names[0]
     place = dataclasses.replace(saturated.where[0], covariate="scan", scan=scan, start=None, end=None, level=None)
     drawn = page.figures(dataclasses.replace(saturated, where=(place,)))
     shown = drawn[place.witness].decode()
-    assert shown.count("each reading") == 2
+    assert shown.count("<!-- one reading -->") == 2
     assert f"(mm), scan {scan}" in shown
 
 
@@ -104,31 +104,65 @@ def test_labels_carry_units():
 def test_residuals_are_averaged_in_even_steps_with_their_chance():
     """Ten thousand readings of a step of two: the means stand at 0 and 2 in steps of the covariate."""
     x = np.linspace(0.0, 1.0, 10_000)
-    marks = mean_residuals(x, 2.0 * (x > 0.5), None, sd=1.0)
-    (line,) = (mark for mark in marks if isinstance(mark, Line))
-    np.testing.assert_allclose(np.diff(line.x), 1 / 24, rtol=0.01)
-    np.testing.assert_allclose(line.y, 2.0 * (line.x > 0.5), atol=0.01)
+    means = mean_residuals(x, 2.0 * (x > 0.5), None, sd=1.0)
+    np.testing.assert_allclose(np.diff(means.at), 1 / 24, rtol=0.01)
+    np.testing.assert_allclose(means.before, 2.0 * (means.at > 0.5), atol=0.01)
+    np.testing.assert_allclose(means.chance, 1.96 / np.sqrt(means.size))
 
 
-def test_values_without_a_scale_stand_side_by_side():
+def test_a_window_is_a_step_of_its_own():
+    """Three readings of 55 stand out: averaged with their neighbours nobody would see them."""
+    x = np.arange(55.0)
+    residuals = np.where((x >= 25) & (x <= 27), -3.0, 0.0)
+    means = mean_residuals(x, residuals, None, sd=1.0, window=(25.0, 27.0))
+    (own,) = np.flatnonzero(means.at == 26.0)
+    assert (means.before[own], means.size[own]) == (-3.0, 3)
+    assert np.all(np.delete(means.before, own) == 0.0)
+
+
+def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
+    """A straight line fitted to noise: what it absorbs, by its posterior samples, makes the band narrower."""
+    rng = np.random.default_rng(2)
+    n, repeats = 48, 400
+    x = np.linspace(-1.0, 1.0, n)
+    design, noise = np.stack([np.ones(n), x], axis=1), rng.standard_normal((repeats, n))
+    residuals = noise - noise @ design @ np.linalg.pinv(design)
+    absorbed = rng.multivariate_normal(np.zeros(2), np.linalg.inv(design.T @ design), 4000) @ design.T
+    inside = [
+        np.abs(means.before) <= means.chance
+        for means in (mean_residuals(x, own, None, sd=1.0, absorbed=absorbed) for own in residuals)
+    ]
+    by_step = np.mean(inside, axis=0)
+    # 400 draws of a share of 0.95 lie below 0.90 or above 0.985 less than once in 1,000.
+    assert by_step.min() > 0.90
+    assert by_step.max() < 0.985
+
+
+def test_noise_that_remembers_widens_the_band():
+    """The variance of the mean of n values of AR(1) approaches (1 + rho) / (1 - rho) / n."""
+    x = np.arange(4800.0)
+    plain, lasting = (mean_residuals(x, 0 * x, None, sd=1.0, rho=rho) for rho in (0.0, 0.6))
+    np.testing.assert_allclose(lasting.chance / plain.chance, np.sqrt(1.6 / 0.4), rtol=0.02)
+
+
+def test_values_without_a_scale_are_a_step_each():
     way = np.repeat([-1.0, 1.0], 30)
-    area, before, after = mean_residuals(way, way, 0 * way, sd=1.0, names={-1.0: "back", 1.0: "forth"})
-    np.testing.assert_allclose(before.y, [-1.0, 1.0])
-    np.testing.assert_allclose(after.y, [0.0, 0.0])
-    assert (before.x < area.x).all()
-    assert (area.x < after.x).all()
+    means = mean_residuals(way, way, 0 * way, sd=1.0, names={-1.0: "back", 1.0: "forth"})
+    np.testing.assert_allclose(means.at, [0.0, 1.0])
+    np.testing.assert_allclose(means.before, [-1.0, 1.0])
+    np.testing.assert_allclose(means.after, [0.0, 0.0])
 
 
 def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
-    panel = gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
-    (bars,) = (mark for mark in panel.marks if isinstance(mark, Bars))
-    np.testing.assert_allclose(bars.length, [*range(39, 33, -1), *range(5, -1, -1)])
-    assert panel.y_names[0] == (0.0, "scan 39")
+    ax = gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
+    lengths = [bar.get_width() for bar in ax.containers[0]]
+    np.testing.assert_allclose(lengths, [*range(39, 33, -1), *range(5, -1, -1)])
+    assert ax.get_yticklabels()[0].get_text() == "scan 39"
 
 
 @pytest.mark.slow
 def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
     worse = dataclasses.replace(saturated.improvement, heldout_log_density_per_reading=-1.0, heldout_sd=0.1)
     found = dataclasses.replace(saturated, improvement=worse)
-    drawn = {**page.figures(saturated), "gain.svg": b""}
+    drawn = {**page.figures(saturated), "gain.svg": b"<svg"}
     assert "Worse than before" in page.write_page(found, drawn, source="some.csv", seed=1)

@@ -1,4 +1,4 @@
-"""The page of a diagnosis: the verdict, where it shows, what it could be, what the repair gains, what to do next."""
+"""The page of a diagnosis: the verdict, the figure that shows it, what to measure next; then the details."""
 
 from __future__ import annotations
 
@@ -19,47 +19,44 @@ from probewise.diagnosis import (
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_unit, covariate_words
-from probewise.report.diagnosis_figures import figures, hypothesis_label
+from probewise.report.diagnosis_figures import figures, shown_first
+from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hypothesis_in_words, listed
+from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
+from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, number, probability, readable, unit_name
 
 __all__ = ["answer", "figures", "sections", "write_page"]
 
-OPENING = {
-    "clean": "Nothing is missing",
-    "named": "The model leaves something out",
-    "cannot_tell": "This recording cannot tell",
-    "noise": "The mean is right, the noise is not plain",
-}
 _MOST_ALIASES = 8
+_MOST_PLACES = 3
+_MOST_CREDIBLE = 6
 _LIKELY = 0.05  # of an effect that is spoken of at once
 _CHANCE = 0.05  # p-value above which nobody is surprised
 _TELLS_SOMETHING = 0.5  # nats
+_NOISE_CAPTIONS = {
+    "correlated_noise": "Correlation of residuals of the same scan, by how many readings they lie apart.",
+    "signal_dependent_noise": "How far residuals scatter, by the predicted reading: plain noise scatters evenly.",
+    "outliers": "How many residuals lie how far out, on a logarithmic scale, beside a normal distribution.",
+    "dropouts": "Recorded against predicted readings; lost readings stand at one value, whatever is predicted.",
+    "quantisation": "Where readings lie between two multiples of the rounding step; unrounded ones lie anywhere.",
+}
 
 
 def answer(diagnosis: Diagnosis) -> str:
-    """Say the verdict in one sentence."""
-    reason = readable(diagnosis.reason.rstrip("."))
-    if diagnosis.verdict == "unknown":  # its reason opens like that itself
-        return f"{reason}."
-    return f"{OPENING[diagnosis.verdict]}: {reason[:1].lower()}{reason[1:]}."
+    """Say the verdict in twenty words at most."""
+    return headline(diagnosis)
 
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
     """Build everything below the first screen."""
     return [
         Section("What it could be", _explanations(diagnosis)),
-        Section(
-            "Where it shows",
-            tuple(figure(drawn[place.witness], _where(diagnosis, place)) for place in diagnosis.where)
-            or (paragraph("Nowhere more than noise explains."),),
-        ),
-        Section("Before and after", _before_and_after(diagnosis, drawn)),
-        Section("Does it predict readings that it has not seen?", _gain(diagnosis, drawn)),
-        Section(
-            "What could not be told apart, and what would", (*_aliases(diagnosis), paragraph(_next_in_words(diagnosis)))
-        ),
-        Section("Noise", _noise(diagnosis)),
+        Section("Where it shows", _places(diagnosis, drawn)),
+        Section("Before and after the repair" if diagnosis.is_repaired else "The model", _fits(diagnosis, drawn)),
+        Section("Does the repaired model predict held-out readings?", _gain(diagnosis, drawn)),
+        Section("Aliased effects, and what would separate them", _aliases(diagnosis)),
+        Section("Noise", _noise(diagnosis, drawn)),
     ]
 
 
@@ -81,50 +78,63 @@ def write_page(
         ),
     )
     design = () if audit is None else (Section("What these readings could have shown", _design(audit)),)
+    known: set[str] = set()
     first = fragment(figure(drawn["first.svg"], _first_caption(diagnosis)), definition_list(_facts(diagnosis)))
     return page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=answer(diagnosis),
-        key_figure=first,
-        sections=[*sections(diagnosis, drawn), *design, run],
+        key_figure=fragment(first, *terms_of(f"{diagnosis.verdict} {first}", known)),
+        sections=explained([*sections(diagnosis, drawn), *design, run], known),
     )
 
 
 def _first_caption(diagnosis: Diagnosis) -> str:
-    where = f" {_where(diagnosis, diagnosis.where[0])}" if diagnosis.where else " Nothing stands out."
-    after = ", blue after the repair" if diagnosis.is_repaired else ""
+    shown = shown_first(diagnosis)
+    bars = "Below: the possible explanations with their probabilities."
+    if shown == "readings":
+        return "The readings in the order of taking. Below: prior probabilities; these readings do not change them."
+    if isinstance(shown, str):
+        return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
+    after = ", blue squares the repaired model" if diagnosis.is_repaired else ""
+    where = f" {_where(diagnosis, shown.place)}" if shown.place else ""
     return (
-        f"Left: recorded minus predicted, averaged; orange as calibrated{after}. The grey band is what chance alone "
-        f"leaves.{where} Right: the explanations with their probabilities."
+        f"Residuals (recorded minus predicted readings), averaged in steps. Orange circles: the model as "
+        f"calibrated{after}. 95 % of such means lie in the grey band by chance alone.{where} {bars}"
     )
 
 
 def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Answer, in words that need no statistics: is it real, does the repair help, what to do now."""
+    """Answer, in words that need no statistics: what to do now, what was found, is it real, does the repair help."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
-    facts = [] if diagnosis.few else [("Could it be chance?", _chance(diagnosis))]
+    facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(diagnosis.reason))]
+    if not diagnosis.few:
+        facts.append(("Could it be chance?", _chance(diagnosis)))
     if gain.heldout_by_scan and diagnosis.is_repaired:
         facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
     if diagnosis.is_repaired:
-        left = f"rms {gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} after"
-        only_here = "; what has no name is put right in these readings alone, sensor.json does not carry it"
-        facts.append(("What is left", left + only_here if diagnosis.corrected else left))
+        left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
+        only_here = ". What has no name is corrected in these readings alone; sensor.json does not carry it"
+        facts.append(("Residuals", f"{left}{only_here if diagnosis.corrected else ''}."))
     if diagnosis.left_open:
-        facts.append(("What its predictions leave open", _shares(diagnosis.left_open)))
-    facts.append(("What to do next", _next_in_words(diagnosis)))
+        facts.append(("In the repaired sensor", _shares(diagnosis.left_open)))
     return facts
 
 
 def _predicts(nats: float, sd: float) -> str:
-    measured = f"{nats:+.3f} ± {sd:.3f} nats a reading of scans that it had not seen".replace("-", "−")
+    measured = f"{_signed_nats(nats, sd)} per held-out reading"
     if nats > 2 * sd:
         return f"Yes: each is {math.exp(min(nats, 50.0)):.3g} times as probable as before ({measured})."
     return f"{'No better than before' if nats > -2 * sd else 'Worse than before'}: {measured}."
 
 
+def _signed_nats(nats: float, sd: float) -> str:
+    written = give_or_take(nats, sd)
+    return f"{readable(written if written.startswith('-') else f'+{written}')} nats"
+
+
 def _shares(shares: Mapping[tuple[str, ...], float]) -> str:
-    listed = (f"{' with '.join(names).replace('_', ' ') or 'no effect'} in {p:.0%}" for names, p in shares.items())
-    return f"{', '.join(listed)} of the samples in sensor.json"
+    held = (f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({p:.0%})" for names, p in shares.items())
+    return f"Samples in sensor.json hold: {', '.join(held)}."
 
 
 def _chance(diagnosis: Diagnosis) -> str:
@@ -134,19 +144,21 @@ def _chance(diagnosis: Diagnosis) -> str:
     elif p_value > 1e-6:
         often = f"with nothing missing, 1 recording in {1 / p_value:,.0f} looks as odd as this ({p})"
     else:
-        often = readable(f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})")
+        often = f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})"
     if diagnosis.verdict == "noise":
-        gained = f"plain noise explains these readings worse by {diagnosis.improvement.log_evidence:.0f} nats"
-        return f"What is said of the noise, hardly: {gained}. The mean is another matter: {often}."
-    if diagnosis.verdict == "unknown" and p_value > _CHANCE:
-        return f"The mean, yes: {often}. That readings far out lie together is no chance."
-    return f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
+        gained = f"its evidence over plain noise is {diagnosis.improvement.log_evidence:.0f} nats"
+        said = f"The noise model, hardly: {gained}. In the mean nothing stands out: {often}."
+    elif diagnosis.verdict == "unknown" and p_value > _CHANCE:
+        said = f"In the mean, yes: {often}. But chance does not put so many outlying readings together."
+    else:
+        said = f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
+    return readable(said)
 
 
 def _next_in_words(diagnosis: Diagnosis) -> str:
     plan = diagnosis.next_measurement
     if plan is None and diagnosis.few:
-        return "Scan across an edge, and take more readings: these say nothing."
+        return "Scan across an edge, and take more readings."
     if plan is None:
         return "Nothing that this apparatus can do would tell more."
     told = plan.expected_log_bayes_factor
@@ -154,24 +166,30 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
     said = f"{plan.description.rstrip('.')}: {asked}, next_plan.csv."
     if told < _TELLS_SOMETHING:
         return f"No plan of {MOST_READINGS} readings was found that tells more than {number(told, 1)} nats: {said}"
-    *others, last = plan.between
+    *others, last = map(_plain, plan.between)
     rivals = f"{others[0]} from {last}" if len(others) == 1 else f"apart {', '.join(others)} and {last}"
-    by = f"by {number(told, 1)} nats; 3 are odds of 20 to 1"
-    return f"{said[:1].upper()}{said[1:]} Expected to tell {rivals} {by}."
+    return f"{said[:1].upper()}{said[1:]} Expected to tell {rivals}, by {number(told, 1)} nats."
+
+
+def _plain(label: str) -> str:
+    """Name a hypothesis of a plan in words, where it goes by names of effects; it may be a phrase already."""
+    names = [part.replace(" ", "_") for part in label.split(" with ")]
+    return listed(map(effect_in_words, names)) if all(name in EFFECTS_IN_WORDS for name in names) else label
 
 
 def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+    credible = [hypothesis_in_words(_effects_of(label)) for label in diagnosis.credible]
     return (
         *(paragraph(_sentence(e.sentence)) for e in diagnosis.effects if e.probability > _LIKELY),
         table(
             ("explanation", "probability"),
             (
-                (hypothesis_label(h.effects).replace("\n", " "), probability(h.probability))
+                (hypothesis_in_words(h.effects), probability(h.probability))
                 for h in diagnosis.hypotheses[:8]
                 if h.probability > 1e-3
             ),
         ),
-        paragraph(f"The smallest set that holds 95 %: {', '.join(diagnosis.credible).replace('_', ' ')}."),
+        *_credible(credible),
         *_candidates(diagnosis),
         *_carried(diagnosis),
         *_weighings(diagnosis),
@@ -179,13 +197,25 @@ def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     )
 
 
+def _effects_of(label: str) -> tuple[str, ...]:
+    """Take a label of the credible set apart."""
+    return () if label == "clean" else tuple(label.split("+"))
+
+
+def _credible(names: Sequence[str]) -> tuple[Markup, ...]:
+    if len(names) <= _MOST_CREDIBLE:
+        return (paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
+    summary = element("summary", f"95 % credible set: {len(names)} explanations")
+    return (element("details", summary, paragraph(f"{'; '.join(names)}.")),)
+
+
 def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Say what something unknown may be, where it may be there at all."""
     likely = [(name, p) for name, p in diagnosis.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
-    listed = ", ".join(f"{name.replace('_', ' ')} ({probability(p)})" for name, p in likely)
-    return (paragraph(f"What has no name may be, or depend on: {listed}."),)
+    said = ", ".join(f"{effect_in_words(name)} ({probability(p)})" for name, p in likely)
+    return (paragraph(f"What is unknown may depend on, or be: {said}."),)
 
 
 def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -202,74 +232,96 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         return ()
     return (
         table(
-            ("weighed twice", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "within a nat"),
+            ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree within a nat"),
             (
                 (
-                    hypothesis_label(w.effects).replace("\n", " "),
+                    hypothesis_in_words(w.effects),
                     str(w.n_gaussians or "–"),
                     number(w.laplace, 2),
-                    f"{number(w.nested, 2)} ± {number(w.error, 2)}",
+                    readable(give_or_take(w.nested, w.error)),
                     ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
                 )
                 for w in diagnosis.weighings
             ),
-            caption="Log evidence with the posterior taken for one Gaussian peak, and by a search of the whole prior.",
+            caption="Log evidence ln Z (nats) by the Laplace approximation and by nested sampling.",
         ),
     )
 
 
-def _before_and_after(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    after = " and repaired" if diagnosis.is_repaired else ""
+def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+    """Show the strongest places, the others folded away."""
+    if not diagnosis.where:
+        return (paragraph("Nothing stands out more than noise explains."),)
+    shown = [figure(drawn[place.witness], _where(diagnosis, place)) for place in diagnosis.where]
+    opening = paragraph(
+        "Residuals of the calibrated model against each covariate in which they stand out, the strongest first. Each "
+        "dot is a reading; 95 % of the means lie in the grey band by chance alone."
+    )
+    first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
+    more = (element("details", element("summary", f"{len(rest)} more"), *rest),) if rest else ()
+    return (opening, *first, *more)
+
+
+def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+    which = "The scan that the repair changes most" if diagnosis.is_repaired else "One scan"
+    colours = "solid orange as calibrated, dashed blue repaired" if diagnosis.is_repaired else "orange"
     return (
         figure(
             drawn["before_after.svg"],
-            f"Readings of one scan, with the model as calibrated{after} on the same axes; below what is left over.",
+            f"{which}: readings (black) and predictions ({colours}), and below the residuals.",
         ),
-        figure(
-            drawn["residuals.svg"],
-            "What is left over of all readings, in time and by predicted reading, with running means.",
-        ),
+        figure(drawn["residuals.svg"], "All residuals in time and by predicted reading, with running means."),
     )
 
 
 def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     shown = (
-        (figure(drawn["gain.svg"], "Each scan kept back in turn, both models fitted to the others."),)
+        (
+            figure(
+                drawn["gain.svg"],
+                "Gain in log predictive density of each held-out scan, both models fitted to the others: blue where "
+                "the repaired model predicts better, orange where worse. Grey: mean of all, with standard error.",
+            ),
+        )
         if "gain.svg" in drawn
-        else (paragraph(_nothing_kept_back(diagnosis)),)
+        else (paragraph(_nothing_held_out(diagnosis)),)
     )
-    held = f"{number(gain.heldout_log_density_per_reading, 4)} ± {number(gain.heldout_sd, 4)} nats each"
-    kept_back = (("readings kept back", held),) if gain.heldout_by_scan else ()
+    held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
+    rms = f"{gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} {unit} after the repair"
+    repaired = (("log evidence gained", f"{number(gain.log_evidence, 1)} nats"), ("rms of the residuals", rms))
     return (
         *shown,
         definition_list(
             (
-                *kept_back,
-                ("log evidence", f"{number(gain.log_evidence, 1)} nats"),
-                (
-                    "rms of the residuals",
-                    f"{number(gain.rms_before, 3)} before, {number(gain.rms_after, 3)} after ({unit})",
-                ),
-                ("something still missing", readable(p_in_words(gain.p_value_after))),
+                *((("gain on held-out readings", held),) if gain.heldout_by_scan else ()),
+                *(repaired if diagnosis.is_repaired else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)),
+                ("test that nothing more is missing", readable(p_in_words(gain.p_value_after))),
             )
         ),
     )
 
 
-def _nothing_kept_back(diagnosis: Diagnosis) -> str:
+def _nothing_held_out(diagnosis: Diagnosis) -> str:
     if not diagnosis.is_repaired:
-        return "The mean is as calibrated: there is no repair to be tested on readings kept back."
-    return "There are fewer than two scans of eight readings or more: none can be kept back."
+        return "The predicted mean is as calibrated: there is no repair to test on held-out readings."
+    return "No scan could be held out: that takes two scans of eight readings or more."
 
 
-def _noise(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     noise = diagnosis.noise
-    said = paragraph(readable(f"Model: {noise.model}; {p_in_words(noise.p_value)} that it explains the noise."))
-    if not noise.parameters:
-        return (said,)
-    rows = ((p.name, p.unit, f"{p.mean:.4g}", f"{p.sd:.2g}") for p in noise.parameters)
-    return (said, table(("parameter", "unit", "mean", "sd"), rows))
+    names = () if noise.model == "white" else tuple(noise.model.split("+"))
+    model = listed(map(effect_in_words, names)) if names else "white: independent, with one sd"
+    rows = ((p.name, "" if p.unit == "1" else p.unit, *_value(p)) for p in noise.parameters)
+    return (
+        paragraph(readable(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
+        *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
+        figure(
+            drawn["noise.svg"],
+            "Residuals after the repair, if any. Above: correlation within scans by the number of readings between. "
+            "Middle: scatter by predicted reading. Below: how many lie how far out, on a logarithmic scale.",
+        ),
+    )
 
 
 def _effects(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -284,11 +336,11 @@ def _effects(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     rows = [
         (
-            effect.name.replace("_", " ") if k == 0 else "",
+            _with_name(effect.name) if k == 0 else "",
             probability(effect.probability) if k == 0 else "",
             number(effect.size_lambda, 1) if k == 0 else "",
-            p.name,
-            *(_value(p) if p.name != "scans" else (", ".join(effect.scans), "")),
+            p.name.replace("_", " "),
+            *(_value(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
         for k, p in enumerate(effect.parameters)
@@ -296,12 +348,17 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     return table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
 
 
-def _value(found: ParameterFound) -> tuple[str, str]:
-    """Write a parameter with its sd and unit, and its interval."""
+def _with_name(name: str) -> str:
+    """Name an effect in words and as diagnosis.json does."""
+    said = effect_in_words(name)
+    return f"{said} ({name})" if said != name else name
+
+
+def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
+    """Write a parameter with its sd, with its unit where asked, and its interval."""
     low, high = found.interval95
-    unit = "" if found.unit == "1" else f" {found.unit}"
-    value = f"{give_or_take(found.mean, found.sd)}{unit}"
-    return readable(value), readable(f"{low:.4g} to {high:.4g}")
+    own = f" {found.unit}" if unit and found.unit != "1" else ""
+    return readable(f"{give_or_take(found.mean, found.sd)}{own}"), readable(f"{low:.4g} to {high:.4g}")
 
 
 def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -309,7 +366,7 @@ def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = {name for label in diagnosis.credible for name in label.split("+")}
     ranked = sorted(diagnosis.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
-        return (paragraph("Every effect that could show here leaves a trace of its own."),)
+        return (paragraph("None: each effect that could show here changes these readings in a way of its own."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
     if not rest:
         return (_alias_table(first),)
@@ -319,7 +376,7 @@ def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 def _alias_table(aliases: Sequence[Alias]) -> Markup:
     return table(
-        ("alike in these readings", "cosine", "what would settle it", "readings"),
+        ("aliased in these readings", "cosine", "what would separate them", "readings needed"),
         (
             (
                 " and ".join(a.effects).replace("_", " "),
@@ -338,15 +395,20 @@ def _readings(n: int) -> str:
 
 
 def _design(audit: PlanAudit) -> tuple[Markup, ...]:
-    def listed(names: Sequence[str]) -> str:
-        return ", ".join(names).replace("_", " ") or "none"
+    def names(found: Sequence[str]) -> str:
+        return ", ".join(found).replace("_", " ") or "none"
+
+    aliased = [f"{e.name} (with {e.alike[0][0]})" for e in audit.seen_as("aliased")]
 
     return (
         definition_list(
             (
-                ("seen and told apart", listed([e.name for e in audit.seen_as("fine")])),
-                ("taken for another", listed([f"{e.name} (as {e.alike[0][0]})" for e in audit.seen_as("aliased")])),
-                ("not seen at all", listed([e.name for e in audit.seen_as("invisible")])),
+                ("detectable and identifiable", names([e.name for e in audit.seen_as("fine")])),
+                (
+                    "detectable, but aliased",
+                    names(aliased),
+                ),
+                ("not detectable", names([e.name for e in audit.seen_as("invisible")])),
             )
         ),
         element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),
@@ -359,14 +421,18 @@ def _sentence(text: str) -> str:
 
 
 def _where(diagnosis: Diagnosis, place: Place) -> str:
-    shows = "It shows" if place.p_value < ALARM else "What stands out most, as chance may have it, is"
-    what = f"{shows} in the {covariate_words(place.covariate)}"
+    """Say where the residuals stand out."""
+    covariate = "scan" if place.covariate == "scan" else covariate_words(place.covariate)
+    unit = covariate_unit(place.covariate, diagnosis.recording.plan.instrumentation.unit)
     if place.covariate == "scan":
-        what = f"{shows} in scan {place.scan}"
-    elif place.start is not None and place.end is not None:
-        unit = covariate_unit(place.covariate, diagnosis.recording.plan.instrumentation.unit)
+        what = f"scan {place.scan}"
+    elif place.start is None or place.end is None:
+        what = covariate
+    else:
         start, end = f"{place.start:.4g}", f"{place.end:.4g}"
-        what += f" at {start} {unit}".rstrip() if start == end else f" from {start} to {end} {unit}".rstrip()
+        ends = start if start == end else f"{start} to {end}"
+        what = f"{covariate}, {ends} {unit}".rstrip()
     if place.scan and place.covariate != "scan":
         what += f", scan {place.scan}"
-    return readable(f"{what} ({p_in_words(place.p_value)}).")
+    chance = "" if place.p_value < ALARM else ", which may be chance"
+    return readable(f"What stands out: {what} ({p_in_words(place.p_value)}{chance}).")

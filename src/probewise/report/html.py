@@ -197,6 +197,7 @@ figure { margin: .8rem 0 1.2rem; }
 figure img { display: block; max-width: 100%; height: auto; }
 figcaption, caption { color: var(--soft); font-size: .9rem; text-align: left; margin-top: .35rem; max-width: 46rem; }
 p { max-width: 46rem; }
+p.terms { font-size: .85rem; color: var(--soft); }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: .6rem 0 1rem; font-size: .95rem; }
 th, td { padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
@@ -207,7 +208,6 @@ code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
 @media (max-width: 34rem) {
   p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
-  figure { overflow-x: auto; } figure img[src^="data:image/svg"] { min-width: 42rem; max-width: none; }
 }
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }
 """

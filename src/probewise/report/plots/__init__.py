@@ -10,13 +10,27 @@ run of nested sampling.
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
-from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
+from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
+from probewise.report.plots.noise import (
+    correlation_of_neighbours,
+    lattice_of_readings,
+    lost_readings,
+    spread_by_level,
+    tails,
+)
 from probewise.report.plots.patterns import quadrant_patterns, sensor_orientations
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
 from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
+from probewise.report.plots.residuals import (
+    gain_by_scan,
+    mean_residuals_along,
+    one_scan,
+    readings_in_order,
+    residual_clouds,
+)
 from probewise.report.plots.scans import before_and_after, residuals_by_scan
 from probewise.report.plots.scene import playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
@@ -31,11 +45,17 @@ __all__ = [
     "calibration_check",
     "confusion_matrix",
     "corner_plot",
+    "correlation_of_neighbours",
+    "gain_by_scan",
     "grid_of_axes",
     "hypothesis_probabilities",
     "information_gained",
     "insertion_plot",
+    "lattice_of_readings",
     "log_evidences",
+    "lost_readings",
+    "mean_residuals_along",
+    "one_scan",
     "playing_field",
     "png",
     "posterior_widths",
@@ -43,14 +63,20 @@ __all__ = [
     "quadrant_patterns",
     "reach_map",
     "readings_by_orientation",
+    "readings_in_order",
     "readings_needed",
     "reliability_diagram",
+    "residual_clouds",
     "residuals_against",
     "residuals_by_scan",
     "run_plot",
     "sensor_orientations",
     "spatial_sensitivity",
+    "spread_by_level",
     "ssf_by_order",
+    "stack_of_axes",
+    "svg",
+    "tails",
     "trace_plot",
     "widths_of_runs",
 ]

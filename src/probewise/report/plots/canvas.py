@@ -6,19 +6,37 @@ Figures are made without pyplot: no global state, no window, nothing to close.
 from __future__ import annotations
 
 import io
+import math
+from collections.abc import Sequence
 from typing import Any, TypeAlias, cast
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
+from probewise.report.words import readable
 
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
-__all__ += ["AxesGrid", "axes_or_new", "grid_of_axes", "png", "tidy"]
+__all__ += [
+    "AxesGrid",
+    "axes_or_new",
+    "grid_of_axes",
+    "legend_above",
+    "plain_numbers",
+    "png",
+    "stack_of_axes",
+    "svg",
+    "tidy",
+]
+
+_LETTERS_PER_IN = 15.0  # of a legend, about
 
 AxesGrid: TypeAlias = NDArray[Any]
 
@@ -51,6 +69,62 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110) -> bytes:
     buffer = io.BytesIO()
     sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight")
     return buffer.getvalue()
+
+
+def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
+    """Make a new figure of axes one above another, shape (n_axes,); `svg` finds their margins in one pass."""
+    sheet = Figure(figsize=(width_in, sum(heights_in)))
+    FigureCanvasAgg(sheet)
+    axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
+    return np.asarray(axes[:, 0], dtype=np.object_)
+
+
+def svg(drawing: Axes | AxesGrid) -> bytes:
+    """Render the figure that holds a drawing as SVG, the same bytes for the same drawing."""
+    ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
+    sheet = cast(Figure, ax.figure)
+    sheet.tight_layout(pad=0.4, h_pad=0.9)
+    buffer, own = io.BytesIO(), sheet.canvas
+    canvas: Any = FigureCanvasSVG(sheet)
+    with mpl.rc_context({"svg.hashsalt": "probewise"}):
+        canvas.print_svg(buffer, metadata={"Date": None})  # `savefig` would draw everything twice
+    sheet.set_canvas(own)
+    text = buffer.getvalue()
+    return text[text.index(b"<svg") :]
+
+
+def legend_above(ax: Axes) -> None:
+    """Set the legend above the axes, in as many columns as fit: it never lies over data."""
+    handles, labels = ax.get_legend_handles_labels()
+    if not labels:
+        return
+    room = _LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
+    n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width(labels, n) < room), 1)
+    ax.legend(
+        handles,
+        labels,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=n_columns,
+        frameon=False,
+        fontsize="small",
+        borderaxespad=0.1,
+        columnspacing=1.2,
+    )
+
+
+def _legend_width(labels: Sequence[str], n_columns: int) -> int:
+    """Count the letters across a legend, which is filled column by column; each sample is as wide as five."""
+    n_rows = -(-len(labels) // n_columns)
+    return sum(max(map(len, labels[k : k + n_rows])) + 6 for k in range(0, len(labels), n_rows))
+
+
+def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
+    """Write tick labels in full, with a true minus sign: no factor or offset stands apart from them."""
+    for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
+        low, high = axis.get_view_interval()
+        digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
+        axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: readable(f"{round(v, digits) + 0.0:.10g}")))
 
 
 def tidy(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,13 +32,17 @@ def hypothesis_probabilities(
     rest = float(np.sum(np.asarray(probabilities)[order[most:]]))
     if len(order) > most:
         shown.append((f"{len(order) - most} others", rest))
-    ax = axes_or_new(ax, size_in=(6.6, 0.8 + 0.36 * len(shown)))
-    at = np.arange(len(shown))[::-1]
-    ax.barh(at, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.62)
-    for y, (_, p) in zip(at, shown, strict=True):
-        ax.annotate(f"{p:.3f}", (p, float(y)), xytext=(4, 0), textcoords="offset points", va="center", fontsize="small")
-    ax.set_yticks(at, [name.replace("_", " ") for name, _ in shown])
-    ax.set_xlim(0, 1.12)
-    # Room for four bars at least, so that one alone is no wall.
-    ax.set_ylim(min(-0.5, len(shown) - 4.5), len(shown) - 0.5)
+    ax = axes_or_new(ax, size_in=(6.6, 0.6 + 0.42 * len(shown)))
+    at = -np.arange(len(shown), dtype=np.float64)
+    ax.barh(at - 0.2, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.38)
+    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": "small"}
+    for y, (name, p) in zip(at, shown, strict=True):
+        ax.annotate(f"{p:.3f}", (p, y - 0.2), xytext=(4, 0), va="center", **beside)
+        ax.annotate(name.replace("_", " "), (0.0, y + 0.03), xytext=(3, 0), **beside)
+    ax.set_yticks([])
+    ax.spines["left"].set_visible(False)
+    ax.set_xlim(0, 1.08)
+    ax.set_xticks(np.linspace(0.0, 1.0, 6))
+    # Room for three bars at least, so that one alone is no wall.
+    ax.set_ylim(min(at[-1], -2.0) - 0.5, 0.5)
     return tidy(ax, x="probability", y="")

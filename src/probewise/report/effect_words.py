@@ -1,0 +1,73 @@
+"""Effects and hypotheses as a headline names them: in words that need no vocabulary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+__all__ = ["EFFECTS_IN_WORDS", "effect_in_words", "hypothesis_in_words", "listed"]
+
+EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "ambient_gradient": "stray light from one side",
+        "ambient_step": "a sudden change of the room light",
+        "offset_drift": "a slow drift of all readings",
+        "gain_drift": "a lamp that warms up",
+        "battery_sag": "a signal that follows the battery",
+        "flicker": "a flickering lamp",
+        "saturation": "readings cut off at a limit",
+        "nonlinearity": "a bent response curve",
+        "quantisation": "rounded readings",
+        "hysteresis": "an offset between both directions of motion",
+        "lag": "a sensor that follows slowly",
+        "backlash": "backlash (play) of the arm",
+        "position_scale": "a wrong scale of the positions",
+        "periodic_position_error": "a periodic position error of the arm",
+        "edge_misplacement": "edges that are not where they should be",
+        "scan_misplacement": "a displaced pattern in one scan",
+        "scan_angle_error": "a wrong sensor angle in some scans",
+        "orientation_error": "a wrong sensor angle in all scans",
+        "sensor_tilt": "a tilted sensor",
+        "height_gradient": "a sloping table",
+        "height_offset": "another sensor height in some scans",
+        "albedo_gradient": "unevenly white paper",
+        "albedo_patch": "a stain on the paper",
+        "edge_blur": "soft printed edges",
+        "edge_shadow": "shadows along the edges",
+        "halo": "scattered light around the spot",
+        "glint": "a glint at one place",
+        "ssf_order": "a finer sensitivity function",
+        "signal_dependent_noise": "noise that grows with the signal",
+        "correlated_noise": "noise that neighbouring readings share",
+        "outliers": "outlying readings",
+        "dropouts": "lost readings",
+        "drifting_noise": "noise that changes in time",
+        "arm_knock": "an arm or sheet that was pushed",
+        "gain_step": "a sudden change of the signal's strength",
+        "bent_rails": "bent rails",
+        "missing_tooth": "a jump of the arm's position",
+        "stick_slip": "a slide that sticks and jumps",
+        "reflection": "a reflection beside the spot",
+        "slow_turn": "a sensor that slowly turns",
+        "slow_sinking": "a sensor that slowly rises or sinks",
+    }
+)
+"""A noun phrase for each effect, to stand behind "the model leaves out"."""
+
+
+def effect_in_words(name: str) -> str:
+    """Name an effect; one of a user's own goes by its own name."""
+    return EFFECTS_IN_WORDS.get(name, name.replace("_", " "))
+
+
+def hypothesis_in_words(effects: Sequence[str]) -> str:
+    """Name a hypothesis: a set of effects, () for clean, ("unknown",) for what has no name."""
+    if not effects:
+        return "nothing is missing"
+    return "something without a name" if tuple(effects) == ("unknown",) else listed(map(effect_in_words, effects))
+
+
+def listed(names: Sequence[str] | map[str]) -> str:
+    """Join names: A, B and C."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last

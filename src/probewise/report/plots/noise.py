@@ -1,0 +1,158 @@
+"""What the noise looks like beside plain noise: correlation of neighbours, spread by level, tails, lattice."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.report.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    VERMILLION,
+    legend_above,
+    plain_numbers,
+    stack_of_axes,
+    tidy,
+)
+
+__all__ = ["correlation_of_neighbours", "lattice_of_readings", "lost_readings", "spread_by_level", "tails"]
+
+_MOST_LAGS = 12
+_STEPS = 12
+_PLAIN = "95 % of plain noise"
+
+
+def correlation_of_neighbours(
+    residuals: FloatArray, scan: IntArray, *, rho: float | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the correlation of residuals of one scan with those so many readings before, and the band of plain noise.
+
+    Parameters
+    ----------
+    residuals, scan
+        Shape (n_points,): residuals, NaN where there is no usable reading, and the number of the scan of each.
+    rho
+        Correlation of neighbours found: its powers are drawn beside.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    lags = np.arange(1, min(_MOST_LAGS, max(len(residuals) // 4, 1)) + 1)
+    variance = float(np.nanmean(residuals**2)) or 1.0
+    found, chance = np.full(len(lags), np.nan), np.full(len(lags), np.nan)
+    for k, lag in enumerate(lags):
+        pairs = (residuals[lag:] * residuals[:-lag])[scan[lag:] == scan[:-lag]]
+        pairs = pairs[np.isfinite(pairs)]
+        if pairs.size:
+            found[k], chance[k] = pairs.mean() / variance, 1.96 / np.sqrt(pairs.size)
+    ax.fill_between(lags, -chance, chance, color=GREY, alpha=0.3, linewidth=0, label=_PLAIN)
+    ax.axhline(0, color=BLACK, linewidth=0.7)
+    ax.vlines(lags, 0, found, color=VERMILLION, linewidth=1.4)
+    ax.plot(lags, found, "o", color=VERMILLION, markersize=5, label="residuals")
+    if rho is not None:
+        ax.plot(lags, rho**lags, "--", color=BLUE, linewidth=1.5, label=f"noise model found: {rho:.2f} per step")
+    ax.set_xticks(lags)
+    tidy(ax, x="how many readings apart (same scan)", y="correlation (no unit)")
+    plain_numbers(ax, x=False)
+    legend_above(ax)
+    return ax
+
+
+def spread_by_level(
+    predicted: FloatArray,
+    residuals: FloatArray,
+    *,
+    unit: str,
+    model_sd: FloatArray | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the rms of residuals in steps of the predicted reading, and the band in which one sd for all would lie.
+
+    Parameters
+    ----------
+    predicted, residuals
+        Shape (n_points,); residuals are NaN where there is no usable reading.
+    unit
+        Of the readings.
+    model_sd
+        Noise sd of each reading by the noise model found, (n_points,).
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    ok = np.flatnonzero(np.isfinite(residuals) & np.isfinite(predicted))
+    parts = np.array_split(ok[np.argsort(predicted[ok], kind="stable")], max(1, min(_STEPS, len(ok) // 8)))
+    at = np.array([predicted[p].mean() for p in parts])
+    rms = np.array([np.sqrt(np.mean(residuals[p] ** 2)) for p in parts])
+    size = np.array([p.size for p in parts])
+    overall = float(np.sqrt(np.mean(residuals[ok] ** 2)))
+    # The sd of an rms of n normal values is close to sd / sqrt(2 n).
+    half = 1.96 * overall / np.sqrt(2 * size)
+    ax.errorbar(at, rms, 1.96 * rms / np.sqrt(2 * size), fmt="o", color=VERMILLION, capsize=3, label="residuals, 95 %")
+    ax.fill_between(at, overall - half, overall + half, color=GREY, alpha=0.3, linewidth=0, label=_PLAIN)
+    if model_sd is not None:
+        by_model = np.array([np.sqrt(np.mean(model_sd[p] ** 2)) for p in parts])
+        ax.plot(at, by_model, "--", color=BLUE, linewidth=1.6, label="noise model found")
+    ax.set_ylim(bottom=0.0)
+    tidy(ax, x=f"predicted reading ({unit})", y=f"rms of residuals ({unit})")
+    plain_numbers(ax)
+    legend_above(ax)
+    return ax
+
+
+def tails(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
+    """Draw how many residuals lie how far out, beside a normal distribution of the noise's sd.
+
+    Parameters
+    ----------
+    residuals
+        Shape (n_points,), NaN where there is no usable reading.
+    sd
+        Of the noise without its tail.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    z = residuals[np.isfinite(residuals)] / sd
+    most = float(np.clip(np.abs(z).max(initial=4.0), 4.0, 30.0))
+    edges = np.arange(-np.ceil(most), np.ceil(most) + 0.25, 0.5)
+    counts = np.histogram(np.clip(z, edges[0], edges[-1]), edges)[0]
+    ax.bar(edges[:-1] + 0.25, counts, 0.45, color=VERMILLION, label="residuals")
+    at = np.linspace(-5, 5, 201)
+    normal = len(z) * 0.5 * np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
+    ax.plot(at, normal, "--", color=BLACK, linewidth=1.4, label="normal distribution")
+    ax.set_yscale("log")
+    ax.set_ylim(0.5, 2 * max(float(counts.max(initial=1)), 1.0))
+    tidy(ax, x="residual (sds of the noise)", y="readings per half sd")
+    plain_numbers(ax)
+    legend_above(ax)
+    return ax
+
+
+def lost_readings(
+    predicted: FloatArray, readings: FloatArray, lost: BoolArray, *, unit: str, ax: Axes | None = None
+) -> Axes:
+    """Draw recorded against predicted readings, those that are lost marked; all arrays (n_points,)."""
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    ax.plot(predicted[~lost], readings[~lost], "o", color=GREY, markersize=3, label="reading")
+    ax.plot(predicted[lost], readings[lost], "X", color=VERMILLION, markersize=7, label="lost reading")
+    ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, color=BLACK, linewidth=0.7)
+    tidy(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
+    plain_numbers(ax)
+    legend_above(ax)
+    return ax
+
+
+def lattice_of_readings(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw where between two multiples of a step the readings lie, (n_points,): rounded ones lie at one place."""
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    finite = readings[np.isfinite(readings)]
+    counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, 41, (-0.5, 0.5))
+    ax.bar((edges[:-1] + edges[1:]) / 2, counts, 0.9 / 41, color=VERMILLION, label="readings")
+    ax.axhline(len(finite) / 41, color=GREY, linestyle="--", label="without rounding")
+    tidy(ax, x=f"distance from a multiple of {step:.4g} {unit} (steps)", y="readings")
+    plain_numbers(ax)
+    legend_above(ax)
+    return ax

@@ -1,0 +1,248 @@
+"""Residuals of the calibrated and of the repaired model: along a covariate, in one scan, scan by scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from probewise._arrays import FloatArray
+from probewise.recordings import Recording
+from probewise.report.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    SKY,
+    VERMILLION,
+    AxesGrid,
+    legend_above,
+    plain_numbers,
+    stack_of_axes,
+    tidy,
+)
+from probewise.report.residual_means import Means
+from probewise.report.words import number, signed, unit_name
+
+__all__ = [
+    "AFTER",
+    "BEFORE",
+    "gain_by_scan",
+    "mean_residuals_along",
+    "one_scan",
+    "readings_in_order",
+    "residual_clouds",
+]
+
+BEFORE, AFTER = "as calibrated", "repaired"
+_MANY = 1500  # dots from which they are drawn as an image inside the SVG
+_ASIDE = 0.15  # of the place of a value with a name: how far the means before and after stand from its middle
+_LEAST_SHADE = 0.008  # of the width of the axes
+_MOST_SCANS = 12
+
+
+def mean_residuals_along(
+    means: Means,
+    *,
+    label: str,
+    unit: str,
+    each: tuple[FloatArray, FloatArray] | None = None,
+    window: tuple[float, float] | None = None,
+    names: Sequence[str] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw mean residuals against a covariate, the 95 % band of chance, and the part of it that stands out.
+
+    Parameters
+    ----------
+    means
+        From `mean_residuals`.
+    label, unit
+        Of the covariate with its unit; of the readings.
+    each
+        Covariate and residual of every reading, (n_points,) each, drawn as dots behind.
+    window
+        Ends of what stands out, shaded.
+    names
+        Names of the values 0, 1, 2 ... of a covariate without a scale.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    if each is not None:
+        _dots(ax, *each, GREY, "one reading", size=5)
+    ax.axhline(0, color=BLACK, linewidth=0.7)
+    if names:
+        ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, color=GREY, alpha=0.3, label=_CHANCE)
+    elif len(means.at) == 1:
+        ax.errorbar(means.at, [0.0], yerr=means.chance, color=GREY, linewidth=8, alpha=0.3, label=_CHANCE)
+    else:
+        ax.fill_between(means.at, -means.chance, means.chance, color=GREY, alpha=0.3, linewidth=0, label=_CHANCE)
+    aside = _ASIDE if names and means.after is not None else 0.0
+    said = "mean, " if each is not None else ""
+    drawn = ((means.before, VERMILLION, "o", BEFORE, -aside), (means.after, BLUE, "s", AFTER, aside))
+    for values, colour, marker, name, step in drawn:
+        if values is not None:
+            line = f"{marker}" if names else f"{marker}-"
+            ax.plot(means.at + step, values, line, color=colour, ms=4.5, lw=1.4, label=f"{said}{name}")
+    if names:
+        _names_on_x(ax, names)
+    if window is not None:
+        low, high = ax.get_xlim()
+        middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
+        ax.axvspan(middle - half, middle + half, color=SKY, alpha=0.3, linewidth=0, label="stands out here", zorder=0)
+    averaged = each is None and int(means.size.max(initial=1)) > 1
+    tidy(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
+    plain_numbers(ax, x=not names)
+    legend_above(ax)
+    return ax
+
+
+def one_scan(
+    along: FloatArray,
+    readings: FloatArray,
+    models: Sequence[tuple[str, FloatArray]],
+    *,
+    label: str,
+    unit: str,
+) -> AxesGrid:
+    """Draw the readings of one scan with what each model predicts, and below the residuals of each.
+
+    Parameters
+    ----------
+    along, readings
+        Place or time, and reading, (n_rows,); NaN where there is no usable reading.
+    models
+        Name and predicted readings, (n_rows,), the calibrated model first.
+    label, unit
+        Of the x axis with its unit; of the readings.
+
+    Returns
+    -------
+    The two axes, shape (2,).
+    """
+    axes = stack_of_axes([2.6, 1.7])
+    above, below = axes
+    above.plot(along, readings, "o", color=BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
+    below.axhline(0, color=BLACK, linewidth=0.7)
+    for (name, predicted), (colour, marker, line) in zip(models, _STYLES, strict=False):
+        above.plot(along, predicted, color=colour, linewidth=1.6, linestyle=line, label=f"predicted, {name}")
+        style = {"color": colour, "marker": marker, "markersize": 3.2, "alpha": 0.8, "linestyle": "none"}
+        below.plot(along, readings - predicted, label=f"residual, {name}", **style)
+    below.sharex(above)
+    tidy(above, x="", y=f"reading ({unit})")
+    tidy(below, x=label, y=f"residual ({unit})")
+    for ax in axes:
+        plain_numbers(ax)
+        legend_above(ax)
+    return axes
+
+
+def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
+    """Draw readings in the order of taking: all that there is to see of a few."""
+    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    usable = np.flatnonzero(recording.usable)
+    ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
+    tidy(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    plain_numbers(ax)
+    return ax
+
+
+def residual_clouds(
+    covariates: Sequence[tuple[str, FloatArray]], models: Sequence[tuple[str, FloatArray]], *, unit: str
+) -> AxesGrid:
+    """Draw all residuals against each covariate, with running means, a panel a covariate.
+
+    Parameters
+    ----------
+    covariates
+        Label with its unit, and values, (n_points,).
+    models
+        Name and residuals, (n_points,), NaN where there is no usable reading; the calibrated model first.
+    unit
+        Of the readings.
+
+    Returns
+    -------
+    The axes, shape (n_covariates,).
+    """
+    axes = stack_of_axes([2.2] * len(covariates))
+    for ax, (label, at) in zip(axes, covariates, strict=True):
+        ax.axhline(0, color=BLACK, linewidth=0.7)
+        for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
+            _dots(ax, at, residuals, colour, "", size=4, alpha=0.3)
+            ax.plot(
+                *_running_mean(at, residuals),
+                color=colour,
+                linewidth=2.0,
+                linestyle=line,
+                label=f"running mean, {name}",
+            )
+        tidy(ax, x=label, y=f"residual ({unit})")
+        plain_numbers(ax)
+        legend_above(ax)
+    return axes
+
+
+def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float, *, ax: Axes | None = None) -> Axes:
+    """Draw the gain on each held-out scan, nats per reading, and the mean of all with its standard error.
+
+    Parameters
+    ----------
+    scans
+        Name and gain of each. Of more than twelve those of largest and least gain are drawn.
+    mean, sd
+        Over all held-out readings, with the standard error.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ranked = sorted(scans, key=lambda pair: -pair[1])
+    if len(ranked) > _MOST_SCANS:
+        ranked = [*ranked[: _MOST_SCANS // 2], *ranked[-_MOST_SCANS // 2 :]]
+    ax = ax if ax is not None else stack_of_axes([1.0 + 0.28 * max(len(ranked), 3)])[0]
+    gains = np.array([gain for _, gain in ranked])
+    at = -np.arange(len(ranked), dtype=np.float64)
+    ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
+    ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0)
+    said = f"all scans: {signed(mean, 3)} ± {number(sd, 3)} nats per reading"
+    ax.axvline(mean, color=GREY, linewidth=1.4, label=said)
+    ax.axvline(0, color=BLACK, linewidth=0.7)
+    ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
+    ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
+    tidy(ax, x="gain on a scan that the fit has not seen (nats per reading)", y="held-out scan")
+    plain_numbers(ax, y=False)
+    legend_above(ax)
+    return ax
+
+
+_CHANCE = "95 % of chance alone"
+_STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
+
+
+def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str, *, size: float, alpha: float = 0.55) -> None:
+    ok = np.isfinite(x) & np.isfinite(y)
+    many = bool(ok.sum() > _MANY)
+    ax.scatter(x[ok], y[ok], size, color=colour, alpha=alpha, linewidth=0, label=label or None, rasterized=many)
+
+
+def _names_on_x(ax: Axes, names: Sequence[str]) -> None:
+    """Set names below their values, slanted and thinned where they do not fit side by side."""
+    width_in = cast(Figure, ax.figure).get_figwidth()  # none of our figures has subfigures
+    fits = sum(len(name) + 2 for name in names) < 12 * width_in
+    skip = max(1, round(len(names) / (4 * width_in)))
+    slant: dict[str, Any] = {} if fits else {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    at = np.arange(len(names))
+    ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize="small", **slant)
+    ax.set_xlim(-0.6, len(names) - 0.4)
+
+
+def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Average groups of about one twentieth of the points, neighbours in x."""
+    ok = np.isfinite(x) & np.isfinite(y)
+    x, y = x[ok], y[ok]
+    if x.size == 0:
+        return x, y
+    groups = np.array_split(np.argsort(x, kind="stable"), max(1, min(20, len(x) // 4)))
+    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

@@ -1,0 +1,139 @@
+"""Means of residuals in steps of a covariate, with the band that chance alone would fill."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+
+__all__ = ["Means", "mean_residuals"]
+
+_STEPS = 24
+_MOST_STEPS = 60
+_LEAST_ROWS = 4
+_NEVER_LESS = 0.05  # of the variance of a mean: a band has some width however much the fit takes up
+
+
+@dataclass(frozen=True, eq=False)
+class Means:
+    """One mean a step, all (n_steps,).
+
+    `at` is the covariate's mean, or 0, 1, 2 ... where its values have names; `before` and `after` are the mean
+    residuals of the calibrated and of the repaired model (`after` None: nothing was repaired); `chance` is
+    half the width of the 95 % band; `size` is the number of readings.
+    """
+
+    at: FloatArray
+    before: FloatArray
+    after: FloatArray | None
+    chance: FloatArray
+    size: IntArray
+
+    @property
+    def stands_out(self) -> float:
+        """Largest mean of the calibrated model's residuals, in sds of chance."""
+        return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
+
+
+def mean_residuals(
+    covariate: FloatArray,
+    before: FloatArray,
+    after: FloatArray | None,
+    *,
+    sd: FloatArray | float,
+    rho: float = 0.0,
+    scan: IntArray | None = None,
+    names: Mapping[float, str] | None = None,
+    window: tuple[float, float] | None = None,
+    absorbed: FloatArray | None = None,
+) -> Means:
+    """Average residuals in steps of a covariate.
+
+    Parameters
+    ----------
+    covariate, before, after
+        Shape (n_points,): the covariate, and recorded minus predicted reading by both models; NaN where there is none.
+    sd
+        Noise of one reading, one for all or (n_points,).
+    rho, scan
+        Correlation of its noise with that of the reading before it in the same scan; the scan of each, (n_points,).
+    names
+        Names of the values of a covariate without a scale: each is a step.
+    window
+        Part of the covariate that is a step of its own, or several, so that no step mixes it with the rest.
+    absorbed
+        Posterior samples of the predictions, (n_samples, n_points): their variance is what the fit absorbs of the
+        noise, and the band is narrower by it.
+    """
+    ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
+    values = covariate[ok]
+    groups = _by_value(values) if names else _in_steps(values, window)
+    rows = [ok[group] for group in groups]
+    at = np.arange(len(groups), dtype=np.float64) if names else np.array([values[g].mean() for g in groups])
+    sd_of_row = np.broadcast_to(np.asarray(sd, dtype=np.float64), before.shape)
+    scan = np.zeros(len(before), dtype=np.int64) if scan is None else scan
+    variance = np.array([_variance_of_mean(r, sd_of_row, scan, rho) for r in rows])
+    if absorbed is not None:
+        taken = np.array([np.var(absorbed[:, r].mean(axis=1)) for r in rows])
+        variance = np.maximum(variance - taken, _NEVER_LESS * variance)
+    return Means(
+        at,
+        np.array([before[r].mean() for r in rows]),
+        None if after is None else np.array([after[r].mean() for r in rows]),
+        1.96 * np.sqrt(variance),
+        np.array([r.size for r in rows], dtype=np.int64),
+    )
+
+
+def _by_value(values: FloatArray) -> list[IntArray]:
+    return [np.flatnonzero(values == value) for value in np.unique(values)]
+
+
+def _in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
+    """Group rows in even steps of the covariate, neighbours with too few joined, a window apart from the rest."""
+    if values.size == 0:
+        return []
+    if window is None:
+        return _even(values, np.arange(values.size), _LEAST_ROWS)
+    inside = (values >= window[0]) & (values <= window[1])
+    least = int(np.clip(inside.sum(), 1, _LEAST_ROWS))
+    parts = (values < window[0], inside, values > window[1])
+    return [group for part in parts if part.any() for group in _even(values, np.flatnonzero(part), least)]
+
+
+def _even(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
+    mine = values[rows]
+    share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
+    n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
+    step = np.minimum((n * (mine - mine.min()) / max(float(np.ptp(mine)), 1e-300)).astype(int), n - 1)
+    return _joined([rows[step == k] for k in range(n)], least)
+
+
+def _joined(parts: Sequence[IntArray], least: int) -> list[IntArray]:
+    groups: list[IntArray] = []
+    waiting = np.empty(0, dtype=np.int64)
+    for part in parts:
+        waiting = np.concatenate([waiting, part])
+        if waiting.size >= least:
+            groups.append(waiting)
+            waiting = waiting[:0]
+    return groups if not waiting.size else [*groups[:-1], np.concatenate([*groups[-1:], waiting])]
+
+
+def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float) -> float:
+    """Give the variance of the mean of readings, each of which remembers the one before it (AR(1))."""
+    own = np.zeros(len(scan))
+    own[rows] = sd[rows]
+    variance = float(own @ own)
+    for lag in range(1, min(_longest_memory(rho), len(scan) - 1) + 1):
+        variance += 2 * rho**lag * float(np.sum(own[lag:] * own[:-lag] * (scan[lag:] == scan[:-lag])))
+    return max(variance, 0.0) / max(rows.size, 1) ** 2
+
+
+def _longest_memory(rho: float) -> int:
+    """Count the readings over which a correlation falls below a hundredth."""
+    return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0

@@ -1,0 +1,55 @@
+"""Terms that a reader may not know, each explained in the section that uses it first."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+from probewise.report.html import Markup, Section, element, paragraph
+
+__all__ = ["TERMS", "explained", "terms_of"]
+
+TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "residual": (r"residuals?\b", "recorded minus predicted reading"),
+        "p": (r"\bp [=<]", "p-value: how often chance alone gives at least this, with nothing missing"),
+        "SSF": (r"\bSSF\b", "spatial sensitivity function: how strongly the sensor sees each point beneath it"),
+        "sd": (r"\bsds?\b", "standard deviation"),
+        "rms": (r"\brms\b", "root of the mean square"),
+        "nat": (r"\bnats?\b", "unit of evidence, a natural logarithm: 3 nats are odds of 20 to 1"),
+        "held-out": (r"\bheld-out\b", "kept for testing: the fit has not seen it"),
+        "λ": (r"λ|\blambda\b", "size of an effect: what is left of it after a full refit without it, in noise sds"),
+        "aliased": (
+            r"\balias(es|ed)?\b",
+            "two effects that change these readings in the same way, so that the readings cannot tell which it is",
+        ),
+        "cosine": (
+            r"\bcosine\b",
+            "1 where two effects change the readings in the same proportions, 0 where unrelated",
+        ),
+        "unknown": (r"\bunknown\b", "an effect for which this program has no formula"),
+    }
+)
+"""Term: the pattern by which its use is found in a text, and its explanation."""
+
+
+def terms_of(content: str, known: set[str]) -> tuple[Markup, ...]:
+    """Explain the terms that some HTML uses and that are not `known` yet; they are from now on."""
+    text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
+    new = [term for term, (pattern, _) in TERMS.items() if term not in known and re.search(pattern, text)]
+    known.update(new)
+    if not new:
+        return ()
+    # An explanation may use a term itself.
+    said = [(term, TERMS[term][1]) for term in new]
+    more = terms_of(" ".join(meaning for _, meaning in said), known)
+    parts = [part for term, meaning in said for part in (element("b", term), f": {meaning}. ")]
+    return (paragraph(*parts, class_="terms"), *more)
+
+
+def explained(sections: Sequence[Section], known: set[str]) -> list[Section]:
+    """Add to each section the explanations of the terms that it is the first to use."""
+    return [replace(s, body=(*s.body, *terms_of(" ".join((s.heading, *s.body)), known))) for s in sections]

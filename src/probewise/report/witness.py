@@ -1,0 +1,168 @@
+"""Along what the residuals are drawn: the covariate of each place, and the one that shows the verdict best."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis import Diagnosis, Place
+from probewise.report.covariate import category_names, covariate_label, covariate_values
+from probewise.report.residual_means import Means, mean_residuals
+from probewise.report.words import unit_name
+
+__all__ = ["Chance", "Witness", "along_scan", "of_place", "telling"]
+
+_SEEN = 2.3  # sds of chance from which a mean is seen to stand out
+_N_SAMPLES = 200  # of the posterior, for what the fit absorbs
+_LEAST_PERIODS = 3.0  # within a recording, for folding it
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """A covariate as it is drawn: each row's value (n_points,), NaN where it has none, its label with unit.
+
+    `names` are those of its values where it has no scale; `window` is what stands out, in the covariate's unit or,
+    with names, in steps; `place` is the place that it shows, if any.
+    """
+
+    at: FloatArray
+    label: str
+    names: Mapping[float, str] | None = None
+    window: tuple[float, float] | None = None
+    place: Place | None = None
+
+    @property
+    def shown_names(self) -> list[str] | None:
+        """Names in the order in which they stand."""
+        return None if self.names is None else [self.names[v] for v in _values(self.at)]
+
+
+@dataclass(frozen=True, eq=False)
+class Chance:
+    """The noise of each reading, (n_points,), its memory, and posterior samples of the calibrated predictions."""
+
+    sd: FloatArray
+    rho: float
+    absorbed: FloatArray | None
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis) -> Chance:
+        """Take the noise model of a diagnosis."""
+        found = {p.name: p.mean for p in diagnosis.noise.parameters}
+        sd = np.full(len(diagnosis.recording), float(diagnosis.repaired.noise_sd.mean()))
+        if "ratio" in found:
+            level = diagnosis.predicted_after
+            share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
+            sd = sd * np.sqrt(1 + found["ratio"] * share)
+        null = diagnosis.null
+        theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
+        return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
+
+    def means(self, diagnosis: Diagnosis, witness: Witness, *, after: bool) -> Means:
+        """Average the residuals of a diagnosis along a witness."""
+        return mean_residuals(
+            witness.at,
+            diagnosis.residuals_before,
+            diagnosis.residuals_after if after and diagnosis.is_repaired else None,
+            sd=self.sd,
+            rho=self.rho,
+            scan=diagnosis.recording.plan.scan,
+            names=witness.names,
+            window=None if witness.names else witness.window,
+            absorbed=self.absorbed,
+        )
+
+
+def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
+    """Choose what the first figure is drawn along: the first that is seen to stand out, else the one that does most.
+
+    What is named comes first: a wave folded at its period, then the places in their order. What is unknown comes by the
+    covariate in which it is most likely. Last comes the change that the repair makes.
+    """
+    values = covariate_values(diagnosis)
+    places = sorted(diagnosis.where, key=lambda place: -_likeness(diagnosis, place))
+    found = [*_folded(diagnosis)]
+    for place in places:
+        if place.covariate == "scan" and place.scan is not None:
+            found.append(along_scan(diagnosis, place.scan, place))
+        found.append(of_place(diagnosis, place, values[place.witness]))
+    if diagnosis.is_repaired:
+        found.append(_by_change(diagnosis))
+    if not found:
+        unit = diagnosis.recording.plan.instrumentation.unit
+        return Witness(np.array(diagnosis.predicted_before), covariate_label("level", unit))
+    sizes = [chance.means(diagnosis, witness, after=False).stands_out for witness in found]
+    return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
+
+
+def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> Witness:
+    """Show a place along its covariate, (n_points,)."""
+    unit = diagnosis.recording.plan.instrumentation.unit
+    label = covariate_label(place.covariate, unit, place.scan)
+    if place.level is not None:
+        label = f"reading to be expected without it ({unit_name(unit)})"
+    names = category_names(diagnosis, place)
+    return Witness(at, label, names, _window(place, at, names), place)
+
+
+def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> Witness:
+    """Show one scan along its way: a residual that changes its sign leaves no mean by scan."""
+    plan = diagnosis.recording.plan
+    rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
+    x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
+    along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
+    if np.ptp(along) == 0:
+        along, label = plan.time_s[rows], "time (s)"
+    at = np.full(len(plan), np.nan)
+    at[rows] = along
+    return Witness(at, f"{label}, scan {scan}", place=place)
+
+
+def _likeness(diagnosis: Diagnosis, place: Place) -> float:
+    """Give the share of the unknown that depends on a place's covariate; 0 where something has a name."""
+    if diagnosis.verdict != "unknown":
+        return 0.0
+    shares = diagnosis.unknown_shares.items()
+    within = " within scans" if place.scan is not None and place.covariate != "scan" else ""
+    return sum(p for family, p in shares if family.partition(",")[0] == place.covariate + within)
+
+
+def _folded(diagnosis: Diagnosis) -> list[Witness]:
+    """Fold time, or X, at the period of a wave that is named."""
+    plan, out = diagnosis.recording.plan, []
+    for effect in diagnosis.effects:
+        found = {p.name: p.mean for p in effect.parameters}
+        if effect.name not in diagnosis.combination:
+            continue
+        if found.get("alias_hz", 0.0) > 0:
+            out.append((plan.time_s, 1 / found["alias_hz"], "time", "s"))
+        if found.get("period_mm", 0.0) > 0:
+            out.append((plan.x_mm, found["period_mm"], "X", "mm"))
+    return [
+        Witness(np.mod(values, period), f"{name} within one period of {period:.4g} {unit} ({unit})")
+        for values, period, name, unit in out
+        if np.ptp(values) > _LEAST_PERIODS * period
+    ]
+
+
+def _by_change(diagnosis: Diagnosis) -> Witness:
+    unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
+    return Witness(diagnosis.predicted_after - diagnosis.predicted_before, f"change that the repair makes ({unit})")
+
+
+def _window(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
+    """Say what to shade: from start to end, or about the scan, direction or orientation named."""
+    ends = None if place.start is None or place.end is None else (place.start, place.end)
+    if not names:
+        return ends
+    shown = _values(at)
+    members = [k for k, v in enumerate(shown) if (ends[0] <= v <= ends[1] if ends else names[v] == place.scan)]
+    return (members[0] - 0.5, members[-1] + 0.5) if members else None
+
+
+def _values(at: FloatArray) -> list[float]:
+    values: list[float] = np.unique(at[np.isfinite(at)]).tolist()
+    return values

@@ -1,0 +1,105 @@
+"""Figures of a diagnosis: every axis has its unit, nothing lies over data, files stay small and are the same again."""
+
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from probewise.report import plots
+from probewise.report.residual_means import mean_residuals
+
+X = np.linspace(0.0, 10.0, 200)
+
+
+def means(**options):
+    return mean_residuals(X, np.sin(X), 0.1 * np.sin(X), sd=1.0, **options)
+
+
+def drawn():
+    rng = np.random.default_rng(0)
+    noise, scan = rng.standard_normal(200), np.repeat([0, 1], 100)
+    return {
+        "means": plots.mean_residuals_along(means(), label="X (mm)", unit="V", each=(X, np.sin(X)), window=(2.0, 3.0)),
+        "scan": plots.one_scan(X, np.sin(X), [("as calibrated", X), ("repaired", np.sin(X))], label="X (mm)", unit="V"),
+        "clouds": plots.residual_clouds([("time (s)", X)], [("as calibrated", noise)], unit="V"),
+        "gain": plots.gain_by_scan([("edge_0", 0.5), ("edge_90", -0.1)], 0.2, 0.05),
+        "neighbours": plots.correlation_of_neighbours(noise, scan, rho=0.3),
+        "spread": plots.spread_by_level(X, noise, unit="V", model_sd=np.ones(200)),
+        "tails": plots.tails(noise, 1.0),
+        "lost": plots.lost_readings(X, noise, X > 9.0, unit="V"),
+        "lattice": plots.lattice_of_readings(np.round(noise, 1), 0.1, unit="V"),
+    }
+
+
+@pytest.fixture(scope="module")
+def figures():
+    return drawn()
+
+
+def test_every_figure_is_svg_that_a_browser_can_read(figures):
+    for drawing in figures.values():
+        root = ElementTree.fromstring(plots.svg(drawing))
+        assert root.tag.endswith("svg")
+
+
+def test_every_axis_says_what_it_carries(figures):
+    for name, drawing in figures.items():
+        for ax in np.atleast_1d(drawing):
+            assert ax.get_ylabel(), name
+        assert np.atleast_1d(drawing)[-1].get_xlabel(), name
+
+
+def test_no_legend_lies_over_data(figures):
+    for name, drawing in figures.items():
+        plots.svg(drawing)
+        for ax in np.atleast_1d(drawing):
+            legend = ax.get_legend()
+            if legend is not None:
+                assert legend.get_window_extent().y0 >= ax.get_window_extent().y1 - 1, name
+                assert legend.get_window_extent().x1 <= ax.figure.bbox.x1, name
+
+
+def test_the_same_drawing_gives_the_same_bytes():
+    first, second = (plots.svg(plots.gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
+    assert first == second
+
+
+def test_small_residuals_are_labelled_in_full():
+    tiny = mean_residuals(X, 1e-4 * np.sin(X), None, sd=1e-4)
+    ax = plots.mean_residuals_along(tiny, label="X (mm)", unit="mW")
+    plots.svg(ax)
+    labels = [label.get_text() for label in ax.get_yticklabels()]
+    assert ax.yaxis.get_offset_text().get_text() == ""
+    assert all("0.000" in label or label == "0" or "10⁻" in label for label in labels)
+
+
+def test_a_hundred_thousand_dots_stay_a_small_file():
+    rng = np.random.default_rng(0)
+    cloud = [("as calibrated", rng.standard_normal(100_000))]
+    assert len(plots.svg(plots.residual_clouds([("time (s)", rng.random(100_000))], cloud, unit="V"))) < 1_000_000
+
+
+def test_rounded_readings_lie_on_their_lattice(figures):
+    counts = [bar.get_height() for bar in figures["lattice"].containers[0]]
+    assert max(counts) == 200
+    assert np.argmax(counts) == 20
+
+
+def test_neighbours_of_ar_1_noise_are_correlated_by_rho():
+    rng, rho = np.random.default_rng(1), 0.6
+    noise = rng.standard_normal(4000)
+    for k in range(1, 4000):
+        noise[k] += rho * noise[k - 1]
+    ax = plots.correlation_of_neighbours(noise, np.zeros(4000, dtype=int))
+    (found,) = (line for line in ax.lines if line.get_label() == "residuals")
+    # The standard error is about 1 / sqrt(4000).
+    np.testing.assert_allclose(found.get_ydata()[:2], [rho, rho**2], atol=0.08)
+
+
+def test_a_diagnosis_needs_no_plotting_library():
+    """A second of its start alone is a fifth of what a whole diagnosis may take."""
+    asked = "import sys, probewise.cli.diagnose, probewise.diagnosis; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"matplotlib", "scipy.stats", "scipy.spatial", "scipy.optimize"} & set(loaded)

@@ -9,7 +9,7 @@ from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.residuals.covariates import covariates_of, slope_along_the_move
 from probewise.report.words import unit_name
 
-__all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words"]
+__all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words", "family_words"]
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
@@ -36,6 +36,14 @@ def covariate_words(name: str) -> str:
     """Name a covariate."""
     stem, _, suffix = name.rpartition("_")
     return WORDS.get(name, (stem if stem and suffix in SUFFIXES else name).replace("_", " "))
+
+
+def family_words(family: str) -> str:
+    """Name what something unknown depends on: a covariate, in all or within each scan, and how."""
+    name, _, how = family.partition(", ")
+    stem = name.removesuffix(" within scans")
+    said = covariate_words(stem) + (", scan by scan" if stem != name else "")
+    return f"{said} ({how})" if how else said
 
 
 def covariate_unit(name: str, unit: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 from probewise.diagnosis import (
@@ -18,7 +19,7 @@ from probewise.diagnosis import (
 )
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
-from probewise.report.covariate import covariate_unit, covariate_words
+from probewise.report.covariate import covariate_unit, covariate_words, family_words
 from probewise.report.diagnosis_figures import figures, shown_first
 from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hypothesis_in_words, listed
 from probewise.report.headline import headline
@@ -34,6 +35,7 @@ _MOST_CREDIBLE = 6
 _LIKELY = 0.05  # of an effect that is spoken of at once
 _CHANCE = 0.05  # p-value above which nobody is surprised
 _TELLS_SOMETHING = 0.5  # nats
+_WEAK = " too weak to be felt so far"
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals of the same scan, by how many readings they lie apart.",
     "signal_dependent_noise": "How far residuals scatter, by the predicted reading: plain noise scatters evenly.",
@@ -97,16 +99,15 @@ def _first_caption(diagnosis: Diagnosis) -> str:
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = ", blue squares the repaired model" if diagnosis.is_repaired else ""
     where = f" {_where(diagnosis, shown.place)}" if shown.place else ""
-    return (
-        f"Residuals (recorded minus predicted readings), averaged in steps. Orange circles: the model as "
-        f"calibrated{after}. 95 % of such means lie in the grey band by chance alone.{where} {bars}"
-    )
+    circles = f"Orange circles: the model as calibrated{after}."
+    band = "95 % of such means lie in the grey band by chance alone."
+    return f"Residuals, averaged in steps. {circles} {band}{where} {bars}"
 
 
 def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Answer, in words that need no statistics: what to do now, what was found, is it real, does the repair help."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
-    facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(diagnosis.reason))]
+    facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(_found(diagnosis)))]
     if not diagnosis.few:
         facts.append(("Could it be chance?", _chance(diagnosis)))
     if gain.heldout_by_scan and diagnosis.is_repaired:
@@ -118,6 +119,13 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     if diagnosis.left_open:
         facts.append(("In the repaired sensor", _shares(diagnosis.left_open)))
     return facts
+
+
+def _found(diagnosis: Diagnosis) -> str:
+    """Give the reason without the plan, which is said already, and names without underscores."""
+    said = diagnosis.reason.partition("; to tell: ")[0]
+    names = "|".join(EFFECTS_IN_WORDS)
+    return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
 
 
 def _predicts(nats: float, sd: float) -> str:
@@ -133,7 +141,10 @@ def _signed_nats(nats: float, sd: float) -> str:
 
 
 def _shares(shares: Mapping[tuple[str, ...], float]) -> str:
-    held = (f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({p:.0%})" for names, p in shares.items())
+    held = (
+        f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
+        for names, share in shares.items()
+    )
     return f"Samples in sensor.json hold: {', '.join(held)}."
 
 
@@ -172,15 +183,21 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _plain(label: str) -> str:
-    """Name a hypothesis of a plan in words, where it goes by names of effects; it may be a phrase already."""
-    names = [part.replace(" ", "_") for part in label.split(" with ")]
-    return listed(map(effect_in_words, names)) if all(name in EFFECTS_IN_WORDS for name in names) else label
+    """Name a rival of a plan in words, where it goes by names of effects; it may be a phrase already."""
+    named, weak, _ = label.partition(_WEAK)
+    names = [part.replace(" ", "_") for part in named.split(" with ")]
+    said = listed(map(effect_in_words, names)) if all(name in EFFECTS_IN_WORDS for name in names) else named
+    return f"{said}, too weak to be detected so far" if weak else said
 
 
 def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = [hypothesis_in_words(_effects_of(label)) for label in diagnosis.credible]
     return (
-        *(paragraph(_sentence(e.sentence)) for e in diagnosis.effects if e.probability > _LIKELY),
+        *(
+            paragraph(_sentence(f"{effect_in_words(e.name)} ({probability(e.probability)}): {e.sentence}"))
+            for e in diagnosis.effects
+            if e.probability > _LIKELY
+        ),
         table(
             ("explanation", "probability"),
             (
@@ -214,8 +231,12 @@ def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     likely = [(name, p) for name, p in diagnosis.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
-    said = ", ".join(f"{effect_in_words(name)} ({probability(p)})" for name, p in likely)
+    said = ", ".join(f"{_candidate(name)} ({probability(p)})" for name, p in likely)
     return (paragraph(f"What is unknown may depend on, or be: {said}."),)
+
+
+def _candidate(name: str) -> str:
+    return effect_in_words(name) if name in EFFECTS_IN_WORDS else family_words(name)
 
 
 def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -312,7 +333,9 @@ def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ..
     noise = diagnosis.noise
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = listed(map(effect_in_words, names)) if names else "white: independent, with one sd"
-    rows = ((p.name, "" if p.unit == "1" else p.unit, *_value(p)) for p in noise.parameters)
+    rows = (
+        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value(p)) for p in noise.parameters
+    )
     return (
         paragraph(readable(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
@@ -330,7 +353,7 @@ def _effects(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     shown = (_effect_table(likely),) if likely else ()
     if not rest:
         return shown
-    return (*shown, element("details", element("summary", f"{len(rest)} less likely"), _effect_table(rest)))
+    return (*shown, element("details", element("summary", f"{len(rest)} less likely effects"), _effect_table(rest)))
 
 
 def _effect_table(effects: Sequence[EffectFound]) -> Markup:
@@ -339,7 +362,7 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
             _with_name(effect.name) if k == 0 else "",
             probability(effect.probability) if k == 0 else "",
             number(effect.size_lambda, 1) if k == 0 else "",
-            p.name.replace("_", " "),
+            p.name.removesuffix(f"_{p.unit}").replace("_", " "),
             *(_value(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
@@ -357,7 +380,7 @@ def _with_name(name: str) -> str:
 def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd, with its unit where asked, and its interval."""
     low, high = found.interval95
-    own = f" {found.unit}" if unit and found.unit != "1" else ""
+    own = f" {unit_name(found.unit)}" if unit and found.unit != "1" else ""
     return readable(f"{give_or_take(found.mean, found.sd)}{own}"), readable(f"{low:.4g} to {high:.4g}")
 
 
@@ -381,7 +404,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
             (
                 " and ".join(a.effects).replace("_", " "),
                 number(a.cosine, 3),
-                a.settle_by,
+                readable(a.settle_by),
                 _readings(a.readings),
             )
             for a in aliases

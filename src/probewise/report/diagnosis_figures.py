@@ -99,7 +99,7 @@ def _witness(diagnosis: Diagnosis, chance: Chance, place: Place, at: FloatArray)
     if place.scan is None or place.covariate != "scan":
         axes = stack_of_axes([2.6])
     else:
-        axes = stack_of_axes([2.2, 2.4])
+        axes = stack_of_axes([2.4, 2.6])
         _along(diagnosis, chance, along_scan(diagnosis, place.scan), after=False, each=True, ax=axes[0])
     _along(diagnosis, chance, by_covariate, after=False, each=True, ax=axes[-1])
     return svg(axes)
@@ -154,7 +154,7 @@ def _residuals(diagnosis: Diagnosis) -> bytes:
 
 def _noise(diagnosis: Diagnosis, chance: Chance) -> bytes:
     """Draw what the noise model was tested on: neighbours, spread by level, tails."""
-    axes = stack_of_axes([2.1, 2.2, 2.1])
+    axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):
         _noise_panel(diagnosis, chance, name)(ax)
     return svg(axes)

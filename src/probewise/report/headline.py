@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from probewise.diagnosis import ALARM, Diagnosis
+from probewise.effects import UNNAMED
 from probewise.report.covariate import covariate_words
 from probewise.report.effect_words import effect_in_words, hypothesis_in_words, listed
 from probewise.report.words import count
@@ -13,6 +16,8 @@ __all__ = ["MOST_WORDS", "headline"]
 
 MOST_WORDS = 20
 _SURE = 0.5
+_RIVAL = 0.1  # probability from which a hypothesis is spoken of as a rival
+_MOST_RIVALS = 3
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -35,7 +40,7 @@ def _sayings(diagnosis: Diagnosis) -> list[str]:
         case "cannot_tell":
             return _undecided(diagnosis)
         case "noise":
-            return _left_out(diagnosis, "The predicted mean is right, but the noise model leaves out")
+            return _left_out(diagnosis, "The predicted mean is right, but the noise is not plain:")
         case "named":
             more = ["Something more is missing."] if diagnosis.improvement.p_value_after < ALARM else []
             said = _left_out(diagnosis, "The model leaves out")
@@ -64,32 +69,36 @@ def _left_out(diagnosis: Diagnosis, opening: str) -> list[str]:
 def _unknown(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
-    family, _, kind = top.partition(", ")
-    covariate = covariate_words(family.removesuffix(" within scans"))
+    covariate = covariate_words(top.partition(", ")[0].removesuffix(" within scans"))
     known = [effect_in_words(e.name) for e in diagnosis.effects if e.probability >= _SURE]
-    beside = f"Beside {listed(known)}, something" if known else "Something"
-    plain = f"{beside} is missing that no known effect explains"
-    said = [f"{plain}.", "Something is missing that no known effect explains."]
-    if kind == "far out":
-        return [f"Outlying readings lie together by {covariate}: something without a name is missing there.", *said]
-    if (top and family == effect_in_words(family)) or not top:
-        return [f"{plain}; it shows most along the {covariate}.", *said] if top else said
-    return [f"{plain}; it looks most like {effect_in_words(family)}.", *said]
+    short = "Something is missing that no known effect explains"
+    plain = f"Beside {listed(known)}, something is missing that no known effect explains" if known else short
+    if top in UNNAMED:
+        said = [f"{plain}; it looks most like {effect_in_words(top)}."]
+    elif top.endswith(", far out"):
+        said = [f"Outlying readings lie together by {covariate}: something without a name is missing there."]
+    else:
+        said = [f"{plain}; it varies most with the {covariate}."] if top else []
+    return [*said, f"{plain}.", f"{short}."]
 
 
 def _undecided(diagnosis: Diagnosis) -> list[str]:
-    first, *others = diagnosis.hypotheses
-    rivals = [hypothesis_in_words(h.effects) for h in (first, *others[:1])]
-    if diagnosis.p_value >= ALARM:
+    if diagnosis.p_value >= ALARM or any(h.probability > _RIVAL and not h.effects for h in diagnosis.hypotheses):
         leading = next((h.effects for h in diagnosis.hypotheses if h.effects), ())
         plain = "These readings cannot tell whether anything is missing"
         return [f"{plain}; if so, most likely {hypothesis_in_words(leading)}.", f"{plain}."]
-    if len(rivals) < 2 or (first.probability >= _SURE and not diagnosis.aliases):
-        return [
-            f"Something is missing; {rivals[0]} fits best but does not predict new readings.",
-            "Something is missing, but these readings cannot tell what.",
+    rivals = [h.effects for h in diagnosis.hypotheses[:_MOST_RIVALS] if h.probability > _RIVAL]
+    said = [f"Something is missing: {_either(rivals[:n])}; these readings cannot tell which." for n in (3, 2)]
+    if len(rivals) < len(said):
+        said = [
+            f"Something is missing; {hypothesis_in_words(name)} fits best, but predicts new readings worse."
+            for name in rivals
         ]
-    return [
-        f"Something is missing, but these readings cannot tell {rivals[0]} from {rivals[1]}.",
-        "Something is missing, but these readings cannot tell what.",
-    ]
+    return [*said, "Something is missing, but these readings cannot tell what."]
+
+
+def _either(rivals: Sequence[tuple[str, ...]]) -> str:
+    """Join hypotheses by what they do not have in common."""
+    shared = frozenset.intersection(*map(frozenset, rivals))
+    *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)
+    return f"{', '.join(others)} or {last}" if others else last

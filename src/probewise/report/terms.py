@@ -14,8 +14,8 @@ __all__ = ["TERMS", "explained", "terms_of"]
 
 TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
-        "residual": (r"residuals?\b", "recorded minus predicted reading"),
-        "p": (r"\bp [=<]", "p-value: how often chance alone gives at least this, with nothing missing"),
+        "residual": (r"(?i)\bresiduals?\b", "recorded minus predicted reading"),
+        "p": (r"\bp\s[=<]", "p-value: how often chance alone gives at least this, with nothing missing"),
         "SSF": (r"\bSSF\b", "spatial sensitivity function: how strongly the sensor sees each point beneath it"),
         "sd": (r"\bsds?\b", "standard deviation"),
         "rms": (r"\brms\b", "root of the mean square"),
@@ -23,7 +23,7 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "held-out": (r"\bheld-out\b", "kept for testing: the fit has not seen it"),
         "λ": (r"λ|\blambda\b", "size of an effect: what is left of it after a full refit without it, in noise sds"),
         "aliased": (
-            r"\balias(es|ed)?\b",
+            r"(?i)\baliase[sd]\b",
             "two effects that change these readings in the same way, so that the readings cannot tell which it is",
         ),
         "cosine": (
@@ -39,15 +39,14 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
 def terms_of(content: str, known: set[str]) -> tuple[Markup, ...]:
     """Explain the terms that some HTML uses and that are not `known` yet; they are from now on."""
     text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
-    new = [term for term, (pattern, _) in TERMS.items() if term not in known and re.search(pattern, text)]
-    known.update(new)
-    if not new:
-        return ()
-    # An explanation may use a term itself.
-    said = [(term, TERMS[term][1]) for term in new]
-    more = terms_of(" ".join(meaning for _, meaning in said), known)
-    parts = [part for term, meaning in said for part in (element("b", term), f": {meaning}. ")]
-    return (paragraph(*parts, class_="terms"), *more)
+    new: list[str] = []
+    while text:  # an explanation may use a term itself
+        found = [term for term, (pattern, _) in TERMS.items() if term not in known and re.search(pattern, text)]
+        known.update(found)
+        new += found
+        text = " ".join(TERMS[term][1] for term in found)
+    parts = [part for term in new for part in (element("b", term), f": {TERMS[term][1]}. ")]
+    return (paragraph(*parts, class_="terms"),) if parts else ()
 
 
 def explained(sections: Sequence[Section], known: set[str]) -> list[Section]:

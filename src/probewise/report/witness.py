@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis import Diagnosis, Place
+from probewise.diagnosis import ALARM, Diagnosis, Place
+from probewise.effects import UNNAMED
 from probewise.report.covariate import category_names, covariate_label, covariate_values
 from probewise.report.residual_means import Means, mean_residuals
 from probewise.report.words import unit_name
@@ -83,13 +84,14 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
     covariate in which it is most likely. Last comes the change that the repair makes.
     """
     values = covariate_values(diagnosis)
-    places = sorted(diagnosis.where, key=lambda place: -_likeness(diagnosis, place))
-    found = [*_folded(diagnosis)]
+    alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
+    places = sorted(alarming, key=lambda place: -_likeness(diagnosis, place))
+    found = _folded(diagnosis)
     for place in places:
         if place.covariate == "scan" and place.scan is not None:
             found.append(along_scan(diagnosis, place.scan, place))
         found.append(of_place(diagnosis, place, values[place.witness]))
-    if diagnosis.is_repaired:
+    if diagnosis.is_repaired and diagnosis.verdict != "clean":
         found.append(_by_change(diagnosis))
     if not found:
         unit = diagnosis.recording.plan.instrumentation.unit
@@ -123,11 +125,11 @@ def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> W
 
 def _likeness(diagnosis: Diagnosis, place: Place) -> float:
     """Give the share of the unknown that depends on a place's covariate; 0 where something has a name."""
-    if diagnosis.verdict != "unknown":
+    shares = diagnosis.unknown_shares
+    if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
         return 0.0
-    shares = diagnosis.unknown_shares.items()
     within = " within scans" if place.scan is not None and place.covariate != "scan" else ""
-    return sum(p for family, p in shares if family.partition(",")[0] == place.covariate + within)
+    return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)
 
 
 def _folded(diagnosis: Diagnosis) -> list[Witness]:

@@ -79,7 +79,10 @@ def reason_of(
             tail = f"to a test of the mean they are noise with a heavy tail, {p}"
             together = f"The readings that are far out lie together in {covariate}"
             return f"{together}: something is missing there, not noise ({tail})."
-        place = f" It shows most in {where[0].covariate}." if where else ""
+        likeliest = family.partition(",")[0].removesuffix(" within scans")
+        shown = [place.covariate for place in where]
+        most = likeliest if likeliest in shown else next(iter(shown), "")
+        place = f" It shows most in {most.replace('_', ' ')}." if most else ""
         found = search.beside(noise)
         known = " and ".join(name.replace("_", " ") for name in found.names) if found else ""
         beside = f", beside {known}" if known else ""

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
@@ -36,7 +36,8 @@ __all__ += [
     "tidy",
 ]
 
-_LETTERS_PER_IN = 15.0  # of a legend, about
+_LETTERS_PER_IN = 17.5  # of a legend, about
+_LEAST_IN_FULL = 1e-5  # length of an axis whose labels are written without a power of ten
 
 AxesGrid: TypeAlias = NDArray[Any]
 
@@ -120,11 +121,16 @@ def _legend_width(labels: Sequence[str], n_columns: int) -> int:
 
 
 def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
-    """Write tick labels in full, with a true minus sign: no factor or offset stands apart from them."""
+    """Write tick labels in full: no factor or offset stands apart from them."""
     for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
         low, high = axis.get_view_interval()
-        digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
-        axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: readable(f"{round(v, digits) + 0.0:.10g}")))
+        if high - low > _LEAST_IN_FULL:
+            in_full = ScalarFormatter(useOffset=False)
+            in_full.set_scientific(False)
+            axis.set_major_formatter(in_full)
+        else:
+            digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
+            axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: readable(f"{round(v, digits) + 0.0:g}")))
 
 
 def tidy(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

@@ -96,7 +96,7 @@ def spread_by_level(
         by_model = np.array([np.sqrt(np.mean(model_sd[p] ** 2)) for p in parts])
         ax.plot(at, by_model, "--", color=BLUE, linewidth=1.6, label="noise model found")
     ax.set_ylim(bottom=0.0)
-    tidy(ax, x=f"predicted reading ({unit})", y=f"rms of residuals ({unit})")
+    tidy(ax, x=f"predicted reading ({unit})", y=f"rms residual ({unit})")
     plain_numbers(ax)
     legend_above(ax)
     return ax
@@ -126,7 +126,7 @@ def tails(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
     ax.set_yscale("log")
     ax.set_ylim(0.5, 2 * max(float(counts.max(initial=1)), 1.0))
     tidy(ax, x="residual (sds of the noise)", y="readings per half sd")
-    plain_numbers(ax)
+    plain_numbers(ax, y=False)
     legend_above(ax)
     return ax
 

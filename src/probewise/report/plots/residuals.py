@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 BEFORE, AFTER = "as calibrated", "repaired"
+_CROWDED = 500  # dots from which they are drawn paler
 _MANY = 1500  # dots from which they are drawn as an image inside the SVG
 _ASIDE = 0.15  # of the place of a value with a name: how far the means before and after stand from its middle
 _LEAST_SHADE = 0.008  # of the width of the axes
@@ -72,7 +73,7 @@ def mean_residuals_along(
     """
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     if each is not None:
-        _dots(ax, *each, GREY, "one reading", size=5)
+        _dots(ax, *each, GREY, "one reading")
     ax.axhline(0, color=BLACK, linewidth=0.7)
     if names:
         ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, color=GREY, alpha=0.3, label=_CHANCE)
@@ -92,7 +93,7 @@ def mean_residuals_along(
     if window is not None:
         low, high = ax.get_xlim()
         middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
-        ax.axvspan(middle - half, middle + half, color=SKY, alpha=0.3, linewidth=0, label="stands out here", zorder=0)
+        ax.axvspan(middle - half, middle + half, color=SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
     tidy(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
     plain_numbers(ax, x=not names)
@@ -123,7 +124,7 @@ def one_scan(
     -------
     The two axes, shape (2,).
     """
-    axes = stack_of_axes([2.6, 1.7])
+    axes = stack_of_axes([2.5, 2.0])
     above, below = axes
     above.plot(along, readings, "o", color=BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
     below.axhline(0, color=BLACK, linewidth=0.7)
@@ -172,7 +173,7 @@ def residual_clouds(
     for ax, (label, at) in zip(axes, covariates, strict=True):
         ax.axhline(0, color=BLACK, linewidth=0.7)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
-            _dots(ax, at, residuals, colour, "", size=4, alpha=0.3)
+            _dots(ax, at, residuals, colour, "")
             ax.plot(
                 *_running_mean(at, residuals),
                 color=colour,
@@ -205,7 +206,7 @@ def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float, *, 
     gains = np.array([gain for _, gain in ranked])
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
-    ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0)
+    ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, zorder=0)
     said = f"all scans: {signed(mean, 3)} ± {number(sd, 3)} nats per reading"
     ax.axvline(mean, color=GREY, linewidth=1.4, label=said)
     ax.axvline(0, color=BLACK, linewidth=0.7)
@@ -221,10 +222,12 @@ _CHANCE = "95 % of chance alone"
 _STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
 
 
-def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str, *, size: float, alpha: float = 0.55) -> None:
+def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
+    """Draw dots, the smaller and paler the more there are."""
     ok = np.isfinite(x) & np.isfinite(y)
-    many = bool(ok.sum() > _MANY)
-    ax.scatter(x[ok], y[ok], size, color=colour, alpha=alpha, linewidth=0, label=label or None, rasterized=many)
+    n = max(int(ok.sum()), 1)
+    size, alpha = float(np.clip(4000 / n, 4, 16)), 0.35 if n > _CROWDED else 0.7
+    ax.scatter(x[ok], y[ok], size, color=colour, alpha=alpha, linewidth=0, label=label or None, rasterized=n > _MANY)
 
 
 def _names_on_x(ax: Axes, names: Sequence[str]) -> None:

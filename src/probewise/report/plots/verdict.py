@@ -34,11 +34,11 @@ def hypothesis_probabilities(
         shown.append((f"{len(order) - most} others", rest))
     ax = axes_or_new(ax, size_in=(6.6, 0.6 + 0.42 * len(shown)))
     at = -np.arange(len(shown), dtype=np.float64)
-    ax.barh(at - 0.2, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.38)
+    ax.barh(at - 0.22, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.34)
     beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": "small"}
     for y, (name, p) in zip(at, shown, strict=True):
-        ax.annotate(f"{p:.3f}", (p, y - 0.2), xytext=(4, 0), va="center", **beside)
-        ax.annotate(name.replace("_", " "), (0.0, y + 0.03), xytext=(3, 0), **beside)
+        ax.annotate(f"{p:.3f}", (p, y - 0.22), xytext=(4, 0), va="center", **beside)
+        ax.annotate(name.replace("_", " "), (0.0, y + 0.06), xytext=(3, 0), **beside)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
     ax.set_xlim(0, 1.08)

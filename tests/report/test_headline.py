@@ -1,0 +1,102 @@
+"""A headline is short, in words, and says which verdict it is, whatever was found."""
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import EffectFound, Hypothesis
+from probewise.effects import EFFECTS, NUISANCES, VOCABULARY
+from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words
+from probewise.report.headline import MOST_WORDS, headline
+
+NAMES = sorted(VOCABULARY)
+
+
+def found(verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares=None, n=408, few=False, beside=()):
+    named = [EffectFound(name, 0.9, 20.0 - k, "", ()) for k, name in enumerate((*combination, *beside))]
+    stated = [Hypothesis(tuple(names), 0.9 / max(len(rivals), 1)) for names in rivals]
+    return SimpleNamespace(
+        recording=SimpleNamespace(usable=np.ones(n, dtype=bool), readings=np.arange(float(n))),
+        verdict=verdict,
+        combination=tuple(combination),
+        p_value=p_value,
+        improvement=SimpleNamespace(p_value_after=after),
+        effects=tuple(named) if combination != ("unknown",) else (),
+        hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
+        unknown_shares=shares or {},
+        few=few,
+    )
+
+
+def several(most):
+    return itertools.chain.from_iterable(itertools.combinations(NAMES, k) for k in range(1, most + 1))
+
+
+def verdicts():
+    yield from (found("clean", p_value=p) for p in (0.5, 1e-4))
+    yield from (found(v, names, after=p) for names in several(2) for v in ("named", "noise") for p in (0.5, 1e-6))
+    yield from (found("named", NAMES[k : k + n]) for n in (3, 4, 9) for k in range(len(NAMES) - n))
+    yield from (found("cannot_tell", a[:1], rivals=(a[:1], a[1:])) for a in itertools.combinations(NAMES, 2))
+    yield from (found("cannot_tell", a[:1], rivals=[(k,) for k in a]) for a in itertools.combinations(NAMES[::3], 3))
+    yield from (found("cannot_tell", (a,), p_value=0.2, rivals=((), (a,))) for a in NAMES)
+    yield from (found("cannot_tell", (), rivals=((), ("unknown",), (a, "outliers"))) for a in NAMES)
+    families = [*EFFECTS, "time", "place within scans, locally", "edge_distance, far out", "what was seen before"]
+    yield from (found("unknown", ("unknown",), shares={name: 1.0}) for name in families)
+    yield from (found("unknown", shares={"time": 1.0}, beside=names) for names in several(2))
+    yield from (found("cannot_tell", few=True, n=n) for n in (1, 3))
+
+
+def test_a_headline_has_twenty_words_at_most_and_no_name_of_code():
+    for diagnosis in verdicts():
+        said = headline(diagnosis)
+        assert 3 <= len(said.split()) <= MOST_WORDS, said
+        assert "_" not in said
+        assert said[0].isupper() or said[0].isdigit()
+        assert said.endswith(".")
+        assert "  " not in said
+
+
+def test_every_effect_has_words_of_its_own():
+    for name in (*EFFECTS, *NUISANCES):
+        assert name in EFFECTS_IN_WORDS, f"say {name} in words in report/effect_words.py"
+    assert len(set(EFFECTS_IN_WORDS.values())) == len(EFFECTS_IN_WORDS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_effect_alone_is_said_in_full(name):
+    assert headline(found("named", (name,))) == f"The model leaves out {effect_in_words(name)}."
+
+
+def test_an_effect_of_a_users_own_goes_by_its_name():
+    assert headline(found("named", ("upper_tank_overflow",))) == "The model leaves out upper tank overflow."
+
+
+def test_the_largest_effect_comes_first():
+    said = headline(found("named", ("flicker", "backlash")))
+    assert said == "The model leaves out a flickering lamp and backlash (play) of the arm."
+
+
+def test_rivals_are_told_by_what_they_do_not_share():
+    said = headline(found("cannot_tell", ("lag",), rivals=(("lag", "outliers"), ("backlash", "outliers"))))
+    assert "outlying" not in said
+    assert "a sensor that follows slowly or backlash" in said
+
+
+def test_nothing_is_no_rival_of_something_missing():
+    said = headline(found("cannot_tell", rivals=((), ("lag",))))
+    assert (
+        said
+        == "These readings cannot tell whether anything is missing; if so, most likely a sensor that follows slowly."
+    )
+
+
+def test_what_is_missing_after_the_repair_is_said():
+    assert headline(found("named", ("lag",), after=1e-5)).endswith("Something more is missing.")
+
+
+def test_equal_readings_are_no_signal():
+    diagnosis = found("cannot_tell", few=True)
+    diagnosis.recording.readings[:] = 7.0
+    assert headline(diagnosis) == "All 408 readings are equal: there is no signal to diagnose."

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from probewise.diagnosis import PlanAudit
-from probewise.diagnosis.audit.sights import ALIAS
+from probewise.diagnosis.audit.sights import ALIAS, LAMBDA, LEAST_NATS
 from probewise.report.audit_table import audit_table
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import audit_matrix, png
-from probewise.report.words import count, number
+from probewise.report.terms import explained, terms_of
+from probewise.report.words import count, number, readable
 
 __all__ = ["answer", "figures", "write_page"]
 
 
 def answer(audit: PlanAudit) -> str:
-    """Say in one sentence what the plan can do, and what it takes to cure the rest."""
-    n = len(audit.effects)
-    said = (
-        f"Of {n} things that may be wrong this plan sees and tells apart {len(audit.seen_as('fine'))}; "
-        f"{len(audit.seen_as('aliased'))} it takes for another, {len(audit.seen_as('invisible'))} it cannot see"
-    )
-    if audit.cures:
-        more = len(audit.seen_as("fine", after=True)) - len(audit.seen_as("fine"))
-        said += f". {count(audit.extra_readings, 'more reading')} would cure {more}"
-    return said + "."
+    """Say in twenty words at most what the plan can do, and what it takes to cure the rest."""
+    n_fine, n_aliased = len(audit.seen_as("fine")), len(audit.seen_as("aliased"))
+    of = f"{n_fine} of {len(audit.effects)} effects"
+    said = f"This plan can identify {of}; {n_aliased} are aliased, {len(audit.seen_as('invisible'))} undetectable."
+    if not audit.cures:
+        return said
+    cured = len(audit.seen_as("fine", after=True)) - n_fine
+    return f"{said} {count(audit.extra_readings, 'more reading')} would cure {cured}."
 
 
 def figures(audit: PlanAudit) -> dict[str, bytes]:
@@ -35,31 +34,35 @@ def figures(audit: PlanAudit) -> dict[str, bytes]:
 
 def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
     """Write the whole page."""
+    shown = figure(
+        drawn["audit.png"],
+        "Left: of what each effect changes in the readings, the share that the sensor's own parameters cannot absorb. "
+        "Right: its cosine with each other effect. Circles mark aliases: at size "
+        f"λ = {LAMBDA:g} these readings tell the two apart by less than {LEAST_NATS:g} nats.",
+    )
+    sections = [
+        Section("The fewest readings that would cure it", _cures(audit)),
+        Section("Every effect", (audit_table(audit.effects),)),
+        Section(
+            "What was assumed",
+            (
+                definition_list(
+                    (
+                        ("plan", source),
+                        ("readings", f"{len(audit.plan)} in {count(len(audit.plan.scan_names), 'scan')}"),
+                        ("sensor", audit.assumed),
+                        ("the arm can also command", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
+                    )
+                ),
+            ),
+        ),
+    ]
+    known: set[str] = set()
     return page(
         f"Audit of {source}",
         answer=answer(audit),
-        key_figure=figure(
-            drawn["audit.png"],
-            "Left: how much of each effect's trace is left when the sensor's own parameters have taken what they can. "
-            "Right: how well each effect (row) is imitated by each other (column).",
-        ),
-        sections=[
-            Section("The fewest readings that would cure it", _cures(audit)),
-            Section("Every effect", (audit_table(audit.effects),)),
-            Section(
-                "What was assumed",
-                (
-                    definition_list(
-                        (
-                            ("plan", source),
-                            ("readings", f"{len(audit.plan)} in {count(len(audit.plan.scan_names), 'scan')}"),
-                            ("sensor", audit.assumed),
-                            ("the arm can also command", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
-                        )
-                    ),
-                ),
-            ),
-        ],
+        key_figure=fragment(shown, *terms_of(f"{answer(audit)} {shown}", known)),
+        sections=explained(sections, known),
     )
 
 
@@ -67,7 +70,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     plan = audit.cure_plan
     if plan is None:
         if all(effect.sight == "fine" for effect in audit.effects):
-            return (paragraph("Nothing is to be cured."),)
+            return (paragraph("None are needed: every effect can be identified."),)
         return (
             paragraph(
                 "No scan that this arm can take, repeated, reversed, faster or turned, nor the sheet laid otherwise, "
@@ -77,14 +80,23 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     left = [e.name.replace("_", " ") for e in audit.after if e.sight != "fine"]
     return (
         table(
-            ("", "what to do", "readings", "then seen and told apart"),
+            ("step", "what to do", "readings", "effects that can then be identified"),
             (
-                (str(k), cure.description, str(len(cure.plan)), ", ".join(cure.cured).replace("_", " ") or "–")
+                (
+                    str(k),
+                    readable(cure.description),
+                    str(len(cure.plan)),
+                    ", ".join(cure.cured).replace("_", " ") or "–",
+                )
                 for k, cure in enumerate(audit.cures, start=1)
             ),
         ),
         paragraph(
             f"{count(len(plan), 'reading')}, about {number(audit.extra_minutes, 0)} minutes; "
-            f"the plan is in cure_plan.csv. Left after that: {', '.join(left) or 'nothing'}."
+            f"the plan is in cure_plan.csv. Still not identified: {', '.join(left) or 'nothing'}."
         ),
     )
+
+
+def _names(effects: Sequence[str]) -> str:
+    return ", ".join(effects).replace("_", " ") or "–"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from probewise.diagnosis import EffectAudit
 from probewise.report.html import Markup, table
-from probewise.report.words import number
+from probewise.report.words import number, unit_name
 
 __all__ = ["audit_table"]
 
@@ -15,7 +15,7 @@ def audit_table(effects: Sequence[EffectAudit]) -> Markup:
     """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows."""
     rank = ("invisible", "aliased", "fine")
     return table(
-        ("effect", "seen", "survives", "looks like", "seen from (λ = 8)"),
+        ("effect", "status", "detectable share", "aliased with (cosine)", "size at λ = 8"),
         (
             (
                 effect.name.replace("_", " "),
@@ -26,11 +26,12 @@ def audit_table(effects: Sequence[EffectAudit]) -> Markup:
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.sight))
         ),
-        caption="Survives: share of its trace that the sensor's own parameters do not absorb. Looks like: effects "
-        "that imitate a typical setting of it, with the cosine.",
+        caption="Status: fine (can be identified), aliased, or invisible (cannot be detected). Detectable share: of "
+        "what it changes in the readings, the share that the sensor's own parameters do not absorb.",
     )
 
 
 def _smallest(parameter: str, unit: str, amount: float | None) -> str:
-    name = parameter.replace("_", " ")
-    return f"{name} not at all" if amount is None else f"{name} {amount:.2g} {'' if unit == '1' else unit}".rstrip()
+    name = "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " ")
+    value = "at no size" if amount is None else f"{amount:.2g} {'' if unit == '1' else unit_name(unit)}"
+    return f"{name} {value}".strip()

@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probewise.challenge import Estimate, Row, by_effect, confusion, reliability, score
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
+from probewise.report.terms import explained, terms_of
 from probewise.report.words import count
 
 __all__ = ["answer", "table_csv", "table_of_rows", "write_page"]
@@ -24,8 +25,8 @@ def answer(rows: Sequence[Row], n_cases: int) -> str:
     """Say in one sentence how many targets are met."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
-        f"{count(n_cases, 'case')}: {count(n['met'], 'target')} met, {n['missed']} missed, "
-        f"{n['open']} that so many cases cannot decide."
+        f"{count(n_cases, 'case')} of concealed physics: {count(n['met'], 'target')} met, {n['missed']} missed, "
+        f"{n['open']} undecided by so few cases."
     )
 
 
@@ -81,7 +82,13 @@ def write_page(results: Results, *, command: str) -> str:
         png(reliability_diagram(reliability(done))),
         "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
     )
-    return page("What a diagnosis is worth", answer=answer(rows, len(results)), key_figure=honest, sections=sections)
+    known: set[str] = set()
+    return page(
+        "What a diagnosis is worth",
+        answer=answer(rows, len(results)),
+        key_figure=fragment(honest, *terms_of(honest, known)),
+        sections=explained(sections, known),
+    )
 
 
 def _effects(done: Results) -> Markup:

@@ -380,8 +380,12 @@ def _with_name(name: str) -> str:
 def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd, with its unit where asked, and its interval."""
     low, high = found.interval95
-    own = f" {unit_name(found.unit)}" if unit and found.unit != "1" else ""
-    return readable(f"{give_or_take(found.mean, found.sd)}{own}"), readable(f"{low:.4g} to {high:.4g}")
+    own = _unit(found) if unit else ""
+    return readable(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), readable(f"{low:.4g} to {high:.4g}")
+
+
+def _unit(found: ParameterFound) -> str:
+    return "" if found.unit == "1" else unit_name(found.unit)
 
 
 def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:

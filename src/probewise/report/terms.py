@@ -23,7 +23,7 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "held-out": (r"\bheld-out\b", "kept for testing: the fit has not seen it"),
         "λ": (r"λ|\blambda\b", "size of an effect: what is left of it after a full refit without it, in noise sds"),
         "aliased": (
-            r"(?i)\baliase[sd]\b",
+            r"(?i)\balias(es|ed)?\b",
             "two effects that change these readings in the same way, so that the readings cannot tell which it is",
         ),
         "cosine": (

@@ -34,7 +34,7 @@ def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArra
     order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(sights[k]), -cosines[k, k]))
     labels = [names[k].replace("_", " ") for k in order]
     at = np.arange(len(order))
-    axes = grid_of_axes(1, 2, size_in=(11.0, 0.8 + 0.27 * len(order)), width_ratios=[1, 2.6], sharey=True)
+    axes = grid_of_axes(1, 2, size_in=(9.4, 0.9 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
     bars, matrix = axes[0]
     bars.barh(at, np.diag(cosines)[order], color=[COLOUR[sights[k]] for k in order], height=0.7)
     bars.set_yticks(at, labels)
@@ -43,8 +43,10 @@ def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArra
     for sight, colour in COLOUR.items():
         if sight in sights:
             bars.barh([np.nan], [0], color=colour, label=sight)
-    bars.legend(frameon=False, fontsize="small", loc="lower right")
-    tidy(bars, x="surviving share of its trace", y="")
+    bars.legend(
+        frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(-0.35, 1.0), ncols=3, columnspacing=1
+    )
+    tidy(bars, x="detectable share (no unit)", y="")
     _matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
     return axes
 
@@ -56,5 +58,5 @@ def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) 
     ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
     ax.set_xticks(np.arange(len(labels)), labels, rotation=90, fontsize="small")
     ax.tick_params(left=False)
-    ax.figure.colorbar(image, ax=ax, label="how well the row is imitated by the column (cosine)", shrink=0.7)
-    tidy(ax, x="", y="", title="circles: not told apart at λ = 8")
+    ax.figure.colorbar(image, ax=ax, label="cosine of row and column (no unit)", shrink=0.7)
+    tidy(ax, x="", y="", title="circles: aliased pairs")

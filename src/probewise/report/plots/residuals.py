@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from probewise._arrays import FloatArray
 from probewise.recordings import Recording
@@ -148,6 +149,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
     tidy(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
     plain_numbers(ax)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return ax
 
 

@@ -120,6 +120,14 @@ def test_a_window_is_a_step_of_its_own():
     assert np.all(np.delete(means.before, own) == 0.0)
 
 
+def test_readings_that_share_a_few_values_still_make_steps():
+    """Sixty readings at one level and nine above it would be two steps of one width."""
+    x = np.concatenate([np.linspace(10.0, 10.1, 60), np.linspace(20.0, 60.0, 9)])
+    means = mean_residuals(x, 0 * x, None, sd=1.0)
+    assert len(means.at) > 6
+    assert means.size.sum() == 69
+
+
 def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
     """A straight line fitted to noise: what it absorbs, by its posterior samples, makes the band narrower."""
     rng = np.random.default_rng(2)

@@ -15,6 +15,7 @@ __all__ = ["Means", "mean_residuals"]
 _STEPS = 24
 _MOST_STEPS = 60
 _LEAST_ROWS = 4
+_FEW_STEPS = 6
 _NEVER_LESS = 0.05  # of the variance of a mean: a band has some width however much the fit takes up
 
 
@@ -109,8 +110,16 @@ def _even(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
     n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
+    groups = _joined(_steps(mine, rows, n), least)
+    if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
+        return groups
+    # Most readings share a few values: as many in each step show more than steps of one width.
+    return np.array_split(rows[np.argsort(mine, kind="stable")], min(n, rows.size // least))
+
+
+def _steps(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
     step = np.minimum((n * (mine - mine.min()) / max(float(np.ptp(mine)), 1e-300)).astype(int), n - 1)
-    return _joined([rows[step == k] for k in range(n)], least)
+    return [rows[step == k] for k in range(n)]
 
 
 def _joined(parts: Sequence[IntArray], least: int) -> list[IntArray]:

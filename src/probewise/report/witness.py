@@ -18,6 +18,7 @@ __all__ = ["Chance", "Witness", "along_scan", "of_place", "telling"]
 
 _SEEN = 2.3  # sds of chance from which a mean is seen to stand out
 _N_SAMPLES = 200  # of the posterior, for what the fit absorbs
+_ASTRAY = 0.01  # of its length, by which a scan may leave its line
 _LEAST_PERIODS = 3.0  # within a recording, for folding it
 
 
@@ -116,11 +117,17 @@ def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> W
     rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
-    if np.ptp(along) == 0:
+    if np.ptp(along) == 0 or not _on_a_line(x_mm, y_mm):
         along, label = plan.time_s[rows], "time (s)"
     at = np.full(len(plan), np.nan)
     at[rows] = along
     return Witness(at, f"{label}, scan {scan}", place=place)
+
+
+def _on_a_line(x_mm: FloatArray, y_mm: FloatArray) -> bool:
+    places = np.stack([x_mm - x_mm.mean(), y_mm - y_mm.mean()])
+    widest, across = np.linalg.svd(places, compute_uv=False)
+    return bool(across <= _ASTRAY * widest)
 
 
 def _likeness(diagnosis: Diagnosis, place: Place) -> float:

@@ -12,7 +12,7 @@ from probewise.challenge import Estimate, Row, by_effect, confusion, reliability
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
 from probewise.report.terms import explained, terms_of
-from probewise.report.words import count
+from probewise.report.words import count, readable
 
 __all__ = ["answer", "table_csv", "table_of_rows", "write_page"]
 
@@ -37,16 +37,22 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
         header,
         (
             (
-                row.name,
-                _value(row.found),
-                _interval(row.found),
+                _indented(row.name),
+                _value(row.found) if row.found.n else "–",
+                readable(_interval(row.found)),
                 str(row.found.n),
                 _target(row),
-                _DECISIONS[row.decision],
+                "undecided" if row.decision == "open" else _DECISIONS[row.decision],
             )
             for row in rows
         ),
     )
+
+
+def _indented(name: str) -> str:
+    """Keep the indentation of a row that is part of the one above: a page drops plain spaces."""
+    own = name.lstrip()
+    return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
 def table_csv(rows: Sequence[Row]) -> str:
@@ -103,7 +109,7 @@ def _effects(done: Results) -> Markup:
 
 def _legend() -> Markup:
     return paragraph(
-        "A target is met or missed only where the whole 95 % interval says so; otherwise so many cases cannot decide. "
+        "A target is met or missed only where the whole 95 % interval says so; otherwise it is undecided. "
         "Intervals of shares are Wilson's, of means Student's, of the others bootstrap ones. "
         "Detection and covariates: effects on the mean. Held-out gain: white noise. "
         "Aliases: effects that so many readings could tell apart by less than 3 nats."

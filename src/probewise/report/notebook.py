@@ -15,6 +15,7 @@ from probewise.recordings import Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
+from probewise.report.effect_words import effect_in_words, hypothesis_in_words
 from probewise.report.html import Markup, element, figure, paragraph, table
 from probewise.report.plots import (
     corner_plot,
@@ -106,8 +107,12 @@ def _(value: Exploration) -> str:
 @render_html.register
 def _(value: Diagnosis) -> str:
     hypotheses = [h for h in value.hypotheses if h.probability > 1e-3]
-    bars = hypothesis_probabilities([h.label for h in hypotheses], [h.probability for h in hypotheses])
-    rows = [(e.name, f"{e.probability:.3f}", e.sentence) for e in value.effects if e.probability > 0.05]
+    bars = hypothesis_probabilities(
+        [hypothesis_in_words(h.effects) for h in hypotheses], [h.probability for h in hypotheses]
+    )
+    rows = [
+        (effect_in_words(e.name), f"{e.probability:.3f}", e.sentence) for e in value.effects if e.probability > 0.05
+    ]
     return _card(
         paragraph(diagnosis_report.answer(value)),
         figure(png(bars, dpi=DPI), "Probability of each hypothesis"),

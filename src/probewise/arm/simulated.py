@@ -54,8 +54,9 @@ class SimulatedArm:
         The conversion to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
     height_mm
         Height of the sensor above the surface when it reads and the pose does not say.
-    start_s
-        What the clock shows at the start, to go on where an earlier run ended.
+    last
+        The reading that an earlier run took last: the arm stands where that was taken, and its clock goes on from
+        there. None: it rests, and its clock shows 0.
     """
 
     def __init__(
@@ -66,14 +67,15 @@ class SimulatedArm:
         speed: Speed | None = None,
         scale: LegoScale | None = LEGO,
         height_mm: float = 14.0,
-        start_s: float = 0.0,
+        last: Reading | None = None,
     ) -> None:
         if not height_mm > 0:
             raise ParameterError("height_mm", height_mm, "greater than 0")
-        self._light, self._scale, self._height_mm, self._time_s = light, scale, height_mm, start_s
+        self._light, self._scale, self._height_mm = light, scale, height_mm
         self.reach: Workspace = Reach() if reach is None else reach
         self.speed = Speed() if speed is None else speed
-        self._home = self._pose = Pose(*self.reach.rest_mm)
+        self._home = Pose(*self.reach.rest_mm)
+        self._pose, self._time_s = (self._home, 0.0) if last is None else (last.pose, last.time_s)
 
     def __enter__(self) -> Self:
         return self

@@ -6,11 +6,12 @@ model leaves out), `predict` (eq. of the sensor model with its uncertainty) and 
 all of them at once; `arm` moves and reads the LEGO arm, `emulate-nxt` stands in for it.
 
 Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
-2: input that cannot be used, told in one line, nothing written; 130: stopped by Ctrl-C.
+2: input that cannot be used, told in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import warnings
@@ -18,6 +19,7 @@ from collections.abc import Sequence
 
 from probewise.cli import arm, audit, calibrate, challenge, demo, diagnose, emulate_nxt, explore, predict, study
 from probewise.cli._common import OneLineParser, Verb
+from probewise.cli._stopping import Stopped, stoppable
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
@@ -59,24 +61,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv
         Arguments without the program's name; None takes those of the process.
     """
+    words = sys.argv[1:] if argv is None else list(argv)
     try:
-        arguments = parser().parse_args(argv)
+        arguments = parser().parse_args(words)
     except SystemExit as stop:  # argparse leaves this way after --help, --version and errors
         return stop.code if isinstance(stop.code, int) else 2
+    arguments.words = words
     verb = next(v for v in VERBS if v.name == arguments.verb)
     with warnings.catch_warnings():
         warnings.showwarning = _one_line_warning
         try:
-            return verb.run(arguments)
-        except KeyboardInterrupt as stop:
-            kept = str(stop) or "nothing was written"
-            _complain(verb, f"stopped; {kept}")
-            return 130
+            with stoppable():
+                return verb.run(arguments)
+        except Stopped as stop:
+            _complain(verb, f"stopped; {str(stop) or 'nothing was written'}")
+            _forget_lost_reader()
+            return stop.status
         except (NotConvergedError, LinkError) as error:
             _complain(verb, str(error))
             return 1
         except BrokenPipeError:  # the reader of a pipe left; what was written is complete
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _forget_lost_reader()
             return 1
         except (ProbewiseError, OSError) as error:
             _complain(verb, _one_line(error))
@@ -84,7 +89,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _complain(verb: Verb, text: str) -> None:
-    sys.stderr.write(f"probewise {verb.name}: {text}\n")
+    with contextlib.suppress(OSError):  # of a terminal that was closed
+        sys.stderr.write(f"probewise {verb.name}: {text}\n")
+
+
+def _forget_lost_reader() -> None:
+    """Throw away what cannot be written to standard output any more, which the interpreter would try again."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _one_line(error: Exception) -> str:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import a_path
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, LegoArm
@@ -25,10 +24,9 @@ __all__ = [
     "open_nxt",
     "parse_arm",
     "parse_place",
-    "telling_what_is_kept",
 ]
 
-AWAKE_S = 20.0  # how often a waiting program thinks of the brick's sleep timer
+WAIT_S = 0.5  # where a wait for a person hears no signal, it lasts so long; the brick is then kept awake
 
 
 def add_geometry(parser: argparse.ArgumentParser) -> None:
@@ -93,7 +91,7 @@ def asker(arm: LegoArm) -> Callable[[str], None]:
         threading.Thread(target=lambda: answers.put(sys.stdin.readline()), daemon=True).start()
         while True:
             try:
-                answer = answers.get(timeout=AWAKE_S)
+                answer = answers.get(timeout=WAIT_S)
             except queue.Empty:
                 arm.keep_awake()
             else:
@@ -102,14 +100,3 @@ def asker(arm: LegoArm) -> Callable[[str], None]:
             raise ParameterError("standard input", "its end", "a person who presses Enter")
 
     return ask
-
-
-@contextlib.contextmanager
-def telling_what_is_kept(kept: Callable[[], str]) -> Iterator[None]:
-    """Add to the last words of a run that Ctrl-C or a dead line ends what of it is on the disk."""
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(kept()) from stop
-    except LinkError as error:
-        raise LinkError(f"{error}; {kept()}") from error

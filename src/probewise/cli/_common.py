@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +23,7 @@ __all__ = [
     "add_out_directory",
     "add_quiet",
     "check_live",
+    "keeps",
     "positive_int",
     "say",
 ]
@@ -105,6 +109,13 @@ def say(text: str, *, quiet: bool = False) -> None:
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
+
+
+def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str) -> str:
+    """Say how much of a run a file holds, and by which command, the same with these options, it goes on."""
+    words = [*arguments.words, *(option for option in options if option not in arguments.words)]
+    command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
+    return f"{path} keeps {n} {noun}{'' if n == 1 else 's'}; go on with: {command}"
 
 
 def check_live(n_live: int, n_params: int) -> int:

@@ -6,11 +6,12 @@ import argparse
 import contextlib
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from pathlib import Path
 
-from probewise.cli._common import positive_int
-from probewise.errors import LinkError, ParameterError
+from probewise.cli._common import keeps, positive_int
+from probewise.errors import LinkError
 
-__all__ = ["add_executor", "executor_of"]
+__all__ = ["add_executor", "campaign_keeps", "executor_of"]
 
 
 def add_executor(parser: argparse.ArgumentParser) -> None:
@@ -37,13 +38,22 @@ def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
         yield None
 
 
+def campaign_keeps(path: Path, noun: str, arguments: argparse.Namespace) -> str:
+    """Say how many finished tasks a campaign's file holds, and how to go on."""
+    from probewise.campaign import read_campaign
+
+    return keeps(path, len(read_campaign(path).results), noun, arguments) if path.exists() else "nothing was written"
+
+
 @contextlib.contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        allowed = "none without the package distributed; install it with: pip install distributed"
-        raise ParameterError("--scheduler", address, allowed) from error
+        raise LinkError(
+            "--scheduler needs the package distributed, which is not installed; "
+            "install it with: pip install distributed; --workers N does without"
+        ) from error
     try:
         client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:

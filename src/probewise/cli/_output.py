@@ -1,18 +1,30 @@
-"""Where results go: checked before any work, written whole or not at all, no input lost."""
+"""Where results go: checked before any work, put in place all or none, no input lost.
+
+The files of a command are written into a hidden folder inside `--out`. When all are complete, a file
+`commit.json` there says so and lists them; only then are they moved. A process that is killed before that
+has changed nothing; one that is killed later has left the list, by which the next command with the same
+`--out` puts the rest in place before its own.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from probewise._signals import deferred
+from probewise.cli._stopping import require_going_on
 from probewise.errors import FileError, ParameterError
 
 __all__ = ["Stage", "check_out_directory", "check_out_file", "staged"]
+
+_FOLDER, _COMMIT = ".writing", "commit.json"
+_PATIENCE_S = 600.0  # for another command that is writing its results just now
 
 
 class Stage:
@@ -66,8 +78,7 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
 def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
     """Yield an empty directory; move its files into `out` only when the block ends well.
 
-    Nobody ever sees half a result: each file is put in place by one atomic rename within
-    one file system, and an error or an interrupt leaves `out` as it was.
+    An error or a signal before that leaves `out` as it was.
 
     Parameters
     ----------
@@ -81,40 +92,102 @@ def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = 
     Raises
     ------
     FileError
-        If `out` cannot be made or written to, or a directory stands where a file has to go.
+        If `out` cannot be made or written to, another process writes results there for long, or a
+        directory stands where a file has to go.
     """
+    from probewise.recordings import locked, write_text_atomically  # here: the help does without
+
     try:
         out.mkdir(parents=True, exist_ok=True)
-        stage = Stage(Path(tempfile.mkdtemp(prefix=".writing-", dir=out)))
     except OSError as error:
-        raise FileError(out, f"cannot be written to ({error.strerror})", "a directory you may write to") from error
-    try:
-        yield stage
-        written = sorted(p.relative_to(stage.folder) for p in stage.folder.rglob("*") if p.is_file())
-        for name in written:
-            if (out / name).is_dir():
-                raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
-        own = {path.resolve() for path in inputs}
-        _set_aside([out / name for name in written if (out / name).resolve() in own], stage)
-        for name in written:
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(stage.folder / name, out / name)
-        for path in itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated):
-            if path.relative_to(out) not in written and path.resolve() not in own and path not in stage.kept.values():
-                path.unlink()
-    finally:
-        shutil.rmtree(stage.folder, ignore_errors=True)
+        raise FileError(out, f"cannot be made ({error.strerror})", "a directory you may write to") from error
+    folder = out / _FOLDER
+    with locked(out / "results", patience_s=_PATIENCE_S):
+        try:
+            _settle(out)
+            folder.mkdir()
+            stage = Stage(folder)
+            yield stage
+            require_going_on()
+            with deferred():
+                commit = _commit(out, folder, inputs, outdated)
+                stage.kept = {out / name: out / kept for name, kept in commit.aside.items()}
+                write_text_atomically(folder / _COMMIT, json.dumps(asdict(commit)))
+                _settle(out)
+        except FileError as error:
+            if not Path(error.path).is_relative_to(folder):
+                raise
+            name = out / Path(error.path).relative_to(folder)
+            raise FileError(name, error.found, error.allowed, row=error.row, column=error.column) from error
+        finally:
+            if not (folder / _COMMIT).exists():
+                shutil.rmtree(folder, ignore_errors=True)
 
 
-def _set_aside(paths: Sequence[Path], stage: Stage) -> None:
-    """Rename files to the first free NAME_kept, NAME_kept_2 ...; files of one name keep one name."""
-    for stem in dict.fromkeys(path.with_suffix("") for path in paths):
-        group = [path for path in paths if path.with_suffix("") == stem]
+@dataclass(frozen=True)
+class _Commit:
+    """What is to be done to `out`, names relative to it: `names` move in, what `aside` lists makes way for them."""
+
+    names: Sequence[str]
+    aside: Mapping[str, str]
+    remove: Sequence[str]
+
+
+def _commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    for name in names:
+        if (out / name).is_dir():
+            raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
+    own = {path.resolve() for path in inputs}
+    aside = _aside(out, [name for name in names if (out / name).resolve() in own])
+    old = itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated)
+    gone = [path.relative_to(out).as_posix() for path in old if path.resolve() not in own]
+    return _Commit(names, aside, [name for name in gone if name not in names])
+
+
+def _settle(out: Path) -> None:
+    """Finish what a complete list in `out` asks for; throw away what came to no list.
+
+    Every step can be done twice, so that it does not matter where the process before this one was killed.
+    """
+    folder = out / _FOLDER
+    if not folder.exists():
+        return
+    if (folder / _COMMIT).exists():
+        try:
+            _put_in_place(out, folder, _Commit(**json.loads((folder / _COMMIT).read_text(encoding="utf-8"))))
+        except OSError as error:
+            raise FileError(
+                error.filename2 or error.filename,
+                f"cannot be replaced ({error.strerror})",
+                f"a file that no other program holds; the next command with --out {out} puts the rest in place",
+            ) from error
+        (folder / _COMMIT).unlink()
+    shutil.rmtree(folder)
+
+
+def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
+    for name in commit.names:
+        new, target = folder / name, out / name
+        if not new.exists():
+            continue
+        if name in commit.aside and target.exists() and not (out / commit.aside[name]).exists():
+            os.replace(target, out / commit.aside[name])
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(new, target)
+    for name in commit.remove:
+        (out / name).unlink(missing_ok=True)
+
+
+def _aside(out: Path, names: Sequence[str]) -> dict[str, str]:
+    """Find for each file the first free NAME_kept, NAME_kept_2 ...; files of one name keep one name."""
+    aside: dict[str, str] = {}
+    for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
+        group = [Path(name) for name in names if Path(name).with_suffix("") == stem]
         endings = itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2)))
-        ending = next(e for e in endings if not any(_renamed(path, e).exists() for path in group))
-        for path in group:
-            os.replace(path, _renamed(path, ending))
-            stage.kept[path] = _renamed(path, ending)
+        ending = next(e for e in endings if not any((out / _renamed(path, e)).exists() for path in group))
+        aside |= {path.as_posix(): _renamed(path, ending).as_posix() for path in group}
+    return aside
 
 
 def _renamed(path: Path, ending: str) -> Path:

@@ -15,10 +15,10 @@ from probewise.cli._arm import (
     open_nxt,
     parse_arm,
     parse_place,
-    telling_what_is_kept,
 )
-from probewise.cli._common import OneLineParser, Verb, a_path, add_quiet, positive_int, say
+from probewise.cli._common import OneLineParser, Verb, a_path, add_quiet, keeps, positive_int, say
 from probewise.cli._output import check_out_file
+from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from tqdm import tqdm
 
     from probewise.arm import carry_out, recorded
-    from probewise.recordings import paper_plan, read_plan, write_recording
+    from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
 
     named = arguments.plan == PAPER
     out = check_out_file(arguments.out, *([] if named else [Path(arguments.plan)]))
@@ -216,19 +216,19 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     start_s = taken[-1].time_s if taken else 0.0
 
     def kept() -> str:
-        some = f"{out} keeps {len(taken)} of {len(plan)} readings; go on with --resume"
-        return some if taken else "nothing was read"
+        if not out.exists():
+            return "nothing was read"
+        return keeps(out, len(read_recording(out)), "reading", arguments, "--resume")
 
-    with _arm(arguments, geometry, start_s=start_s) as arm:
+    with saying_what_is_kept(kept), _arm(arguments, geometry, start_s=start_s) as arm:
         readings = carry_out(arm, plan, origin_mm=origin, ask=_asker(arguments, arm), first=len(taken))
         bar = tqdm(
             readings, desc="readings", total=len(plan), initial=len(taken), disable=True if arguments.quiet else None
         )
-        with telling_what_is_kept(kept):
-            for reading in bar:
-                taken.append(reading)
-                if not arguments.dry_run:
-                    write_recording(recorded(plan, taken), out)
+        for reading in bar:
+            taken.append(reading)
+            if not arguments.dry_run:
+                write_recording(recorded(plan, taken), out)
     if not arguments.dry_run:
         say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 

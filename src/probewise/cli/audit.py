@@ -55,17 +55,17 @@ def _write(audit: PlanAudit, out: Path, plan: Path, *, quiet: bool) -> None:
     import json
 
     from probewise.diagnosis import CURE_PLAN, audit_json
-    from probewise.recordings import write_plan
+    from probewise.recordings import write_bytes_atomically, write_plan, write_text_atomically
     from probewise.report import audit as report
 
     drawn = report.figures(audit)
     cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
     with staged(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
         text = json.dumps(audit_json(audit), allow_nan=False, indent=1)
-        (stage / "audit.json").write_text(text + "\n", encoding="utf-8")
+        write_text_atomically(stage / "audit.json", text + "\n")
         for name, png in drawn.items():
-            (stage / name).write_bytes(png)
-        (stage / "report.html").write_text(report.write_page(audit, drawn, source=plan.name), encoding="utf-8")
+            write_bytes_atomically(stage / name, png)
+        write_text_atomically(stage / "report.html", report.write_page(audit, drawn, source=plan.name))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
     for note in stage.notes:

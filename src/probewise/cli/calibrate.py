@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise.calibration import calibrate, predict, write_sensor
     from probewise.cli._progress import nested_progress
-    from probewise.recordings import read_recording
+    from probewise.recordings import read_recording, write_bytes_atomically, write_text_atomically
     from probewise.report import calibration as report
 
     out = check_out_directory(arguments.out)
@@ -54,9 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
     with staged(out) as stage:
         write_sensor(result.sensor, stage / "sensor.json")
         for name, png in drawn.items():
-            (stage / name).write_bytes(png)
+            write_bytes_atomically(stage / name, png)
         page = report.write_page(result, recording, prediction, drawn, seed=arguments.seed)
-        (stage / "report.html").write_text(page, encoding="utf-8")
+        write_text_atomically(stage / "report.html", page)
     for note in recording.notes:
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from functools import partial
 from typing import Any
 
 from probewise.cli._common import Verb, add_common, add_out_directory, positive_int, say
-from probewise.cli._executor import add_executor, executor_of
+from probewise.cli._executor import add_executor, campaign_keeps, executor_of
 from probewise.cli._output import check_out_directory, staged
+from probewise.cli._stopping import saying_what_is_kept
 
 __all__ = ["VERB"]
 
@@ -32,34 +34,29 @@ def run(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from probewise.challenge import run_challenge, score
+    from probewise.recordings import write_text_atomically
     from probewise.report import challenge as report
 
     out = check_out_directory(arguments.out)
     out.mkdir(parents=True, exist_ok=True)
     cases = out / "cases.jsonl"
-    ended = 0
+    kept = partial(campaign_keeps, cases, "case", arguments)
     with (
+        saying_what_is_kept(kept),
         executor_of(arguments) as executor,
         tqdm(total=arguments.cases, desc="cases", unit="", disable=True if arguments.quiet else None) as bar,
     ):
 
         def advance(key: str, result: Any) -> None:
-            nonlocal ended
-            ended += 1
             bar.set_postfix_str(key)
             bar.update()
 
-        try:
-            results = run_challenge(
-                arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=advance
-            )
-        except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(f"{cases} keeps {ended} more cases; the same command goes on") from stop
+        results = run_challenge(arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=advance)
     rows = score(results)
     command = shlex.join(["probewise", "challenge", "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
-    with staged(out) as stage:
-        (stage / "table.csv").write_text(report.table_csv(rows), encoding="utf-8")
-        (stage / "report.html").write_text(report.write_page(results, command=command), encoding="utf-8")
+    with saying_what_is_kept(kept), staged(out) as stage:
+        write_text_atomically(stage / "table.csv", report.table_csv(rows))
+        write_text_atomically(stage / "report.html", report.write_page(results, command=command))
     say(report.answer(rows, len(results)), quiet=arguments.quiet)
     say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

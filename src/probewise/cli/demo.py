@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
     from probewise.cli._workers import workers
-    from probewise.recordings import read_recording, shipped
+    from probewise.recordings import read_recording, shipped, write_bytes_atomically, write_text_atomically
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
     from probewise.world.shipped import truth as world_behind
@@ -87,11 +87,11 @@ def run(arguments: argparse.Namespace) -> int:
     with staged(out) as stage:
         write_sensor(sensor, stage / "sensor.json")
         for name, png in drawn.items():
-            (stage / name).write_bytes(png)
+            write_bytes_atomically(stage / name, png)
         (stage / "diagnosis").mkdir()
         rng = np.random.default_rng([seed, 3])
         diagnose_verb.write_results(diagnosis, witnesses, stage / "diagnosis", rng=rng)
-        (stage / "diagnosis" / "report.html").write_text(diagnosis_page, encoding="utf-8")
+        write_text_atomically(stage / "diagnosis" / "report.html", diagnosis_page)
         page = report.write_page(
             calibration,
             recording,
@@ -105,9 +105,9 @@ def run(arguments: argparse.Namespace) -> int:
             seed=seed,
             seconds=seconds,
         )
-        (stage / "report.html").write_text(page, encoding="utf-8")
+        write_text_atomically(stage / "report.html", page)
         answers = report.answers(started_alike, diagnosis, concealed=concealed, seed=seed)
-        (stage / "answers.json").write_text(json.dumps(answers, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        write_text_atomically(stage / "answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     for line in (
         *report.comparison_lines(searches),
         report.answer(started_alike),

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.calibration import read_sensor
     from probewise.cli._progress import nested_progress
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
-    from probewise.recordings import read_recording
+    from probewise.recordings import read_recording, write_text_atomically
     from probewise.report import diagnosis as report
 
     out = check_out_directory(arguments.out)
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     with staged(out, inputs=_to_be_kept(arguments, out), outdated=_OF_ONE_RUN) as stage:
         write_results(diagnosis, drawn, stage.folder, rng=files_rng)
         page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
-        (stage / "report.html").write_text(page, encoding="utf-8")
+        write_text_atomically(stage / "report.html", page)
     for note in (*joined.notes, *stage.notes):
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
@@ -115,16 +115,16 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *
 
     from probewise.calibration import write_sensor
     from probewise.diagnosis import NEXT_PLAN, diagnosis_json
-    from probewise.recordings import write_plan
+    from probewise.recordings import write_bytes_atomically, write_plan, write_text_atomically
 
     text = json.dumps(diagnosis_json(diagnosis), allow_nan=False, indent=1)
-    (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
+    write_text_atomically(folder / "diagnosis.json", text + "\n")
     write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), folder / "sensor.json")
     write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), folder / "calibrated.json")
     if diagnosis.next_measurement is not None:
         write_plan(diagnosis.next_measurement.plan, folder / NEXT_PLAN)
     for name, png in drawn.items():
-        (folder / name).write_bytes(png)
+        write_bytes_atomically(folder / name, png)
 
 
 VERB = Verb("diagnose", "Find which physics the sensor model leaves out of recordings.", add_arguments, run)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, a_path, add_common, say
 from probewise.cli._output import check_out_file
+from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -99,10 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
             f"seed {arguments.seed}, scene {arguments.scene}; type another, or `turn DEGREES`; end with Ctrl-C",
             quiet=arguments.quiet,
         )
-        try:
+        with saying_what_is_kept(lambda: "the device is gone"):
             serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench.table).listen)
-        except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt("the device is gone") from stop
     say(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
     return 0
 

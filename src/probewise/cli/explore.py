@@ -8,14 +8,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import add_geometry, geometry_of, open_nxt, parse_arm, telling_what_is_kept
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, positive_int, say
+from probewise.cli._arm import add_geometry, geometry_of, open_nxt, parse_arm
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
 from probewise.cli._output import check_out_directory, staged
+from probewise.cli._stopping import require_going_on, saying_what_is_kept
 from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Instrument, Reading
-    from probewise.experiment import Model, Step
+    from probewise.arm import Geometry, Instrument
+    from probewise.experiment import Journal, Model, Step
     from probewise.scene import Field
 
 __all__ = ["VERB"]
@@ -101,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import experiment as posing
     from probewise.calibration import read_sensor
     from probewise.cli._geometry import parse_truth
-    from probewise.experiment import Exploration, beside, explore
+    from probewise.experiment import Exploration, beside, explore, read_journal
     from probewise.inquiry import utility_named
     from probewise.recordings import write_bytes_atomically, write_text_atomically
     from probewise.report import exploration as report
@@ -131,7 +132,8 @@ def run(arguments: argparse.Namespace) -> int:
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
     other = pose_it(model=other_model) if arguments.both_models else None
     journal = out / "journal.jsonl"
-    taken = _taken_before(journal, resume=arguments.resume)
+    before = _before(journal, resume=arguments.resume)
+    taken = () if before is None else before.readings
     arm: Instrument
     truth_mm, known = None, None
     if port is not None and geometry is not None:
@@ -155,14 +157,16 @@ def run(arguments: argparse.Namespace) -> int:
     frames, readings = [], []
 
     def kept() -> str:
-        return f"{journal} keeps {len(steps)} readings; go on with --resume" if journal.exists() else "nothing was read"
+        if not journal.exists():
+            return "nothing was read"
+        return keeps(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
     with (
-        telling_what_is_kept(kept),
+        saying_what_is_kept(kept),
         arm,
         tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
     ):
-        own = explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=journal)
+        own = explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=before or journal)
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if other is not None:
             pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=other_rng)
@@ -177,6 +181,9 @@ def run(arguments: argparse.Namespace) -> int:
                 views = {arguments.model: (step, experiment), other_model: (shadow, other)}
                 titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
                 frames.append(report.frame_of_both(titled, readings, levels=levels, truth_mm=truth_mm))
+            require_going_on()  # a signal may have spoilt the picture
+            if step.number == 1 and not step.replayed:
+                _remove_pictures(out)
             folder.mkdir(exist_ok=True)
             write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
             if arguments.live:
@@ -186,7 +193,7 @@ def run(arguments: argparse.Namespace) -> int:
             bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
             bar.update()
     result = Exploration(experiment, tuple(steps))
-    with staged(out) as stage:
+    with saying_what_is_kept(kept), staged(out) as stage:
         page = report.write_page(
             result,
             frames,
@@ -195,8 +202,8 @@ def run(arguments: argparse.Namespace) -> int:
             truth=known,
             beside={other_model: others} if others else None,
         )
-        (stage / "report.html").write_text(page, encoding="utf-8")
-        (stage / "run.gif").write_bytes(gif(frames))
+        write_text_atomically(stage / "report.html", page)
+        write_bytes_atomically(stage / "run.gif", gif(frames))
     say(result.summary(), quiet=arguments.quiet)
     if known is not None:
         say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
@@ -253,16 +260,23 @@ def _field(text: str | None, geometry: Geometry | None) -> Field:
     return own
 
 
-def _taken_before(journal: Path, *, resume: bool) -> tuple[Reading, ...]:
+def _before(journal: Path, *, resume: bool) -> Journal | None:
     from probewise.experiment import read_journal
 
     if resume and not journal.exists():
         raise FileError(journal, "no such file", "a journal to resume; without --resume a new run begins")
     if not journal.exists():
-        return ()
+        return None
     if not resume:
         raise FileError(journal, "a run's journal stands there", "--resume to go on with it, or another --out")
-    return read_journal(journal).readings
+    return read_journal(journal)
+
+
+def _remove_pictures(out: Path) -> None:
+    """Remove what an earlier run has left in `out`, whose journal is gone, lest the pictures of two runs mix."""
+    for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png"):
+        for path in out.glob(pattern):
+            path.unlink()
 
 
 def _truth_by_name(shape: str, truth: dict[str, float], names: tuple[str, ...]) -> dict[str, float]:

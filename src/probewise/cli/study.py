@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probewise.cli._common import Verb, add_out_directory, add_quiet, positive_int, say
-from probewise.cli._executor import add_executor, executor_of
+from probewise.cli._executor import add_executor, campaign_keeps, executor_of
 from probewise.cli._output import check_out_directory, staged
+from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the study and write its table."""
     from tqdm import tqdm
 
+    from probewise.recordings import write_text_atomically
     from probewise.report import study as report
     from probewise.study import run_study
 
@@ -58,28 +61,24 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--circles", arguments.circles, "2 or more, so that there is an error to tell")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "trials.jsonl"
-    ended = 0
+    kept = partial(campaign_keeps, trials, "run", arguments)
     with (
+        saying_what_is_kept(kept),
         executor_of(arguments) as executor,
         tqdm(total=sum(numbers.values()), desc="runs", unit="", disable=True if arguments.quiet else None) as bar,
     ):
 
         def advance(key: str, result: Any) -> None:
-            nonlocal ended
-            ended += 1
             bar.set_postfix_str(key)
             bar.update()
 
-        try:
-            study = run_study(
-                numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=advance
-            )
-        except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(f"{trials} keeps {ended} more runs; the same command goes on") from stop
-    with staged(out) as stage:
-        (stage / "table.csv").write_text(report.table_csv(study), encoding="utf-8")
+        study = run_study(
+            numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=advance
+        )
+    with saying_what_is_kept(kept), staged(out) as stage:
+        write_text_atomically(stage / "table.csv", report.table_csv(study))
         page = report.write_page(study, command=_command(arguments))
-        (stage / "report.html").write_text(page, encoding="utf-8")
+        write_text_atomically(stage / "report.html", page)
     say(report.answer(study), quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0

@@ -13,12 +13,14 @@ back as a reading alone, and one that is torn earlier is dropped with a note.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -29,6 +31,7 @@ from probewise._arrays import FloatArray
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError
 from probewise.recordings.atomic import write_text_atomically
+from probewise.recordings.locking import locked
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.strict_json import strict_json
@@ -72,7 +75,8 @@ class Entry:
 class Journal:
     """Hold what a journal file says: its settings, its measurements, notes on what was dropped.
 
-    `n_bytes` is the length of the file up to the last whole line; what follows it is rewritten on resuming.
+    `n_bytes` is the length of the file up to the last whole line, `n_torn` of what follows, which is rewritten on
+    resuming.
     """
 
     path: str
@@ -80,6 +84,7 @@ class Journal:
     entries: tuple[Entry, ...]
     notes: tuple[str, ...]
     n_bytes: int
+    n_torn: int = 0
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -172,7 +177,7 @@ def read_journal(path: str | Path) -> Journal:
         else:
             entries.append(saved)
             notes.append(f"the last line of {path} was torn after its reading; the reading is kept")
-    return Journal(str(path), settings, tuple(entries), tuple(notes), len(raw) - len(tail))
+    return Journal(str(path), settings, tuple(entries), tuple(notes), len(raw) - len(tail), len(tail))
 
 
 def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
@@ -270,10 +275,14 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(eq=False)
 class JournalWriter:
-    """Append to a journal; every call returns when the line is on the disk. Use as a context manager."""
+    """Append to a journal; every call returns when the line is on the disk. Use as a context manager.
+
+    As long as it is open no other process can write to the journal.
+    """
 
     path: Path
-    _file: Any = field(repr=False)
+    _file: FileIO = field(repr=False)
+    _open: contextlib.ExitStack = field(repr=False)
 
     @classmethod
     def begin(cls, path: str | Path, settings: Mapping[str, Any]) -> JournalWriter:
@@ -282,24 +291,42 @@ class JournalWriter:
         Raises
         ------
         FileError
-            If the file exists already, or cannot be written.
+            If the file exists already, cannot be written, or another process writes to it.
         """
-        if Path(path).exists():
-            raise FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
-        return cls(Path(path), open(path, "ab"))
+        path = Path(path)
+        if path.exists():
+            raise _exists(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(locked(path))
+            if path.exists():
+                raise _exists(path)
+            write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
+            file = stack.enter_context(open(path, "ab", buffering=0))
+            return cls(path, file, stack.pop_all())
 
     @classmethod
     def resume(cls, journal: Journal) -> JournalWriter:
-        """Go on behind the last whole line of a journal; a torn line is cut off."""
-        try:
-            file = open(journal.path, "r+b")  # noqa: SIM115  (the writer closes it)
-        except OSError as error:
-            raise FileError(journal.path, f"cannot be written ({error.strerror})", "a file you may write to") from error
-        file.truncate(journal.n_bytes)
-        file.seek(0, os.SEEK_END)
-        return cls(Path(journal.path), file)
+        """Go on behind the last whole line of a journal; a torn line is cut off.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written, another process writes to it, or one has since it was read.
+        """
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(locked(journal.path))
+            try:
+                file = stack.enter_context(open(journal.path, "r+b", buffering=0))
+            except OSError as error:
+                raise FileError(
+                    journal.path, f"cannot be written ({error.strerror})", "a file you may write to"
+                ) from error
+            if file.seek(0, os.SEEK_END) != journal.n_bytes + journal.n_torn:
+                raise FileError(journal.path, "another process has written to it", "to resume it once more")
+            file.truncate(journal.n_bytes)
+            file.seek(0, os.SEEK_END)
+            return cls(Path(journal.path), file, stack.pop_all())
 
     def reading(self, index: int, reading: Reading) -> None:
         """Write a reading, the first part of its line."""
@@ -323,8 +350,8 @@ class JournalWriter:
         self._write(BELIEF + json.dumps(line, allow_nan=False) + "}\n")
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file and let other processes write to it."""
+        self._open.close()
 
     def __enter__(self) -> Self:
         return self
@@ -335,6 +362,14 @@ class JournalWriter:
         self.close()
 
     def _write(self, text: str) -> None:
-        self._file.write(text.encode())
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        left = memoryview(text.encode())
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise FileError(self.path, f"cannot be written ({error.strerror})", "a file on a disk with room") from error
+
+
+def _exists(path: Path) -> FileError:
+    return FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")

@@ -166,7 +166,7 @@ def explore(
     *,
     rng: np.random.Generator,
     max_readings: int = 100,
-    journal: str | Path | None = None,
+    journal: str | Path | Journal | None = None,
 ) -> Iterator[Step]:
     """Let the robot find the shape: yield one step a reading until its lengths are known (paper, section 2).
 
@@ -185,21 +185,26 @@ def explore(
     journal
         File that gets one JSON line a measurement. Where it exists already the run resumes: the
         readings it holds are taken from it, not from the instrument, and their steps are
-        yielded again with `replayed` set.
+        yielded again with `replayed` set. An instrument that cannot read its state from the world,
+        such as a simulated one, must stand where the last of them left it: read the journal, place
+        the instrument, and hand the journal over as it was read.
 
     Raises
     ------
     ReachError
         If the arm can reach no place of the grid.
     FileError
-        If the journal is damaged, or belongs to a run with other settings.
+        If the journal is damaged, belongs to a run with other settings, or is written to by another process.
     NotConvergedError
         If no hypothesis could have given the readings.
     """
     if max_readings < 1:
         raise ParameterError("max_readings", max_readings, "1 or more")
     seed = _child(rng)
-    before = None if journal is None or not Path(journal).exists() else read_journal(journal)
+    path = None if journal is None else Path(journal.path if isinstance(journal, Journal) else journal)
+    before = journal if isinstance(journal, Journal) else None
+    if before is None and path is not None and path.exists():
+        before = read_journal(path)
     if before is not None:
         require_same_settings(before, experiment.settings(seed))
         seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(before.settings["spawn_key"]))
@@ -207,7 +212,7 @@ def explore(
             raise ParameterError(
                 "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
             )
-    return _steps(instrument, experiment, seed, max_readings, None if journal is None else Path(journal), before)
+    return _steps(instrument, experiment, seed, max_readings, path, before)
 
 
 def run(
@@ -216,7 +221,7 @@ def run(
     *,
     rng: np.random.Generator,
     max_readings: int = 100,
-    journal: str | Path | None = None,
+    journal: str | Path | Journal | None = None,
     progress: Callable[[Step], None] | None = None,
 ) -> Exploration:
     """Run `explore` to its end and collect the steps; `progress` is called with each as it comes."""

@@ -193,7 +193,7 @@ def arm_over(
         Of the noise. Each reading has a generator of its own, so that a run that was stopped goes on
         with the noise it would have had.
     taken
-        Readings taken before.
+        Readings that the run took before it was stopped: the arm stands, and its clock, where the last one left them.
     workspace
         Where the arm can go and how its sensor then stands; by default nearly everywhere, and never turned.
     """
@@ -205,4 +205,4 @@ def arm_over(
         return world.read(surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
     reach = Reach((field.width_mm, field.height_mm)) if workspace is None else workspace
-    return SimulatedArm(light, reach=reach, height_mm=world.height_mm, start_s=taken[-1].time_s if taken else 0.0)
+    return SimulatedArm(light, reach=reach, height_mm=world.height_mm, last=taken[-1] if taken else None)

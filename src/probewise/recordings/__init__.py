@@ -9,6 +9,7 @@ from probewise.recordings.files import (
     write_recording,
 )
 from probewise.recordings.fingerprint import fingerprint
+from probewise.recordings.locking import locked
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,
@@ -41,6 +42,7 @@ __all__ = [
     "Stripes",
     "Uniform",
     "fingerprint",
+    "locked",
     "paper_plan",
     "read_plan",
     "read_plan_and_readings",

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import tempfile
 from pathlib import Path
 
+from probewise._signals import deferred
 from probewise.errors import FileError
+from probewise.recordings.locking import remove_abandoned, try_lock
 
 __all__ = ["write_bytes_atomically", "write_text_atomically"]
+
+_SUFFIX = ".part"
 
 
 def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None:
     """Replace the file at `path` by `content` in one step, so that no reader ever sees half of it.
 
     The bytes go to a temporary file in the same folder (a rename across file systems is not
-    atomic), reach the disk, and then take the name.
+    atomic), reach the disk, and then take the name. Temporary files that killed processes
+    left there under this name are removed.
 
     Raises
     ------
@@ -24,27 +30,34 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
         If the folder does not exist or cannot be written to.
     """
     path = Path(path)
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    except OSError as error:
-        raise FileError(
-            path, f"cannot be written ({error.strerror})", "a file in an existing, writable folder"
-        ) from error
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        # mkstemp makes the file private; a result is for everybody the folder's mask allows.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FileError(path, f"cannot be written ({error.strerror})", "a file on a disk with room") from error
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
+    prefix = f".{path.name}."
+    for left in path.parent.glob(f"{glob.escape(prefix)}*{_SUFFIX}"):
+        remove_abandoned(left)
+    with deferred():
+        try:
+            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=_SUFFIX)
+        except OSError as error:
+            raise FileError(
+                path, f"cannot be written ({error.strerror})", "a file in an existing, writable folder"
+            ) from error
+        try:
+            with os.fdopen(handle, "wb", buffering=0) as file:
+                with contextlib.suppress(OSError):  # where there are no locks, others may take it for abandoned
+                    try_lock(handle)
+                left_over = memoryview(content)
+                while left_over:
+                    left_over = left_over[file.write(left_over) :]
+                os.fsync(handle)
+            # mkstemp makes the file private; a result is for everybody the folder's mask allows.
+            mask = os.umask(0)
+            os.umask(mask)
+            os.chmod(temporary, 0o666 & ~mask)
+            os.replace(temporary, path)
+        except OSError as error:
+            raise FileError(path, f"cannot be written ({error.strerror})", "a file on a disk with room") from error
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
 
 
 def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:

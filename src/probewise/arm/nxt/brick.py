@@ -7,6 +7,7 @@ import warnings
 from types import TracebackType
 from typing import Self
 
+from probewise._signals import deferred
 from probewise.arm.basics import Clock
 from probewise.arm.nxt.light import Light
 from probewise.arm.nxt.link import Link
@@ -73,20 +74,21 @@ class Brick:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop and release the motors and switch the LEDs off, after an exception and Ctrl-C too; close the line.
+        """Stop and release the motors, switch the LEDs off, close the line; a signal waits until that is done.
 
         Raises
         ------
         LinkError
             If that could not be made sure of, and nothing else went wrong before.
         """
-        try:
-            self._come_to_rest()
-        except LinkError:
-            if error is None:
-                raise
-        finally:
-            self.link.close()
+        with deferred():
+            try:
+                self._come_to_rest()
+            except LinkError:
+                if error is None:
+                    raise
+            finally:
+                self.link.close()
 
     def motor(self, port: int, *, guard: Guard | None = None, drive: Drive | None = None) -> Motor:
         """Make the motor at port 0 to 2; see `Motor`."""

@@ -1,0 +1,135 @@
+"""Keep other processes away from a file while it is written to; the system lets go when a process dies."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from probewise.errors import FileError
+
+__all__ = ["locked", "remove_abandoned", "try_lock"]
+
+_BUSY = {errno.EACCES, errno.EAGAIN, errno.EDEADLK, errno.EWOULDBLOCK}
+_BEHIND = 1 << 20  # Windows locks bytes against reading too: one far behind the process id
+_RETRY_S = 0.05
+
+
+@contextlib.contextmanager
+def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator[None]:
+    """Hold a file or folder against every other process that asks for the same, by a lock on .NAME.lock beside it.
+
+    The lock belongs to the open file, so that it ends with the process, whatever ends that. What a killed
+    process leaves behind is an unlocked file, which the next one takes over and removes.
+
+    Parameters
+    ----------
+    path
+        What is held; it need not exist, its folder must.
+    patience_s
+        Wait so long for another process.
+
+    Raises
+    ------
+    FileError
+        If another process, named where it is known, holds it; or if the file system has no locks.
+    """
+    path = Path(path)
+    lock = path.with_name(f".{path.name}.lock")
+    deadline_s = time.monotonic() + patience_s
+    while (handle := _acquired(lock, path)) is None:
+        if time.monotonic() >= deadline_s:
+            raise FileError(path, f"{_holder(lock)} is writing to it", "one process at a time")
+        time.sleep(_RETRY_S)
+    try:
+        with contextlib.suppress(OSError):  # whose number is only for messages
+            os.ftruncate(handle, 0)
+            os.write(handle, b"%d" % os.getpid())
+        yield
+    finally:
+        _let_go(handle, lock)
+
+
+def _acquired(lock: Path, path: Path) -> int | None:
+    """Open and lock; None where another process has it."""
+    while True:
+        try:
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise FileError(
+                path, f"cannot be written ({error.strerror})", "a file in an existing, writable folder"
+            ) from error
+        try:
+            if not try_lock(handle):
+                os.close(handle)
+                return None
+            # Whoever held it before may have removed the file after it was opened here.
+            if os.path.samestat(os.fstat(handle), os.stat(lock)):
+                return handle
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            os.close(handle)
+            raise FileError(path, f"cannot be locked ({error.strerror})", "a file system that has locks") from error
+        os.close(handle)
+
+
+def try_lock(handle: int) -> bool:
+    """Lock an open file until it is closed; tell whether no other process has it locked."""
+    try:
+        _lock(handle)
+    except OSError as error:
+        if error.errno in _BUSY:
+            return False
+        raise
+    return True
+
+
+def remove_abandoned(path: Path) -> None:
+    """Remove a file that a process locks as long as it lives, unless it does."""
+    with contextlib.suppress(OSError):
+        if sys.platform == "win32":
+            path.unlink()  # refused while another process has it open
+            return
+        handle = os.open(path, os.O_RDWR)
+        try:
+            if try_lock(handle):
+                path.unlink()
+        finally:
+            os.close(handle)
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(handle: int) -> None:
+        os.lseek(handle, _BEHIND, os.SEEK_SET)
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        os.lseek(handle, 0, os.SEEK_SET)
+
+    def _let_go(handle: int, lock: Path) -> None:
+        os.close(handle)  # an open file cannot be removed here; one that somebody else has opened stays
+        with contextlib.suppress(OSError):
+            os.unlink(lock)
+
+else:
+    import fcntl
+
+    def _lock(handle: int) -> None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def _let_go(handle: int, lock: Path) -> None:
+        with contextlib.suppress(OSError):
+            os.unlink(lock)
+        os.close(handle)
+
+
+def _holder(lock: Path) -> str:
+    try:
+        return f"process {int(lock.read_text(encoding='ascii'))}"
+    except (OSError, ValueError):
+        return "another process"

@@ -10,16 +10,15 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from probewise.errors import FileError, NotConvergedError, ParameterError
-from probewise.recordings import write_text_atomically
+from probewise.recordings import locked, write_text_atomically
 
 __all__ = ["FORMAT", "Finished", "read_campaign", "run_campaign"]
 
@@ -74,18 +73,19 @@ def run_campaign(
         If the executor's workers die; all that ended before is kept.
     """
     path = Path(path)
-    before = read_campaign(path) if path.exists() else None
     wanted = json.loads(json.dumps(dict(settings)))
-    if before is not None and before.settings != wanted:
-        raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
-    done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
-    left = {key: task for key, task in tasks.items() if key not in done}
-    with _Lines(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
-        for key, result in ended:
-            line = json.loads(lines.add(key, result))  # as a later reader will see it
-            done[key] = line["result"]
-            if progress is not None:
-                progress(key, done[key])
+    with locked(path):
+        before = read_campaign(path) if path.exists() else None
+        if before is not None and before.settings != wanted:
+            raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
+        done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
+        left = {key: task for key, task in tasks.items() if key not in done}
+        with _Lines(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
+            for key, result in ended:
+                line = json.loads(lines.add(key, result))  # as a later reader will see it
+                done[key] = line["result"]
+                if progress is not None:
+                    progress(key, done[key])
     return {key: done[key] for key in tasks}
 
 
@@ -128,7 +128,7 @@ def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str,
 
 
 class _Lines:
-    """Append lines, each on disk before the next; a torn end is cut off first, and no other process may write."""
+    """Append lines, each on disk before the next; a torn end is cut off first."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:
         if fresh:
@@ -136,8 +136,7 @@ class _Lines:
         self._path = path
 
     def __enter__(self) -> Self:
-        self._file: BinaryIO = self._path.open("r+b")
-        _lock(self._file, self._path)
+        self._file = self._path.open("r+b", buffering=0)
         content = self._file.read()
         self._file.truncate(self._file.seek(content.rfind(b"\n") + 1))
         return self
@@ -155,23 +154,16 @@ class _Lines:
             raise ParameterError(
                 f"the result of {key}", result, f"a JSON object of finite numbers ({error})"
             ) from error
-        self._file.write(line.encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        left = memoryview(line.encode() + b"\n")
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise FileError(
+                self._path, f"cannot be written ({error.strerror})", "a file on a disk with room"
+            ) from error
         return line
-
-
-def _lock(file: BinaryIO, path: Path) -> None:
-    """Keep other processes from writing to a file as long as it is open; Windows has no such lock."""
-    if sys.platform == "win32":
-        return
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        file.close()
-        raise FileError(path, "another process is writing to it", "one campaign a file at a time") from error
 
 
 @contextlib.contextmanager

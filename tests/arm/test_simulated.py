@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import Instrument, LegoScale, Pose, Reach, SimulatedArm, Speed
+from probewise.arm import Instrument, LegoScale, Pose, Reach, Reading, SimulatedArm, Speed
 from probewise.errors import ParameterError, ReachError, ShapeError
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 131), np.linspace(0, 520, 65)), axis=-1).reshape(-1, 2)
@@ -72,13 +72,15 @@ def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(p
 
 
 def test_the_clock_is_advanced_by_travel_and_reading():
-    arm = SimulatedArm(flat(50.0), speed=Speed(move_mm_s=50.0, read_s=2.0), start_s=100.0)
+    arm = SimulatedArm(
+        flat(50.0), speed=Speed(move_mm_s=50.0, read_s=2.0), last=Reading(50.0, Pose(500.0, 250.0), 100.0)
+    )
     first = arm.measure(HERE)
     second = arm.measure(Pose(530.0, 240.0))
     third = arm.measure(Pose(530.0, 240.0))
     assert second.time_s - first.time_s == pytest.approx(50 / 50 + 2)
     assert third.time_s - second.time_s == pytest.approx(2.0)
-    assert first.time_s > 102
+    assert first.time_s == pytest.approx(100 + 50 / 50 + 2)
     assert arm.time_s == third.time_s
 
 

@@ -38,7 +38,7 @@ def at_port(paper_brick, clock, monkeypatch):
 def test_check_asks_a_brick_who_it_is_and_moves_nothing(at_port, capsys):
     out = said(capsys, "arm", "check", "--arm", "nxt:x").out
     assert "brick        ARM1, firmware 1.31, battery 7.41 V" in out
-    assert "light        56.89 % at port 1, 500 counts" in out
+    assert "light        56 LEGO units (1 dark to 100 bright) at port 1, 500 raw counts" in out
     assert not at_port.drives()
     assert not at_port.is_open
 

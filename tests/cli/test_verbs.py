@@ -1,6 +1,7 @@
 """Each verb writes what it promises, and nothing when it is stopped."""
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -85,7 +86,8 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
     assert run("explore", "--sensor", sensor_file, "--out", out, "--quiet") == 130
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "journal.jsonl keeps 1 readings" in said
+    again = shlex.join(["probewise", "explore", "--sensor", str(sensor_file), "--out", str(out), "--quiet", "--resume"])
+    assert said.endswith(f"journal.jsonl keeps 1 reading; go on with: {again}\n")
     assert len((out / "journal.jsonl").read_text().splitlines()) == 2
     assert not (out / "report.html").exists()
 

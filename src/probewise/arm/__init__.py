@@ -4,7 +4,7 @@ from probewise.arm.carry_out import carry_out, recorded
 from probewise.arm.geometry import Geometry, Joint
 from probewise.arm.geometry_file import read_geometry, shipped_geometry
 from probewise.arm.instrument import Instrument, Pose, Reading
-from probewise.arm.lego import LegoArm
+from probewise.arm.lego import LegoArm, in_lego_units
 from probewise.arm.limits import SoftLimits
 from probewise.arm.machine import Machine, Rehearsal
 from probewise.arm.reach import FIELD_MM, Reach, Workspace
@@ -29,6 +29,7 @@ __all__ = [
     "Speed",
     "Workspace",
     "carry_out",
+    "in_lego_units",
     "read_geometry",
     "recorded",
     "shipped_geometry",

@@ -20,7 +20,7 @@ from probewise.arm.machine import Machine
 from probewise.arm.scale import LegoScale
 from probewise.errors import LinkError, ReachError
 
-__all__ = ["LegoArm"]
+__all__ = ["LegoArm", "in_lego_units"]
 
 BASE, SHOULDER, ELBOW = range(3)
 N_RISES = 3  # rough moves, of which the first one or two may stop short
@@ -38,6 +38,13 @@ class Goal:
 
     counts: int
     side: Side
+
+
+def in_lego_units(percent: float, geometry: Geometry) -> float:
+    """Convert what the light sensor reads, 0 to 100 in all its steps, to what recordings hold: LEGO units."""
+    if geometry.whole_percent and math.isfinite(percent):
+        percent = math.floor(percent)  # the brick cuts fractions off
+    return LegoScale(step=1.0 if geometry.whole_percent else None).convert(percent)
 
 
 class LegoArm:
@@ -63,7 +70,6 @@ class LegoArm:
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
         self._machine, self.geometry, self._clock = machine, geometry, clock
         self._zero_s = clock.monotonic() - start_s
-        self._scale = LegoScale(step=1.0 if geometry.whole_percent else None)
         self._is_down = False
         self._arrived: list[int] = [0, 0, 0]  # from which side each joint came to where it stands
         self.turned_rad = 0.0
@@ -142,16 +148,14 @@ class LegoArm:
             )
         self.go_down(pose.x_mm, pose.y_mm)
         battery_mv = self._machine.battery_mv()  # before the light: from then on nothing is asked that could lose it
-        value = self._machine.read_percent()
-        if self.geometry.whole_percent and math.isfinite(value):
-            value = math.floor(value)  # the brick cuts fractions off
+        value = self.read_here()
         time_s = self._clock.monotonic() - self._zero_s
         covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
         there = self._pose()
         # The reading is here. A line that dies now shows at the next move, which starts with raising.
         with contextlib.suppress(LinkError):
             self.rise()
-        return Reading(value=self._scale.convert(value), pose=there, time_s=time_s, covariates=covariates)
+        return Reading(value=value, pose=there, time_s=time_s, covariates=covariates)
 
     def go_over(self, x_mm: float, y_mm: float) -> None:
         """Bring the sensor over a place, at about the height of travel.
@@ -235,8 +239,8 @@ class LegoArm:
         self._machine.release()
 
     def read_here(self) -> float:
-        """Read the sensor where it stands: 0 to 100 in all steps that it has."""
-        return self._machine.read_percent()
+        """Read the sensor where it stands, in LEGO units: what recordings hold."""
+        return in_lego_units(self._machine.read_percent(), self.geometry)
 
     def battery_mv(self) -> float:
         """Read the battery's voltage."""

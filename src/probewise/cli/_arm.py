@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import a_path
+from probewise.cli._common import CommandError, a_path
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -97,6 +97,6 @@ def asker(arm: LegoArm) -> Callable[[str], None]:
             else:
                 break
         if not answer:
-            raise ParameterError("standard input", "its end", "a person who presses Enter")
+            raise CommandError("nobody is there to press Enter: standard input has ended; run it in a terminal")
 
     return ask

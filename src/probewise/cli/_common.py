@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import itertools
 import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, ProbewiseError
 
 __all__ = [
     "DEFAULT_SEED",
+    "CommandError",
     "OneLineParser",
     "Verb",
     "a_path",
@@ -41,11 +44,39 @@ class Verb:
     run: Callable[[argparse.Namespace], int]
 
 
+class CommandError(ProbewiseError, ValueError):
+    """Report a command line that lacks something, and how to give it."""
+
+
 class OneLineParser(argparse.ArgumentParser):
-    """Report a wrong command line in one line, as every other bad input is."""
+    """Report a wrong command line in one line, as every other bad input is, with what was perhaps meant."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        words = sys.argv[1:] if args is None else list(args)
+        if self._subparsers is None:  # else words may be options of a verb
+            for word in itertools.takewhile(lambda word: word != "--", words):
+                self._require_known(word.partition("=")[0])
+        return super().parse_known_args(words, namespace)
+
+    def _require_known(self, name: str) -> None:
+        options = self._option_string_actions
+        if name.startswith("--") and not any(option.startswith(name) for option in options):
+            self.error(f"no option {name}{_meant(name, options)}")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            choices = [str(choice) for choice in action.choices]
+            raise argparse.ArgumentError(action, f"{value!r} is none of {', '.join(choices)}{_meant(value, choices)}")
+
+
+def _meant(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:

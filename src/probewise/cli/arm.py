@@ -16,7 +16,7 @@ from probewise.cli._arm import (
     parse_arm,
     parse_place,
 )
-from probewise.cli._common import OneLineParser, Verb, a_path, add_quiet, keeps, positive_int, say
+from probewise.cli._common import CommandError, OneLineParser, Verb, a_path, add_quiet, keeps, positive_int, say
 from probewise.cli._output import check_out_file
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["TASKS", "VERB"]
 
 PAPER = "paper"
+UNITS = "LEGO units (1 dark to 100 bright)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--here", action="store_true", help="let a person bring the arm home by hand, and set the counters to 0 there"
     )
 
-    _task(tasks, "read", "Read the sensor where it stands.", moves=True)
+    _task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
 
-    scan = _task(tasks, "scan", "Read along a line; the readings go to standard output as CSV.", moves=True)
+    scan = _task(tasks, "scan", "Read along a line; readings in LEGO units go to standard output as CSV.", moves=True)
     scan.add_argument("start", metavar="X,Y", help="from here, mm")
     scan.add_argument("end", metavar="X,Y", help="to here, mm")
     scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="how many (default 21)")
@@ -128,12 +129,15 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 def _check_brick(port: str, geometry: Geometry) -> None:
     """Ask the brick who it is and whether it is fit to work; nothing moves."""
+    from probewise.arm import in_lego_units
+
     with open_brick(port) as brick:
         version = brick.version()
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
         say(f"brick        {brick.name()}, firmware {firmware}, battery {brick.battery_mv() / 1000:.2f} V")
         light = brick.light(geometry.sensor_port).read()
-        say(f"light        {light.fine_percent:.2f} % at port {geometry.sensor_port + 1}, {light.raw_counts} counts")
+        value = in_lego_units(light.fine_percent, geometry)
+        say(f"light        {value:g} {UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts")
         program = brick.program()
         if program is not None:
             raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
@@ -182,7 +186,9 @@ def _home(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with _arm(arguments, geometry) as arm:
-        say(f"{arm.read_here():.2f} %, battery {arm.battery_mv():.0f} mV")
+        value, battery_mv = arm.read_here(), arm.battery_mv()
+        if not arguments.dry_run:
+            say(f"{value:g} {UNITS}, battery {battery_mv:.0f} mV")
 
 
 def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
@@ -285,7 +291,9 @@ def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 
     if arguments.dry_run:
         return LegoArm(Rehearsal(geometry, say), geometry, start_s=start_s)
     if arguments.arm is None:
-        raise ParameterError("--arm", None, "nxt:PORT such as nxt:/dev/rfcomm0; or --dry-run, to print the moves only")
+        raise CommandError(
+            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
+        )
     return open_nxt(_port(arguments.arm), geometry, start_s=start_s)
 
 

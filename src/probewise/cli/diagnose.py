@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, say
 from probewise.cli._journal import is_journal, journal_recording
 from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
             recordings.append(read_recording(path))
             continue
         if sensor is None:
-            raise ParameterError(
-                "--sensor", None, f"the sensor.json that the run of {path} was made with, or a newer one"
+            raise CommandError(
+                f"--sensor is missing: {path} needs the sensor.json that its run was made with, or a newer one"
             )
         recording, shape = journal_recording(path, sensor)
         recordings.append(recording)

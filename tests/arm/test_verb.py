@@ -118,7 +118,7 @@ def test_what_cannot_be_done_is_refused_in_one_line(arguments, says, tmp_path, m
 
 
 def test_without_an_arm_there_is_nothing_to_move(capsys):
-    assert "--arm is None; allowed: nxt:PORT" in said(capsys, "arm", "read", status=2).err
+    assert "--arm is missing: name the brick" in said(capsys, "arm", "read", status=2).err
     assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "simulated", status=2).err
     assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "ev3:/dev/x", status=2).err
 

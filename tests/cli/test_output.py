@@ -1,5 +1,10 @@
 """Results are written whole or not at all, and nothing that was read is lost for them."""
 
+import itertools
+import os
+import signal
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,7 +12,7 @@ from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
 from probewise.cli._output import staged
 from probewise.errors import FileError
-from probewise.recordings import read_recording, write_recording
+from probewise.recordings import read_recording, write_recording, write_text_atomically
 
 
 def test_what_an_earlier_run_left_behind_goes_and_what_is_not_ours_stays(tmp_path):
@@ -90,3 +95,121 @@ def test_readings_filled_in_where_the_plan_stood_are_not_lost(recording_file, tm
     assert main(["diagnose", str(recording_file), "--sensor", str(out / "sensor.json"), "--out", str(out)]) == 0
     assert (out / "sensor_kept.json").read_bytes() == before
     assert "sensor_kept.json" in capsys.readouterr().out
+
+
+NEW = {"a.txt": "new", "plan.csv": "new", "plan.json": "new", "sub/c.txt": "new"}
+OLD = {"a.txt": "old", "plan.csv": "read", "plan.json": "read", "witness_1.svg": "old"}
+DONE = {**NEW, "plan_kept.csv": "read", "plan_kept.json": "read"}
+
+
+def contents(folder):
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+def write_new(out):
+    with staged(out, inputs=(out / "plan.csv", out / "plan.json"), outdated=("witness_*.svg",)) as stage:
+        (stage / "sub").mkdir()
+        for name, text in NEW.items():
+            write_text_atomically(stage / name, text)
+
+
+def write_abc(out):
+    with staged(out) as stage:
+        for name in "abc":
+            (stage / name).write_text("new")
+
+
+def write_much(out):
+    with staged(out) as stage:
+        write_text_atomically(stage / "small", "x")
+        write_text_atomically(stage / "run.gif", "x" * 20_000)
+
+
+def killed_at(n, write, out):
+    """Run in a process that is killed before it moves, removes or makes its n-th file; tell whether it was."""
+    pid = os.fork()
+    if pid == 0:
+        calls = itertools.count()
+
+        def dying(do):
+            return lambda *a, **k: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == n else do(*a, **k)
+
+        for name in ("replace", "unlink", "mkdir", "rmdir"):
+            setattr(os, name, dying(getattr(os, name)))
+        write(out)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) != 0
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
+def test_wherever_a_command_is_killed_the_next_one_finds_all_of_its_files_or_none(tmp_path):
+    """Killed before each step on the disk; then a command that fails begins, which settles what it finds."""
+    settled = []
+    for n in itertools.count():
+        out = tmp_path / str(n)
+        out.mkdir()
+        for name, text in OLD.items():
+            (out / name).write_text(text)
+        if not killed_at(n, write_new, out):
+            break
+        with pytest.raises(ZeroDivisionError), staged(out):
+            raise ZeroDivisionError
+        assert contents(out) in (OLD, DONE), n
+        settled.append(contents(out) == DONE)
+    assert contents(out) == DONE
+    assert settled == sorted(settled)  # none before the list is complete, all from then on
+    assert 5 <= sum(settled) < len(settled)
+
+
+def test_a_file_that_cannot_be_replaced_is_put_in_place_by_the_next_command(tmp_path, monkeypatch):
+    real = os.replace
+
+    def held(source, target):
+        if Path(target) == tmp_path / "b":
+            raise PermissionError(13, "Permission denied", str(source), None, str(target))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", held)
+    with pytest.raises(FileError, match=r"b: cannot be replaced \(Permission denied\).*next command"):
+        write_abc(tmp_path)
+    assert (tmp_path / "a").exists()
+    monkeypatch.undo()
+    with staged(tmp_path):
+        pass
+    assert contents(tmp_path) == dict.fromkeys("abc", "new")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows cannot bound the size of a file")
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(FileError, match=rf"^{tmp_path}/out/run.gif: cannot be written \(File too large\)"):
+            write_much(tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not contents(tmp_path)
+
+
+def test_a_signal_while_files_are_put_in_place_is_heard_when_all_are(tmp_path, monkeypatch):
+    real = os.replace
+
+    def signalled(source, target):
+        real(source, target)
+        if Path(target) == tmp_path / "a":
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(os, "replace", signalled)
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_abc(tmp_path)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert contents(tmp_path) == dict.fromkeys("abc", "new")
+
+
+def stop(number, frame):
+    raise KeyboardInterrupt

@@ -76,8 +76,16 @@ def require_going_on() -> None:
 
 
 @contextlib.contextmanager
-def saying_what_is_kept(kept: Callable[[], str]) -> Iterator[None]:
-    """Add to the last words of a run that a signal or a dead line ends what of it is on the disk."""
+def saying_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
+    """Add to the last words of a run that a signal or a dead line ends what of it is on the disk.
+
+    Parameters
+    ----------
+    kept
+        Says it.
+    results
+        The run is over and writes its results: add it to what is wrong with a file too.
+    """
     try:
         yield
     except BaseException as error:
@@ -85,6 +93,8 @@ def saying_what_is_kept(kept: Callable[[], str]) -> Iterator[None]:
             raise Stopped(asked.number, _told(kept)) from error
         if isinstance(error, LinkError):
             raise LinkError(f"{error}; {_told(kept)}") from error
+        if results and isinstance(error, FileError):
+            raise FileError(error.path, error.found, f"{error.allowed}; {_told(kept)}") from error
         raise
 
 

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         results = run_challenge(arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=advance)
     rows = score(results)
     command = shlex.join(["probewise", "challenge", "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
-    with saying_what_is_kept(kept), staged(out) as stage:
+    with saying_what_is_kept(kept, results=True), staged(out) as stage:
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
         write_text_atomically(stage / "report.html", report.write_page(results, command=command))
     say(report.answer(rows, len(results)), quiet=arguments.quiet)

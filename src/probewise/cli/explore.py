@@ -94,6 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, infer, inquire; keep a journal and a picture of every step."""
     import webbrowser
+    from contextlib import closing
     from functools import partial
 
     import numpy as np
@@ -164,9 +165,11 @@ def run(arguments: argparse.Namespace) -> int:
     with (
         saying_what_is_kept(kept),
         arm,
+        closing(
+            explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=before or journal)
+        ) as own,
         tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
     ):
-        own = explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=before or journal)
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if other is not None:
             pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=other_rng)
@@ -193,7 +196,7 @@ def run(arguments: argparse.Namespace) -> int:
             bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
             bar.update()
     result = Exploration(experiment, tuple(steps))
-    with saying_what_is_kept(kept), staged(out) as stage:
+    with saying_what_is_kept(kept, results=True), staged(out) as stage:
         page = report.write_page(
             result,
             frames,

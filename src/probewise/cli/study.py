@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         study = run_study(
             numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=advance
         )
-    with saying_what_is_kept(kept), staged(out) as stage:
+    with saying_what_is_kept(kept, results=True), staged(out) as stage:
         write_text_atomically(stage / "table.csv", report.table_csv(study))
         page = report.write_page(study, command=_command(arguments))
         write_text_atomically(stage / "report.html", page)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import numpy as np
@@ -167,8 +167,10 @@ def explore(
     rng: np.random.Generator,
     max_readings: int = 100,
     journal: str | Path | Journal | None = None,
-) -> Iterator[Step]:
+) -> Generator[Step, None, None]:
     """Let the robot find the shape: yield one step a reading until its lengths are known (paper, section 2).
+
+    A run that is left before its end holds its journal against others until it is closed.
 
     Parameters
     ----------
@@ -240,7 +242,7 @@ def _steps(
     max_readings: int,
     path: Path | None,
     before: Journal | None,
-) -> Iterator[Step]:
+) -> Generator[Step, None, None]:
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
     field = Field.under(instrument, experiment.grid)
     first = _rng_of(seed, 0)

@@ -1,0 +1,250 @@
+"""Whichever signal asks for it, a command stops at once, says what is kept, and leaves no motor on."""
+
+import contextlib
+import json
+import os
+import shlex
+import signal
+import time
+
+import numpy as np
+import pytest
+from arm_faults import GEOMETRY, bench_with, connected
+
+from probewise._signals import ENDING, SAME_S, deferred
+from probewise.arm import Pose
+from probewise.cli import _stopping, main
+from probewise.cli._stopping import Stopped, require_going_on, saying_what_is_kept, stoppable
+from probewise.emulator import Faults, VirtualClock
+from probewise.errors import LinkError
+from probewise.report import exploration
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard():
+    """A test runner in the background ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", ENDING, ids=lambda number: number.name)
+def test_a_signal_raises_and_gives_the_status_that_shells_expect(number):
+    before = [signal.getsignal(k) for k in ENDING]
+    with pytest.raises(Stopped) as stop, stoppable():
+        signal.raise_signal(number)
+    assert stop.value.status == 128 + number
+    assert [signal.getsignal(k) for k in ENDING] == before
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    """As under nohup."""
+    before = signal.signal(ENDING[-1], signal.SIG_IGN)
+    try:
+        with stoppable():
+            signal.raise_signal(ENDING[-1])
+    finally:
+        signal.signal(ENDING[-1], before)
+
+
+def test_signals_within_a_second_are_one_request_and_a_later_one_forces(monkeypatch):
+    now_s = [0.0]
+    monkeypatch.setattr(_stopping.time, "monotonic", lambda: now_s[0])
+    with stoppable():
+        with pytest.raises(Stopped):
+            signal.raise_signal(signal.SIGTERM)
+        now_s[0] += 0.9 * SAME_S
+        signal.raise_signal(signal.SIGINT)
+        now_s[0] += 0.2 * SAME_S
+        with pytest.raises(Stopped):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_a_signal_whose_exception_is_swallowed_is_raised_again():
+    with stoppable():
+        with pytest.raises(Stopped):
+            signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(Stopped):
+            require_going_on()
+
+
+@pytest.mark.parametrize("echo", [ValueError("Invalid affine transformation matrix"), OSError(5, "closed"), KeyError()])
+def test_whatever_a_signal_is_turned_into_is_the_stop(echo):
+    def turned():
+        with stoppable(), saying_what_is_kept(lambda: "ten are kept"):
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            except Stopped:
+                raise echo from None
+
+    with pytest.raises(Stopped, match="ten are kept") as stop:
+        turned()
+    assert stop.value.status == 128 + signal.SIGTERM
+
+
+def test_an_error_without_a_signal_stays_what_it_is():
+    with pytest.raises(ValueError, match="own"), stoppable(), saying_what_is_kept(lambda: "kept"):
+        raise ValueError("own")
+    with pytest.raises(LinkError, match="dead; kept"), stoppable(), saying_what_is_kept(lambda: "kept"):
+        raise LinkError("dead")
+
+
+def test_deferred_lines_are_finished_first():
+    done = []
+
+    def lines():
+        with stoppable():
+            with deferred(), deferred():
+                signal.raise_signal(signal.SIGTERM)
+                done.append("finished")
+            done.append("gone on")
+
+    with pytest.raises(Stopped):
+        lines()
+    assert done == ["finished"]
+
+
+def test_a_repeated_signal_cuts_deferred_lines_short(monkeypatch):
+    now_s = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    done = []
+
+    def lines():
+        with stoppable(), deferred():
+            signal.raise_signal(signal.SIGTERM)
+            now_s[0] += 2 * SAME_S
+            done.append("still here")
+            signal.raise_signal(signal.SIGTERM)
+            done.append("gone on")
+
+    with pytest.raises(Stopped):
+        lines()
+    assert done == ["still here"]
+
+
+class Struck(Exception):
+    """A signal's exception."""
+
+
+def strike(number, frame):
+    raise Struck
+
+
+def struck_session(n):
+    """Measure once, struck at the n-th telegram; return the emulated brick, and how many telegrams came."""
+    clock = VirtualClock()
+    bench = bench_with(Faults(), clock, seed=1)
+    send, sent = bench.radio.send, []
+
+    def struck(data):
+        send(data)
+        sent.append(data)
+        if len(sent) == n:
+            signal.raise_signal(signal.SIGTERM)
+
+    bench.radio.send = struck
+    x_mm, y_mm = GEOMETRY.field_mm[0] / 2, GEOMETRY.field_mm[1] / 2
+    standing = float(GEOMETRY.orientation_rad(np.array([[x_mm, y_mm]]))[0])
+    with contextlib.suppress(Struck), connected(bench, clock, []) as arm:
+        arm.measure(Pose(x_mm, y_mm, standing))
+    bench.radio.brick.advance()
+    return bench.radio.brick, len(sent)
+
+
+def test_wherever_a_signal_strikes_a_measurement_motors_and_led_are_off():
+    """At every ninth telegram of a session and the last ten, which end it; the emulator says how it is left."""
+    before = signal.signal(signal.SIGTERM, strike)
+    try:
+        _, total = struck_session(0)
+        for n in {*range(1, total, 9), *range(total - 10, total + 1)}:
+            brick, _ = struck_session(n)
+            assert all(output.is_at_rest for output in brick.outputs.ports), n
+            assert brick.answer(bytes((0, 7, GEOMETRY.sensor_port)))[6] == 0, n  # its type: none, without LED
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert total > 50
+
+
+def command(sensor_file, out, *more):
+    where = ("--sensor", sensor_file, "--truth", "500,250,90", "--out", out, "--seed", 3, "--quiet")
+    return [str(word) for word in ("explore", *where, "--max-readings", 1, *more)]
+
+
+def test_ctrl_c_while_the_report_is_written_says_how_to_go_on_and_that_goes_on(
+    sensor_file, tmp_path, quick_frames, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(exploration, "write_page", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+        assert main(command(sensor_file, out)) == 130
+    said = capsys.readouterr().err
+    again = command(sensor_file, out, "--resume")
+    assert said == (
+        f"probewise explore: stopped; {out / 'journal.jsonl'} keeps 1 reading; "
+        f"go on with: {shlex.join(['probewise', *again])}\n"
+    )
+    kept = (out / "journal.jsonl").read_bytes()
+    assert not (out / "report.html").exists()
+    assert main(again) == 0
+    assert (out / "journal.jsonl").read_bytes() == kept
+    assert (out / "report.html").exists()
+
+
+def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
+    sensor_file, tmp_path, quick_frames, monkeypatch, capsys
+):
+    drawn = exploration.frame
+
+    def swallowing(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            return drawn()
+
+    monkeypatch.setattr(exploration, "frame", swallowing)
+    out = tmp_path / "out"
+    assert main(command(sensor_file, out)) == 128 + signal.SIGTERM
+    assert "keeps 1 reading; go on with" in capsys.readouterr().err
+    assert [p.name for p in out.iterdir()] == ["journal.jsonl"]
+
+
+def test_what_the_journal_holds_is_counted_not_what_this_command_took(
+    sensor_file, tmp_path, quick_frames, monkeypatch, capsys
+):
+    """Stopped while it replays the first of two readings, it keeps both."""
+    out = tmp_path / "out"
+    assert main(command(sensor_file, out, "--max-readings", 2)) == 0
+    monkeypatch.setattr(exploration, "frame", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    assert main(command(sensor_file, out, "--max-readings", 2, "--resume")) == 130
+    assert "keeps 2 readings" in capsys.readouterr().err
+
+
+def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_next(sensor_file, tmp_path, quick_frames):
+    out = tmp_path / "out"
+    assert main(command(sensor_file, out, "--max-readings", 2)) == 0
+    (out / "journal.jsonl").unlink()
+    (out / "notes.txt").write_text("mine")
+    assert main(command(sensor_file, out)) == 0
+    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert names == {"journal.jsonl", "frames/001.png", "report.html", "run.gif", "notes.txt"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows cannot bound the size of a file")
+def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
+    import resource
+
+    from probewise.report import animation
+
+    monkeypatch.setattr(animation, "gif", lambda _: bytes(5_000_000))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
+    out = tmp_path / "out"
+    try:
+        assert main(command(sensor_file, out)) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = capsys.readouterr().err
+    assert f"{out / 'run.gif'}: cannot be written (File too large)" in said
+    assert "keeps 1 reading; go on with: " in said
+    assert not (out / "report.html").exists()
+    assert len([json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()]) == 2

@@ -1,0 +1,81 @@
+"""A lock keeps other processes away, names who holds it, and ends with the process."""
+
+import os
+import signal
+import subprocess
+import sys
+from multiprocessing import get_all_start_methods, get_context
+
+import pytest
+
+from probewise.errors import FileError
+from probewise.recordings import locked, write_bytes_atomically
+
+HOLD = """
+import sys, time
+from probewise.recordings.locking import locked
+with locked(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def count_to_25(path):
+    for _ in range(25):
+        with locked(path, patience_s=60):
+            path.write_text(str(int(path.read_text()) + 1))
+
+
+def test_who_holds_it_is_named_and_a_killed_holder_holds_it_no_more(tmp_path):
+    path = tmp_path / "journal.jsonl"
+    with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(FileError, match=rf"journal.jsonl: process {other.pid} is writing to it"), locked(path):
+            pass
+        other.send_signal(signal.SIGKILL if os.name != "nt" else signal.SIGTERM)
+        other.wait()
+    with locked(path, patience_s=10):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_is_not_taken_twice_within_one_process_either(tmp_path):
+    with locked(tmp_path / "a"), pytest.raises(FileError, match=f"process {os.getpid()}"), locked(tmp_path / "a"):
+        pass
+
+
+@pytest.mark.skipif("fork" not in get_all_start_methods(), reason="processes cannot be forked here")
+def test_processes_that_come_and_go_never_hold_it_together(tmp_path):
+    """Each adds 25 to a number that two at once would miscount, while the lock file is removed every time."""
+    path = tmp_path / "number"
+    path.write_text("0")
+    counting = [get_context("fork").Process(target=count_to_25, args=(path,)) for _ in range(3)]
+    for process in counting:
+        process.start()
+    for process in counting:
+        process.join(60)
+    assert [process.exitcode for process in counting] == [0, 0, 0]
+    assert path.read_text() == "75"
+    assert [p.name for p in tmp_path.iterdir()] == ["number"]
+
+
+def test_a_folder_that_is_missing_is_named(tmp_path):
+    with pytest.raises(FileError, match=r"nowhere.*cannot be written"), locked(tmp_path / "nowhere" / "a"):
+        pass
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next_and_what_a_living_one_holds_is_not(tmp_path):
+    (tmp_path / ".a.killed.part").write_text("half")
+    (tmp_path / ".b.other.part").write_text("of another name")
+    if os.name != "nt":
+        import fcntl
+
+        living = (tmp_path / ".a.living.part").open("w")
+        fcntl.flock(living, fcntl.LOCK_EX)
+    else:
+        living = (tmp_path / ".a.living.part").open("w")
+    with living:
+        write_bytes_atomically(tmp_path / "a", b"whole")
+        assert {p.name for p in tmp_path.iterdir()} == {"a", ".a.living.part", ".b.other.part"}
+    write_bytes_atomically(tmp_path / "a", b"again")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a": b"again", ".b.other.part": b"of another name"}

@@ -14,13 +14,15 @@ import pytest
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
-from probewise.experiment import Exploration, OneScan, begin, explore, read_journal, run, step
+from probewise.experiment import Exploration, OneScan, arm_over, begin, explore, read_journal, run, step
 from probewise.experiment import Field as FieldOf
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, gaussian_entropy, prior_entropy
+from probewise.recordings import Disc
 from probewise.scene.scenes import HypothesisScene
 from probewise.scene.shapes import AnyOf, Circle, Field, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
+from probewise.world import Blob, World, gaussian_spot
 
 COARSE = Grid(400.0, 300.0, 14, 10)
 
@@ -150,6 +152,39 @@ def test_a_run_that_was_interrupted_goes_on_bit_for_bit(small, found, tmp_path, 
     assert len(arm.poses) == len(whole.steps) - n_before
     assert all(same(a, b) for a, b in zip(whole.steps, resumed.steps, strict=True))
     assert [info.replayed for info in resumed.steps] == [k < n_before for k in range(len(whole.steps))]
+
+
+def test_a_simulated_run_resumed_at_any_reading_writes_the_journal_of_one_never_interrupted(small, tmp_path):
+    """Its clock shows the way from the place of the last reading, its noise is that of the next."""
+    surface, world = Disc((250.0, 140.0), 60.0), World(gaussian_spot([Blob(1.0, (0.0, 0.0), (8.0, 8.0))]))
+    experiment = small.experiment(grid=COARSE, n_particles=200)
+
+    def simulated(journal, taken=()):
+        with arm_over(world, surface, Field(400.0, 300.0), seed=5, taken=taken) as arm:
+            return run(arm, experiment, rng=rng(), max_readings=3, journal=journal)
+
+    whole, journal = simulated(tmp_path / "whole"), tmp_path / "journal.jsonl"
+    written = (tmp_path / "whole").read_bytes()
+    ends = [k + 1 for k, byte in enumerate(written) if byte == ord("\n")]
+    torn = written.index(b', "belief"', ends[1])
+    for cut in [*ends[:3], torn]:
+        journal.write_bytes(written[:cut])
+        before = read_journal(journal)
+        resumed = simulated(before, before.readings)
+        assert journal.read_bytes() == written, cut
+        assert resumed.readings == whole.readings
+        assert resumed.last.mean.tolist() == whole.last.mean.tolist()
+
+
+def test_a_journal_that_has_grown_since_it_was_read_is_not_resumed(small, tmp_path):
+    journal = tmp_path / "journal.jsonl"
+    run(small.arm(), small.experiment(grid=COARSE), rng=rng(), max_readings=1, journal=journal)
+    before = read_journal(journal)
+    run(small.arm(), small.experiment(grid=COARSE), rng=rng(), max_readings=2, journal=journal)
+    text = journal.read_bytes()
+    with pytest.raises(FileError, match="another process has written to it"):
+        run(small.arm(), small.experiment(grid=COARSE), rng=rng(), max_readings=3, journal=before)
+    assert journal.read_bytes() == text
 
 
 def test_a_run_that_ended_is_replayed_without_asking_the_arm(small, tmp_path):

@@ -1,0 +1,109 @@
+"""A command that moves the arm is stopped by a signal, as a process with a line of its own: nothing stays on."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import pytest
+from arm_faults import SENSOR
+
+from probewise.arm.nxt import Brick
+from probewise.arm.nxt.telegram import GetInputValues, GetOutputState, RunState, SensorType
+from probewise.calibration import write_sensor
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals"),
+]
+
+LIMIT_S = 60.0
+PROMPT_S = 2.0
+Emulator: TypeAlias = Callable[..., AbstractContextManager[Any]]
+TASKS = {
+    "explore": ("explore", "--sensor", "sensor.json", "--out", "found"),
+    "jog": ("arm", "jog", "base", "-90"),
+    "scan": ("arm", "scan", "300,200", "500,300"),
+    "home": ("arm", "home"),
+    "record": ("arm", "record", "paper", "--out", "mine.csv"),
+}
+STOPS = ["SIGINT", "SIGTERM", "SIGHUP", "closed terminal", "SIGHUP twice"]
+
+
+@pytest.fixture
+def chance() -> random.Random:
+    return random.Random(int(os.environ.get("PROBEWISE_STOP_SEED", "1")))
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("task", TASKS)
+def test_nothing_stays_on_whatever_stops_which_command_when(
+    task: str, stop: str, emulator: Emulator, tmp_path: Path, chance: random.Random
+) -> None:
+    """At a random moment of the first seconds in which motors turn."""
+    pytest.importorskip("serial", reason="pyserial is not installed")
+    write_sensor(SENSOR, tmp_path / "sensor.json")
+    log = tmp_path / "log"
+    with emulator("--log", str(log)) as running:
+        terminal, own = os.openpty()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "probewise", *TASKS[task], "--arm", f"nxt:{running.device}"],
+            cwd=tmp_path,
+            stdin=own,
+            stdout=own,
+            stderr=own,
+            preexec_fn=lambda: _lead(own),
+        )
+        os.close(own)
+        os.write(terminal, b"\n" * 3)  # a person who has done what is asked
+        await_motion(log)
+        time.sleep(chance.uniform(0.0, 1.5))
+        began_s = time.monotonic()
+        if stop == "closed terminal":
+            os.close(terminal)
+        else:
+            for _ in range(1 + stop.endswith("twice")):
+                process.send_signal(signal.Signals[stop.split()[0]])
+        status = process.wait(timeout=LIMIT_S)
+        took_s = time.monotonic() - began_s
+        name = "SIGHUP" if stop == "closed terminal" else stop.split()[0]
+        assert status == 128 + signal.Signals[name]
+        if stop != "closed terminal":
+            said = os.read(terminal, 65536).decode()
+            assert "stopped; " in said
+            assert "Traceback" not in said
+            os.close(terminal)
+        brick = Brick.open(running.device)
+        motors = [brick.link.ask(GetOutputState(port)) for port in range(3)]
+        lights = [brick.link.ask(GetInputValues(port)) for port in range(4)]
+        brick.link.close()
+        assert [(motor.power, motor.run_state) for motor in motors] == [(0, RunState.IDLE)] * 3
+        assert not any(motor.mode for motor in motors)  # neither braked nor held
+        assert [light.type for light in lights] == [SensorType.NONE] * 4
+        assert took_s < PROMPT_S
+
+
+def await_motion(log: Path) -> None:
+    """Wait until a motor is told to turn."""
+    deadline_s = time.monotonic() + LIMIT_S
+    while "SETOUTPUTSTATE" not in (log.read_text(encoding="utf-8") if log.exists() else ""):
+        assert time.monotonic() < deadline_s, "no motor is ever told to turn"
+        time.sleep(0.05)
+
+
+def _lead(terminal: int) -> None:
+    """Become the leader of a session with this terminal, which hears Ctrl-C."""
+    import fcntl
+    import termios
+
+    os.setsid()
+    fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -26,7 +26,8 @@ pytestmark = [
 ]
 
 LIMIT_S = 60.0
-PROMPT_S = 2.0
+PROMPT_S = 1.0  # until all motors are released
+RELEASE = "> 80 04 ff 00 00"
 Emulator: TypeAlias = Callable[..., AbstractContextManager[Any]]
 TASKS = {
     "explore": ("explore", "--sensor", "sensor.json", "--out", "found"),
@@ -48,7 +49,7 @@ def chance() -> random.Random:
 def test_nothing_stays_on_whatever_stops_which_command_when(
     task: str, stop: str, emulator: Emulator, tmp_path: Path, chance: random.Random
 ) -> None:
-    """At a random moment of the first seconds in which motors turn."""
+    """At a random moment of the first seconds in which motors turn; the emulator says how it is left, and when."""
     pytest.importorskip("serial", reason="pyserial is not installed")
     write_sensor(SENSOR, tmp_path / "sensor.json")
     log = tmp_path / "log"
@@ -64,16 +65,18 @@ def test_nothing_stays_on_whatever_stops_which_command_when(
         )
         os.close(own)
         os.write(terminal, b"\n" * 3)  # a person who has done what is asked
-        await_motion(log)
+        await_telegram(log, "SETOUTPUTSTATE")
         time.sleep(chance.uniform(0.0, 1.5))
+        n_before = log.stat().st_size
         began_s = time.monotonic()
         if stop == "closed terminal":
             os.close(terminal)
         else:
             for _ in range(1 + stop.endswith("twice")):
                 process.send_signal(signal.Signals[stop.split()[0]])
-        status = process.wait(timeout=LIMIT_S)
+        await_telegram(log, RELEASE, n_before)
         took_s = time.monotonic() - began_s
+        status = process.wait(timeout=LIMIT_S)
         name = "SIGHUP" if stop == "closed terminal" else stop.split()[0]
         assert status == 128 + signal.Signals[name]
         if stop != "closed terminal":
@@ -91,12 +94,12 @@ def test_nothing_stays_on_whatever_stops_which_command_when(
         assert took_s < PROMPT_S
 
 
-def await_motion(log: Path) -> None:
-    """Wait until a motor is told to turn."""
+def await_telegram(log: Path, text: str, n_before: int = 0) -> None:
+    """Wait until the emulator has heard a telegram, behind so many bytes of its log."""
     deadline_s = time.monotonic() + LIMIT_S
-    while "SETOUTPUTSTATE" not in (log.read_text(encoding="utf-8") if log.exists() else ""):
-        assert time.monotonic() < deadline_s, "no motor is ever told to turn"
-        time.sleep(0.05)
+    while text not in (log.read_text(encoding="utf-8")[n_before:] if log.exists() else ""):
+        assert time.monotonic() < deadline_s, f"{text} never comes"
+        time.sleep(0.02)
 
 
 def _lead(terminal: int) -> None:

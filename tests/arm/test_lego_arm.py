@@ -212,6 +212,7 @@ def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
 
 
 def test_the_battery_and_the_sensor_can_be_read_without_moving(bench):
+    """In LEGO units, as `measure` gives and recordings hold."""
     with bench.arm as arm:
         assert arm.read_here() == 100 * 582 // 1023
         assert arm.battery_mv() == 7412

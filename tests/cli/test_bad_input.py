@@ -1,6 +1,7 @@
 """Input that cannot be used: exit status 2, one line that says what, where and what is allowed, nothing written."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -204,3 +205,28 @@ def test_a_run_that_stands_there_is_not_overwritten_by_a_new_one(sensor_file, tm
 @pytest.mark.parametrize("arguments", [[], ["unheard-of"], ["calibrate"], ["predict", "only-one"]])
 def test_a_wrong_command_line_is_refused_in_one_line(arguments, tmp_path, capsys):
     refused(capsys, tmp_path / "out", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["explor"], "did you mean explore?"),
+        (["explore", "--sensr", "s.json", "--out", "o"], "no option --sensr; did you mean --sensor?"),
+        (["explore", "--sensor", "s.json", "--out", "o", "--max-raedings=5"], "did you mean --max-readings?"),
+        (["explore", "--sensor", "s.json", "--out", "o", "--shape", "circel"], "did you mean circle?"),
+        (["arm", "raed"], "did you mean read?"),
+        (["arm", "jog", "base", "-5", "--dryrun"], "did you mean --dry-run?"),
+        (["arm", "read", "--zzz"], "no option --zzz (see"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_what_was_perhaps_meant_is_said(arguments, says, tmp_path, capsys):
+    assert says in refused(capsys, tmp_path / "out", *arguments)
+
+
+def test_a_package_that_is_missing_is_named_and_not_the_address(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["study", "--out", str(tmp_path / "out"), "--scheduler", "localhost:8786", "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "--scheduler needs the package distributed, which is not installed; pip install 'probewise[cluster]'" in said
+    assert said.count("\n") == 1

@@ -100,7 +100,7 @@ def test_a_recording_that_a_dead_line_ended_goes_on(bricks, plan_file, tmp_path,
     assert said.endswith("cut; nothing was read\n")
     status, said = run(capsys, *arguments)
     assert status == 1
-    assert "rec.csv keeps 4 of 13 readings; go on with --resume" in said
+    assert "rec.csv keeps 4 of 13 readings; go on with: probewise arm record" in said
     status, said = run(capsys, *arguments, "--resume")
     assert "rec.csv keeps 6 of 13 readings" in said
     status, said = run(capsys, *arguments, "--resume")
@@ -118,7 +118,7 @@ def test_a_light_value_out_of_range_ends_the_recording_and_keeps_it(bricks, plan
     status, said = run(capsys, *arguments)
     assert status == 1
     assert "input 1 says valid 1, calibrated 0, 2000 counts; allowed: 0 or 1, 0, 0 to 1023" in said
-    assert "rec.csv keeps 1 of 13 readings; go on with --resume" in said
+    assert "rec.csv keeps 1 of 13 readings; go on with: probewise arm record" in said
     assert bricks["opened"][0].at_rest
     monkeypatch.undo()
     assert len(read_recording(out)) == 1
@@ -150,7 +150,7 @@ def test_nobody_to_press_enter_is_told_of(bricks, plan_file, tmp_path, monkeypat
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     status, said = run(capsys, "arm", "record", plan_file, "--out", tmp_path / "rec.csv", "--arm", "nxt:x")
     assert status == 2
-    assert "a person who presses Enter" in said
+    assert "nobody is there to press Enter" in said
     assert bricks["opened"][0].at_rest
 
 
@@ -166,7 +166,7 @@ def test_exploring_with_a_brick_goes_on_after_its_line_died(model, bricks, senso
     assert said.count("\n") == 1
     status, said = run(capsys, *arguments, "--resume")
     assert status == 1
-    assert "journal.jsonl keeps 2 readings; go on with --resume" in said
+    assert "journal.jsonl keeps 2 readings; go on with: probewise explore" in said
     status, said = run(capsys, *arguments, "--resume")
     assert (status, said) == (0, "")
     lines = [json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()[1:]]

@@ -9,15 +9,20 @@ import time
 
 import numpy as np
 import pytest
-from arm_faults import GEOMETRY, bench_with, connected
 
 from probewise._signals import ENDING, SAME_S, deferred
-from probewise.arm import Pose
+from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
+from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
 from probewise.cli._stopping import Stopped, require_going_on, saying_what_is_kept, stoppable
-from probewise.emulator import Faults, VirtualClock
+from probewise.emulator import VirtualClock, VirtualLine, set_up
+from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
+from probewise.recordings import Uniform
 from probewise.report import exploration
+from probewise.world.shipped import truth
+
+GEOMETRY = read_geometry(shipped_geometry())
 
 
 @pytest.fixture(autouse=True)
@@ -133,7 +138,7 @@ def strike(number, frame):
 def struck_session(n):
     """Measure once, struck at the n-th telegram; return the emulated brick, and how many telegrams came."""
     clock = VirtualClock()
-    bench = bench_with(Faults(), clock, seed=1)
+    bench = set_up(read_numbers(shipped_geometry()), truth("paper"), Uniform(0.5), clock, seed=1)
     send, sent = bench.radio.send, []
 
     def struck(data):
@@ -145,7 +150,8 @@ def struck_session(n):
     bench.radio.send = struck
     x_mm, y_mm = GEOMETRY.field_mm[0] / 2, GEOMETRY.field_mm[1] / 2
     standing = float(GEOMETRY.orientation_rad(np.array([[x_mm, y_mm]]))[0])
-    with contextlib.suppress(Struck), connected(bench, clock, []) as arm:
+    brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
+    with contextlib.suppress(Struck), LegoArm(BrickMachine(brick, GEOMETRY), GEOMETRY, clock=clock) as arm:
         arm.measure(Pose(x_mm, y_mm, standing))
     bench.radio.brick.advance()
     return bench.radio.brick, len(sent)

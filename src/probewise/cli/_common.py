@@ -142,11 +142,12 @@ def say(text: str, *, quiet: bool = False) -> None:
         sys.stdout.flush()
 
 
-def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str) -> str:
+def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
     """Say how much of a run a file holds, and by which command, the same with these options, it goes on."""
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
-    return f"{path} keeps {n} {noun}{'' if n == 1 else 's'}; go on with: {command}"
+    count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"
+    return f"{path} keeps {count}; go on with: {command}"
 
 
 def check_live(n_live: int, n_params: int) -> int:

@@ -224,7 +224,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     def kept() -> str:
         if not out.exists():
             return "nothing was read"
-        return keeps(out, len(read_recording(out)), "reading", arguments, "--resume")
+        return keeps(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
     with saying_what_is_kept(kept), _arm(arguments, geometry, start_s=start_s) as arm:
         readings = carry_out(arm, plan, origin_mm=origin, ask=_asker(arguments, arm), first=len(taken))

@@ -35,7 +35,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_with
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariates import Covariate
 from probewise.diagnosis.residuals.locate import places, places_of_effect, windows
-from probewise.diagnosis.statement.verdict import Hypothesis, credible_set, decide
+from probewise.diagnosis.verdict_report.verdict import Hypothesis, credible_set, decide
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
@@ -189,9 +189,9 @@ def test_whitening_is_the_inverse_root_of_the_covariance():
     steps = steps_within_scans(recording)
     np.testing.assert_array_equal(steps, [0, 1, 2, 1, 1, 0, 1, 1, 1, 1, 1])
     rows = np.flatnonzero(recording.usable)
-    laid_out = NoiseModel((CorrelatedNoise(),), recording).laws(np.zeros(len(rows)))
+    nodes = NoiseModel((CorrelatedNoise(),), recording).laws(np.zeros(len(rows)))
     node = 20
-    rho, whitener = laid_out.settings[node, 0], laid_out.laws[node]
+    rho, whitener = nodes.settings[node, 0], nodes.laws[node]
     scan = recording.plan.scan[rows]
     cov = np.where(scan[:, None] == scan[None, :], rho ** np.abs(rows[:, None] - rows[None, :]), 0.0)
     r = np.random.default_rng(0).normal(size=len(rows))

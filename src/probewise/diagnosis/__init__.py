@@ -22,8 +22,9 @@ from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.statement.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
-from probewise.diagnosis.statement.verdict import (
+from probewise.diagnosis.unknown_shape import SensorAndShape
+from probewise.diagnosis.verdict_report.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
+from probewise.diagnosis.verdict_report.verdict import (
     Diagnosis,
     EffectFound,
     Hypothesis,
@@ -31,8 +32,7 @@ from probewise.diagnosis.statement.verdict import (
     ParameterFound,
     Verdict,
 )
-from probewise.diagnosis.statement.words import p_in_words
-from probewise.diagnosis.unknown_shape import SensorAndShape
+from probewise.diagnosis.verdict_report.words import p_in_words
 
 __all__ = [
     "ALARM",

@@ -24,18 +24,18 @@ from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.fine_structure import fine_structure
 from probewise.diagnosis.residuals.locate import ALARM, Place, global_p_value, places, places_of_effect
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, outside
+from probewise.diagnosis.search.weighed_fit import Search, WeighedFit, in_vocabulary, out_of_vocabulary
 from probewise.diagnosis.search.weighed_twice import Weighing, with_agreement
-from probewise.diagnosis.statement.reasons import reason_of
-from probewise.diagnosis.statement.stating import effects_found, noise_found
-from probewise.diagnosis.statement.verdict import (
+from probewise.diagnosis.thinning import rows_to_diagnose
+from probewise.diagnosis.verdict_report.reasons import reason_of
+from probewise.diagnosis.verdict_report.stating import effects_found, noise_found
+from probewise.diagnosis.verdict_report.verdict import (
     Diagnosis,
     EffectFound,
     Hypothesis,
     credible_set,
     decide,
 )
-from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
@@ -253,22 +253,24 @@ class _Diagnoser:
             corrected=bool(np.any(change)),
         )
 
-    def _judged(self, null: Candidate, best: Candidate, noise: Names, p_value: float) -> tuple[Linearised, Improvement]:
+    def _judged(
+        self, null: WeighedFit, best: WeighedFit, noise: Names, p_value: float
+    ) -> tuple[Linearised, Improvement]:
         """Lay the repaired model out as a linear problem, and measure what it gains over the null."""
         after = Linearised.of(best.found, best.evidence[noise].law)
         return after, improvement_of(self.search, null, best, noise, after, p_value, rng=self.rng)
 
-    def _left_open(self, ensemble: Ensemble, null: Candidate, noise: Names, p_value: float) -> ModelSamples:
+    def _left_open(self, ensemble: Ensemble, null: WeighedFit, noise: Names, p_value: float) -> ModelSamples:
         """Average over hypotheses where none is stated: what has a name may be it all the same, the rest is plain."""
         by_mean = self.search.by_mean
-        named = {names for _, names in self.search.candidates if not outside(names)}
+        named = {names for _, names in self.search.candidates if not out_of_vocabulary(names)}
         best = self.search.best(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or null
         if best.names and self._judged(null, best, noise, p_value)[1].heldout_log_density_per_reading < _RUIN:
             return ensemble.of(null)
         shares = {names: by_mean.get(names, 0.0) for names in ensemble.likely(best) if names}
         return ensemble.averaged(best, {**shares, (): 1 - sum(shares.values())})
 
-    def _p_value(self, null: Candidate, noise: Names, problem: Linearised, draws: FloatArray) -> float:
+    def _p_value(self, null: WeighedFit, noise: Names, problem: Linearised, draws: FloatArray) -> float:
         """Test that nothing is missing from the mean, be the SSF of the null's order, of a greater one, or finer still.
 
         The evidence grants a Gaussian only where it gains the ten nats and more that it costs; what an SSF that is no
@@ -302,7 +304,7 @@ class _Diagnoser:
     def _foreseen(self) -> Names:
         """Name the leading refitted combination with something outside the vocabulary, if it leads what is unknown."""
         by_mean = self.search.by_mean
-        own = {names: p for names, p in by_mean.items() if outside(names)}
+        own = {names: p for names, p in by_mean.items() if out_of_vocabulary(names)}
         refitted = {names for _, names in self.search.candidates}
         leader = max(own, key=lambda names: own[names], default=())
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
@@ -312,7 +314,7 @@ class _Diagnoser:
         by_mean = self.search.by_mean
         shares = {family: by_mean.get(("unknown",), 0.0) * p for family, p in self.search.unknown_shares.items()}
         for names, p in by_mean.items():
-            for name in outside(names):
+            for name in out_of_vocabulary(names):
                 shares[name] = shares.get(name, 0.0) + p
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}
@@ -344,10 +346,10 @@ class _Diagnoser:
 
     def _where(
         self,
-        null: Candidate,
+        null: WeighedFit,
         problem: Linearised,
         draws: FloatArray,
-        best: Candidate,
+        best: WeighedFit,
         effects: tuple[EffectFound, ...],
         p_value: float,
     ) -> list[Place]:
@@ -397,7 +399,7 @@ def _hypotheses(
     """Join mean and noise into combinations; unknown is one hypothesis under any noise."""
     joined: dict[tuple[str, ...], float] = {}
     for (mean, noise), p in probabilities.items():
-        unknown = mean == ("unknown",) or outside(mean)
+        unknown = mean == ("unknown",) or out_of_vocabulary(mean)
         key = ("unknown",) if unknown else tuple(sorted((*mean, *in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())

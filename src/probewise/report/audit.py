@@ -28,7 +28,7 @@ def answer(audit: PlanAudit) -> str:
 
 def figures(audit: PlanAudit) -> dict[str, bytes]:
     """Draw the figure of an audit: PNG by file name."""
-    names, sights = [e.name for e in audit.effects], [e.sight for e in audit.effects]
+    names, sights = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
     return {"audit.png": png(audit_matrix(names, sights, audit.cosines, alias=ALIAS))}
 
 
@@ -69,7 +69,7 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
 def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     plan = audit.cure_plan
     if plan is None:
-        if all(effect.sight == "fine" for effect in audit.effects):
+        if all(effect.detectability == "fine" for effect in audit.effects):
             return (paragraph("None are needed: every effect can be identified."),)
         return (
             paragraph(
@@ -77,7 +77,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
                 "would help enough."
             ),
         )
-    left = [e.name.replace("_", " ") for e in audit.after if e.sight != "fine"]
+    left = [e.name.replace("_", " ") for e in audit.after if e.detectability != "fine"]
     return (
         table(
             ("step", "what to do", "readings", "effects that can then be identified"),

@@ -19,12 +19,12 @@ def audit_table(effects: Sequence[EffectAudit]) -> Markup:
         (
             (
                 effect.name.replace("_", " "),
-                effect.sight,
+                effect.detectability,
                 number(effect.share, 2),
                 effect.reason or ", ".join(f"{n.replace('_', ' ')} {c:.3f}" for n, c in effect.alike[:4]) or "–",
                 "; ".join(_smallest(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
             )
-            for effect in sorted(effects, key=lambda e: rank.index(e.sight))
+            for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
         ),
         caption="Status: fine (can be identified), aliased, or invisible (cannot be detected). Detectable share: of "
         "what it changes in the readings, the share that the sensor's own parameters do not absorb.",

@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.advice.commands import MOST_READINGS, commands, excerpts, in_turn, one_after_another, put_off
-from probewise.diagnosis.advice.layings import layings
-from probewise.diagnosis.advice.next_scans import Outlook, Rival, mutual_information, next_scans
+from probewise.diagnosis.advice.next_scans import PredictiveNormal, Rival, mutual_information, next_scans
+from probewise.diagnosis.advice.target_swaps import target_swaps
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
 from probewise.effects import VOCABULARY, Extent
@@ -23,12 +23,12 @@ from probewise.sensor import Chain, FixedLevels, FixedMixture
 SPOT = FixedMixture.from_parameters(np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0]))  # a Gaussian of sd 5 mm
 
 
-def outlooks(seed: int, apart: float) -> list[Outlook]:
+def predictives(seed: int, apart: float) -> list[PredictiveNormal]:
     rng = np.random.default_rng(seed)
-    return [Outlook(apart * rng.standard_normal(4), 0.7 * rng.standard_normal((4, 2))) for _ in range(3)]
+    return [PredictiveNormal(apart * rng.standard_normal(4), 0.7 * rng.standard_normal((4, 2))) for _ in range(3)]
 
 
-def by_sampling(of: list[Outlook], weights: np.ndarray, n: int = 40_000) -> float:
+def by_sampling(of: list[PredictiveNormal], weights: np.ndarray, n: int = 40_000) -> float:
     """The mutual information itself: the mean log ratio of the true density to the mixture's."""
     rng = np.random.default_rng(3)
     laws = [multivariate_normal(o.mean, np.eye(4) + o.factor @ o.factor.T) for o in of]
@@ -44,7 +44,7 @@ def by_sampling(of: list[Outlook], weights: np.ndarray, n: int = 40_000) -> floa
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
     weights = np.array([0.5, 0.3, 0.2])
-    bound, true = (f(outlooks(seed, apart), weights) for f in (mutual_information, by_sampling))
+    bound, true = (f(predictives(seed, apart), weights) for f in (mutual_information, by_sampling))
     entropy = float(-np.sum(weights * np.log(weights)))
     assert 0.4 * true - 0.02 < bound < true + 0.02
     assert bound <= entropy + 1e-12
@@ -53,7 +53,7 @@ def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
 
 
 def test_the_same_predictions_tell_nothing():
-    one = outlooks(0, 1.0)[0]
+    one = predictives(0, 1.0)[0]
     assert mutual_information([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -112,7 +112,7 @@ def read_by(plan: Plan) -> np.ndarray:
 
 
 def laid(plan: Plan, scan: str) -> Plan:
-    return next(command.plan for command in layings(plan) if command.plan.scan_names == (scan,))
+    return next(command.plan for command in target_swaps(plan) if command.plan.scan_names == (scan,))
 
 
 def test_a_sheet_turned_half_round_swaps_black_and_white():
@@ -147,14 +147,14 @@ def test_a_sheet_moved_aside_reads_the_same_as_far_aside():
 def test_along_an_edge_there_is_nothing_to_lay_otherwise():
     plan = paper_plan()
     along = replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(math.pi / 2, 0.0)})
-    assert {command.kind for command in layings(along)} == {"lay", "across"}
-    assert all("boundary" not in command.description for command in layings(along))
+    assert {command.kind for command in target_swaps(along)} == {"lay", "across"}
+    assert all("boundary" not in command.description for command in target_swaps(along))
     # Of several edges the first that a scan goes across.
     names = (*plan.pattern_names, "upright")
     under = np.where(plan.scan == 1, len(names) - 1, plan.pattern)
     patterns = {**along.patterns, "upright": HalfPlane(0.0, 0.0)}
     second = replace(along, pattern=under, pattern_names=names, patterns=patterns)
-    assert any("upright, turned half round" in command.description for command in layings(second))
+    assert any("upright, turned half round" in command.description for command in target_swaps(second))
 
 
 def test_short_scans_are_taken_whole():
@@ -162,14 +162,14 @@ def test_short_scans_are_taken_whole():
     assert {command.kind for command in commands(plan, strides=(2, 4))} == {"repeat", "reverse", "respeed", "rotate"}
     assert all(len(command.plan) == 12 for command in commands(plan, strides=(2, 4)))
     tiny = replace(plan, x_mm=plan.x_mm / 10)
-    assert not any(re.search("by -?0 mm", command.description) for command in layings(tiny))
+    assert not any(re.search("by -?0 mm", command.description) for command in target_swaps(tiny))
 
 
 def test_a_name_that_is_taken_stands_for_something_else():
     plan = paper_plan()
     grey = replace(plan, pattern_names=(*plan.pattern_names, "plain_white"))
     grey = replace(grey, patterns={**plan.patterns, "plain_white": Uniform(0.8)})
-    white = next(command.plan for command in layings(grey) if command.description == "scan a plain white surface")
+    white = next(command.plan for command in target_swaps(grey) if command.description == "scan a plain white surface")
     ((name, _),) = white.rows_by_pattern()
     assert (white.patterns[name], white.patterns["plain_white"]) == (Uniform(1.0), Uniform(0.8))
 
@@ -187,7 +187,7 @@ def test_excerpts_hold_the_step_and_every_so_many_readings():
 def test_a_scan_over_a_new_sheet_takes_longer():
     plan = paper_plan()
     again = next(c for c in commands(plan, strides=(4,)) if c.kind == "repeat")
-    new = next(c for c in layings(plan) if c.plan.scan_names == ("boundary_half_round_4",))
+    new = next(c for c in target_swaps(plan) if c.plan.scan_names == ("boundary_half_round_4",))
     assert new.minutes == pytest.approx(again.minutes + 1.0)
     # In turn, or behind a plan: what the minutes say passes before the first reading.
     end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))

@@ -8,8 +8,8 @@ import pytest
 
 from probewise.diagnosis import audit_plan, join
 from probewise.diagnosis.advice.commands import behind, commands
+from probewise.diagnosis.audit.detectability import Expected, PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.audit.plan_audit import _cured_at
-from probewise.diagnosis.audit.sights import Expected, LaidOut, Survivors
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.effects import Backlash, EdgeMisplacement, Extent
 from probewise.errors import ParameterError
@@ -27,11 +27,11 @@ def thinned(plan: Plan, step: int = 4) -> Plan:
 
 
 def sights_of(plan: Plan):
-    """The surviving share of backlash and its cosine to an edge that lies elsewhere, by `Survivors`."""
+    """The surviving share of backlash and its cosine to an edge that lies elsewhere, by `ProjectedTemplates`."""
     sensor = default_sensor(Extent(10.0, 60.0, plan), 1)
     expected = Expected(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
-    seen = Survivors.of(LaidOut.of(expected, plan, TWO), np.arange(len(plan)))
-    share, like = seen.sights()["backlash"]
+    seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, TWO), np.arange(len(plan)))
+    share, like = seen.detectability()["backlash"]
     return expected, share, like["edge_misplacement"], seen
 
 
@@ -85,7 +85,7 @@ def test_going_both_ways_tells_play_from_an_edge_that_lies_elsewhere():
 
 def test_what_a_cure_claims_is_seen_after_all_of_it():
     audit = audit_plan(thinned(paper_plan()))
-    before, after = ({e.name: e.sight for e in effects} for effects in (audit.effects, audit.after))
+    before, after = ({e.name: e.detectability for e in effects} for effects in (audit.effects, audit.after))
     cured = [name for cure in audit.cures for name in cure.cured]
     assert {"lag", "backlash"} & set(cured)
     assert all(before[name] != "fine" and after[name] == "fine" for name in cured)
@@ -100,9 +100,9 @@ def test_what_a_cure_claims_is_seen_after_all_of_it():
 
 def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
     """Of three scans the second cures two effects for good but one, which the third, that cures nothing, spoils."""
-    sights = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
+    detectability = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
     words = {"a": "aliased", "f": "fine"}
-    steps = [[SimpleNamespace(name=n, sight=words[of[k]]) for n, of in sights.items()] for k in range(4)]
+    steps = [[SimpleNamespace(name=n, detectability=words[of[k]]) for n, of in detectability.items()] for k in range(4)]
     assert _cured_at(steps) == {"lag": 2, "tilt": 2}
     assert _cured_at(steps[:1]) == {}
 
@@ -122,9 +122,9 @@ def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
 def test_a_flat_surface_shows_no_edge():
     plan = thinned(paper_plan())
     flat = replace(plan, patterns=dict.fromkeys(plan.patterns, Uniform(1.0)))
-    sights = {effect.name: effect.sight for effect in audit_plan(flat).effects}
-    assert sights["backlash"] == sights["edge_misplacement"] == "invisible"
-    assert sights["ambient_gradient"] != "invisible"
+    detectability = {effect.name: effect.detectability for effect in audit_plan(flat).effects}
+    assert detectability["backlash"] == detectability["edge_misplacement"] == "invisible"
+    assert detectability["ambient_gradient"] != "invisible"
 
 
 def test_only_what_the_apparatus_can_command_is_asked_for():

@@ -158,16 +158,16 @@ def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     plan = paper_plan()
     mean = 50 + 35 * np.sin(np.arange(len(plan)))
     recording = Recording(plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP)).unlimited()
-    laid_out = NoiseModel((), recording, rounding=STEP).laws(mean)
+    nodes = NoiseModel((), recording, rounding=STEP).laws(mean)
     off = (recording.readings - mean)[:, None]
-    each = np.array([-law.misfit(off, law.scale(off))[0] for law in laid_out.laws])
+    each = np.array([-law.misfit(off, law.scale(off))[0] for law in nodes.laws])
 
     log_sigma = np.linspace(np.log(STEP / 30), np.log(30 * STEP), 4001)
     near = -np.abs(off)  # where a difference of cumulatives is exact
     cell = norm.cdf((near + STEP / 2) / np.exp(log_sigma)) - norm.cdf((near - STEP / 2) / np.exp(log_sigma))
     grid = np.log(np.maximum(cell, 1e-300) / STEP).sum(axis=0) + 0.5 * len(plan) * np.log(2 * np.pi)
     wanted = logsumexp(grid) + np.log(log_sigma[1] - log_sigma[0])
-    assert logsumexp(each + laid_out.log_weights) == pytest.approx(wanted, abs=0.1)
+    assert logsumexp(each + nodes.log_weights) == pytest.approx(wanted, abs=0.1)
 
 
 @pytest.mark.parametrize("noise_sd", [0.3, 0.7])

@@ -109,8 +109,8 @@ def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
     evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording, least_sd=0.6 * SD))
     step = np.linspace(-0.2, 0.2, 161)
     log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
-    for node in (0, len(evidence.laid_out.laws) // 2):
-        law = evidence.laid_out.laws[node]
+    for node in (0, len(evidence.nodes.laws) // 2):
+        law = evidence.nodes.laws[node]
         whitened = law(noise)[:, None] - law(slope)[:, None] * step
         total = []
         for s in log_sigma:
@@ -119,7 +119,7 @@ def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
             total.append(logsumexp(density.sum(axis=0) - N * s + norm.logpdf(step)))
         cell = (step[1] - step[0]) * (log_sigma[1] - log_sigma[0])
         by_grid = float(logsumexp(total)) + math.log(cell) - law.log_det()
-        own = evidence.log_z_nodes[node] - evidence.laid_out.log_weights[node]
+        own = evidence.log_z_nodes[node] - evidence.nodes.log_weights[node]
         assert own == pytest.approx(by_grid, abs=0.05)
 
 
@@ -192,7 +192,7 @@ def test_where_nothing_is_lost_there_is_no_such_law():
     found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
     evidence = weigh(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
     assert evidence.log_z == -math.inf
-    assert evidence.laid_out.laws == ()
+    assert evidence.nodes.laws == ()
 
 
 def test_a_law_of_some_scans_is_that_of_the_whole():

@@ -30,4 +30,4 @@ def test_half_of_the_unknown_has_a_name_of_our_own():
     odds = PriorOdds.over({name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()})
     assert sum(math.exp(odds.log_mean((name,))) for name in UNNAMED) == pytest.approx(math.exp(odds.log_unknown(())))
     beside = odds.log_mean(("arm_knock", "backlash")) - odds.log_mean(("backlash",))
-    assert math.exp(beside) * len(UNNAMED) == pytest.approx(odds.unknown_beside * odds.foreseen)
+    assert math.exp(beside) * len(UNNAMED) == pytest.approx(odds.unknown_beside * odds.out_of_vocabulary)

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.commands import MOST_READINGS, commands, one_after_another
-from probewise.diagnosis.advice.layings import layings
+from probewise.diagnosis.advice.target_swaps import target_swaps
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import NamedEffect
@@ -79,7 +79,7 @@ def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect
         here = model.predict(z[None, :])[0] - null
         shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
     best = {pair.effects: (0.0, pair) for pair in pairs}
-    scans = [*commands(found.model.plan, level=null), *layings(found.model.plan)]
+    scans = [*commands(found.model.plan, level=null), *target_swaps(found.model.plan)]
     if not (best and scans):
         return list(pairs)
     everywhere, rows_of = one_after_another(scans, found.model.plan)

@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.advice.commands import MOST_READINGS, Command, commands, in_turn, one_after_another
-from probewise.diagnosis.advice.layings import layings
+from probewise.diagnosis.advice.target_swaps import target_swaps
 from probewise.diagnosis.fitting.fit import Model
 from probewise.recordings.plan import Plan
 
@@ -60,22 +60,22 @@ class Rival:
     root: FloatArray
     probability: float
 
-    def outlook(self, plan: Plan, sd: float) -> Outlook:
+    def predictive(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Predict a plan's readings, in noise sd."""
         mean, slopes = replace(self.model, plan=plan).jacobian(self.z)
-        return Outlook(mean / sd, slopes @ self.root / sd)
+        return PredictiveNormal(mean / sd, slopes @ self.root / sd)
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class PredictiveNormal:
     """Normal predictions in noise sd: mean (n_points,), covariance 1 + factor factor^T, factor (n_points, n_params)."""
 
     mean: FloatArray
     factor: FloatArray
 
-    def take(self, rows: IntArray) -> Outlook:
+    def take(self, rows: IntArray) -> PredictiveNormal:
         """Keep these readings."""
-        return Outlook(self.mean[rows], self.factor[rows])
+        return PredictiveNormal(self.mean[rows], self.factor[rows])
 
     @property
     def covariance(self) -> FloatArray:
@@ -97,14 +97,14 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
     """
     leader = max(rivals, key=lambda rival: rival.probability)
     level = leader.model.predict(leader.z[None, :])[0]
-    offered = [*commands(plan, strides=_STRIDES, level=level), *layings(plan)]
+    offered = [*commands(plan, strides=_STRIDES, level=level), *target_swaps(plan)]
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
     offered = [offered[k] for k in _promising(rivals, sd, offered, plan)]
     if not offered:
         return None
     everywhere, rows = one_after_another(offered, plan)
-    outlooks = [rival.outlook(everywhere, sd) for rival in rivals]
+    predictives = [rival.predictive(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
     taken: IntArray = np.zeros(0, dtype=np.int64)
@@ -114,7 +114,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
-                gains[k] = mutual_information([outlook.take(together) for outlook in outlooks], weights) - told
+                gains[k] = mutual_information([predictive.take(together) for predictive in predictives], weights) - told
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also where a model fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
@@ -128,26 +128,26 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
         in_turn(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
-        _expected_log_bayes_factor([outlook.take(taken) for outlook in outlooks], weights),
+        _expected_log_bayes_factor([predictive.take(taken) for predictive in predictives], weights),
         tuple(rival.label for rival in rivals),
     )
 
 
-def mutual_information(outlooks: Sequence[Outlook], weights: FloatArray) -> float:
+def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
     """Bound the mutual information of the hypothesis' index and the readings from below, in nats.
 
     Parameters
     ----------
-    outlooks
+    predictives
         What each hypothesis predicts of the same readings.
     weights
         Probabilities (n_hypotheses,), which sum to one.
     """
-    covariances = [outlook.covariance for outlook in outlooks]
+    covariances = [predictive.covariance for predictive in predictives]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
-    distances = np.zeros((len(outlooks), len(outlooks)))
-    for a, b in combinations(range(len(outlooks)), 2):
-        middle, apart = (covariances[a] + covariances[b]) / 2, outlooks[a].mean - outlooks[b].mean
+    distances = np.zeros((len(predictives), len(predictives)))
+    for a, b in combinations(range(len(predictives)), 2):
+        middle, apart = (covariances[a] + covariances[b]) / 2, predictives[a].mean - predictives[b].mean
         log_det = np.linalg.slogdet(middle)[1] - (log_dets[a] + log_dets[b]) / 2
         distances[a, b] = distances[b, a] = apart @ np.linalg.solve(middle, apart) / 8 + log_det / 2
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
@@ -169,15 +169,15 @@ def _promising(rivals: Sequence[Rival], sd: float, offered: Sequence[Command], p
     return list(kept)
 
 
-def _expected_log_bayes_factor(outlooks: Sequence[Outlook], weights: FloatArray) -> float:
+def _expected_log_bayes_factor(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
     """Average, over which hypothesis is true, the log Bayes factor to be expected over the hardest of its rivals."""
-    covariances = [outlook.covariance for outlook in outlooks]
+    covariances = [predictive.covariance for predictive in predictives]
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
     hardest = []
-    for a, true in enumerate(outlooks):
+    for a, true in enumerate(predictives):
         divergences = []
-        for b, other in enumerate(outlooks):
+        for b, other in enumerate(predictives):
             if a != b:
                 apart = true.mean - other.mean
                 trace = float(np.sum(inverse[b] * covariances[a])) - len(apart)

@@ -9,8 +9,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
-from probewise.diagnosis.fitting.fit import degrees_of_freedom
-from probewise.diagnosis.search.weighed import Candidate, Search
+from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
+from probewise.diagnosis.search.weighed_fit import Search, WeighedFit
 
 __all__ = ["next_readings"]
 
@@ -22,14 +22,14 @@ _LEFT = 2.0  # times that it may change the readings taken, all told: what takes
 _SIZES = 4  # tried until it does not, each a quarter of the one before
 
 
-def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
+def next_readings(search: Search, null: WeighedFit) -> NextMeasurement | None:
     """Ask for the readings that tell the leading refitted hypotheses about the mean apart."""
     by_mean = search.by_mean
     # What has no name at all predicts no more than the null does.
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
-    found: list[Candidate] = []
+    found: list[WeighedFit] = []
     for names in ranked:
         candidate = search.best(names, search.certain) if names else null
         # Of what is named the next is a rival however improbable; of nothing, something that could be there.
@@ -49,12 +49,12 @@ def next_readings(search: Search, null: Candidate) -> NextMeasurement | None:
     return next((asked for asked in wanted if asked is not None), None)
 
 
-def _as_rival(candidate: Candidate, probability: float) -> Rival:
+def _as_rival(candidate: WeighedFit, probability: float) -> Rival:
     label = " with ".join(candidate.names).replace("_", " ") or "the sensor as calibrated"
     return Rival(label, candidate.found.model, candidate.found.z, _root_of(candidate), probability)
 
 
-def _imagined(search: Search, null: Candidate, name: str) -> Rival | None:
+def _imagined(search: Search, null: WeighedFit, name: str) -> Rival | None:
     """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here. None where none can."""
     effect, found = search.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
@@ -81,7 +81,7 @@ def _imagined(search: Search, null: Candidate, name: str) -> Rival | None:
     return None
 
 
-def _root_of(candidate: Candidate) -> FloatArray:
+def _root_of(candidate: WeighedFit) -> FloatArray:
     """Take the square root of the covariance of a fit's coordinates, noise white."""
     slopes, sd = candidate.found.slopes, candidate.sd
-    return covariance_root(slopes, sd**2 * len(slopes) / degrees_of_freedom(slopes, sd))
+    return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd))

@@ -10,8 +10,15 @@ import numpy as np
 
 from probewise._arrays import IntArray
 from probewise.diagnosis.advice.commands import Command, behind, commands, put_off
-from probewise.diagnosis.advice.layings import layings
-from probewise.diagnosis.audit.sights import LEAST_NATS, LEAST_SHARE, Expected, LaidOut, Survivors, nats_between
+from probewise.diagnosis.advice.target_swaps import target_swaps
+from probewise.diagnosis.audit.detectability import (
+    LEAST_NATS,
+    LEAST_SHARE,
+    Expected,
+    PlanTemplates,
+    ProjectedTemplates,
+    nats_between,
+)
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 
@@ -40,7 +47,7 @@ def cures_of(
     ailing
         Names of the effects that are not fine under the plan.
     """
-    every = [*commands(plan, strides=_STRIDES), *layings(plan)]
+    every = [*commands(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Command] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
@@ -50,7 +57,7 @@ def cures_of(
         if not options:
             break
         together = behind(current, [option.plan for option in options])
-        laid = LaidOut.of(expected, together, effects, most=_MOST_SETTINGS)
+        laid = PlanTemplates.of(expected, together, effects, most=_MOST_SETTINGS)
         now = np.arange(len(current))
         trouble = _trouble(laid, now, ailing)
         worth = []
@@ -66,12 +73,12 @@ def cures_of(
     return chosen
 
 
-def _trouble(laid: LaidOut, rows: IntArray, ailing: Sequence[str]) -> float:
+def _trouble(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
     """Add up how far effects are from being fine: 0 fine, up to 1 aliased, 1 to 2 invisible."""
-    sights = Survivors.of(laid, rows).sights(ailing)
+    detectability = ProjectedTemplates.of(laid, rows).detectability(ailing)
     total = 0.0
     for name in ailing:
-        share, like = sights.get(name, (0.0, {}))
+        share, like = detectability.get(name, (0.0, {}))
         if share < LEAST_SHARE:
             total += 2.0 - share / LEAST_SHARE
         else:

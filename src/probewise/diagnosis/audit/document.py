@@ -45,7 +45,7 @@ def _effects(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
     return [
         {
             "name": effect.name,
-            "sight": effect.sight,
+            "sight": effect.detectability,
             "surviving_share": effect.share,
             "alike": [{"effect": name, "cosine": cosine} for name, cosine in effect.alike],
             "smallest": [{"parameter": s.parameter, "unit": s.unit, "amount": s.amount} for s in effect.smallest],

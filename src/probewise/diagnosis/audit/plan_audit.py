@@ -18,20 +18,20 @@ from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
 from probewise.diagnosis.advice.commands import behind
 from probewise.diagnosis.audit.cures import cures_of
-from probewise.diagnosis.audit.sights import ALIAS, LEAST_SHARE, Expected, LaidOut, Survivors
+from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected, PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.statement.verdict import Diagnosis
-from probewise.diagnosis.statement.words import unit_in_words
+from probewise.diagnosis.verdict_report.verdict import Diagnosis
+from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor import Stage, is_free_form
 
-__all__ = ["Cure", "EffectAudit", "PlanAudit", "Sight", "Smallest", "audit_plan", "audit_recorded"]
+__all__ = ["Cure", "Detectability", "EffectAudit", "PlanAudit", "Smallest", "audit_plan", "audit_recorded"]
 
-Sight: TypeAlias = Literal["invisible", "aliased", "fine"]
+Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
 _MOST_READINGS = 4000  # of a recording that are looked at; of a longer one every second, every third, ...
 _SETTINGS = 48  # of an effect's bank, beside a diagnosis
@@ -56,7 +56,7 @@ class EffectAudit:
 
     Attributes
     ----------
-    name, sight
+    name, detectability
         The effect, and whether it is invisible, aliased or fine.
     share
         Surviving share of its trace, the median over its settings; 0 where it cannot show at all.
@@ -69,7 +69,7 @@ class EffectAudit:
     """
 
     name: str
-    sight: Sight
+    detectability: Detectability
     share: float
     alike: tuple[tuple[str, float], ...] = ()
     smallest: tuple[Smallest, ...] = ()
@@ -116,9 +116,11 @@ class PlanAudit(ShowsItself):
     def __post_init__(self) -> None:
         object.__setattr__(self, "cosines", frozen(self.cosines))
 
-    def seen_as(self, sight: Sight, *, after: bool = False) -> tuple[EffectAudit, ...]:
+    def seen_as(self, detectability: Detectability, *, after: bool = False) -> tuple[EffectAudit, ...]:
         """Select the effects that are seen this way."""
-        return tuple(effect for effect in (self.after if after else self.effects) if effect.sight == sight)
+        return tuple(
+            effect for effect in (self.after if after else self.effects) if effect.detectability == detectability
+        )
 
     @property
     def cure_plan(self) -> Plan | None:
@@ -153,7 +155,7 @@ class PlanAudit(ShowsItself):
             so_that = ", ".join(cure.cured) or "helps the next"
             said = f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}"
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
-        left = [e.name for e in self.after if e.sight != "fine"]
+        left = [e.name for e in self.after if e.detectability != "fine"]
         return "\n".join([*lines, *_listed("left", left or ["nothing"])])
 
 
@@ -205,13 +207,13 @@ def audit_plan(
         raise ParameterError("pattern", lacking[0], f"one that is described: {', '.join(plan.patterns) or 'none'}")
     expected, said = _expected(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
-    before, cosines = _judged(LaidOut.of(expected, plan, effects), effects, unit)
-    ailing = [effect.name for effect in before if effect.sight != "fine"]
+    before, cosines = _judged(PlanTemplates.of(expected, plan, effects), effects, unit)
+    ailing = [effect.name for effect in before if effect.detectability != "fine"]
     chosen = cures_of(plan, expected, effects, ailing)
     steps, current = [before], plan
     for command in chosen:
         current = behind(current, [command.plan])
-        steps.append(_judged(LaidOut.of(expected, current, effects), effects, unit)[0])
+        steps.append(_judged(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)
     n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
     cures = tuple(
@@ -226,7 +228,7 @@ def _cured_at(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
 
     An effect may be fine as long as the steps last that cure anything, and spoilt by one behind them.
     """
-    fine = [{effect.name for effect in step if effect.sight == "fine"} for step in steps]
+    fine = [{effect.name for effect in step if effect.detectability == "fine"} for step in steps]
 
     def since(last: int) -> dict[str, int]:
         names = [effect.name for effect in steps[0] if effect.name in fine[last] - fine[0]]
@@ -268,7 +270,9 @@ def audit_recorded(
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
-    judged, cosines = _judged(LaidOut.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit)
+    judged, cosines = _judged(
+        PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
+    )
     return PlanAudit(plan, "the sensor as calibrated from these readings", judged, cosines, (), judged)
 
 
@@ -294,11 +298,11 @@ def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) ->
 
 
 def _judged(
-    laid: LaidOut, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
+    laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Judge every effect, and how well each (row) is imitated by each other (column)."""
-    seen = Survivors.of(laid, np.arange(len(laid.slopes)))
-    sights = seen.sights()
+    seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
+    detectability = seen.detectability()
     names = list(effects)
     cosines = np.zeros((len(names), len(names)))
     out = []
@@ -311,7 +315,7 @@ def _judged(
             reason = "" if enough else f"{seen.n_points} readings show no scatter; {LEAST_READINGS} do"
             out.append(EffectAudit(name, "fine" if enough else "invisible", float(enough), reason=reason))
         else:
-            share, like = sights[name]
+            share, like = detectability[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
             out.append(_seen(effect, share, like, seen.smallest(effect), unit))

@@ -84,11 +84,11 @@ class JointProblem:
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         residuals = (self.recording.readings[usable] - predicted).T
-        laid_out, kept = self.noise.laid_out, self._kept
-        laws, log_share = [laid_out.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
+        nodes, kept = self.noise.nodes, self._kept
+        laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         terms = [
             log_weight + log_likelihood_of_whitened(law, law(residuals))
-            for log_weight, law in zip(laid_out.log_weights[kept], laws, strict=True)
+            for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
         ]
         out = np.asarray(logsumexp(terms, axis=0)) + log_share
         return np.where(np.isfinite(out), out, -np.inf)

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.fitting.fit import Fit, degrees_of_freedom
+from probewise.diagnosis.fitting.fit import Fit, residual_degrees_of_freedom
 from probewise.diagnosis.fitting.null import log_multiplicity
 from probewise.diagnosis.noise.law import NoiseLaw, forms
-from probewise.diagnosis.noise.models import LaidOut, NoiseModel
+from probewise.diagnosis.noise.models import NoiseModel, NoiseNodes
 
 __all__ = [
     "LEAST_VISIBLE",
@@ -51,7 +51,7 @@ class NoiseEvidence:
     noise: NoiseModel
     log_z: float
     log_z_nodes: FloatArray
-    laid_out: LaidOut
+    nodes: NoiseNodes
 
     @property
     def weights(self) -> FloatArray:
@@ -61,20 +61,20 @@ class NoiseEvidence:
     def likely_nodes(self, name: str) -> tuple[FloatArray, float]:
         """Give up to four nodes of one effect that hold most, (n_nodes, n_params), and the log weight of each."""
         best = np.argsort(-self.weights)[:4]
-        each = float(self.laid_out.log_weights[0]) - math.log(float(self.weights[best].sum()))
-        return self.laid_out.settings[best][:, self.noise.columns_of(name)], each
+        each = float(self.nodes.log_weights[0]) - math.log(float(self.weights[best].sum()))
+        return self.nodes.settings[best][:, self.noise.columns_of(name)], each
 
     @property
     def law(self) -> NoiseLaw:
         """The most probable node's."""
-        return self.laid_out.laws[int(np.argmax(self.log_z_nodes))]
+        return self.nodes.laws[int(np.argmax(self.log_z_nodes))]
 
     @property
     def at_best(self) -> NoiseEvidence:
         """The most probable node alone."""
         at = [int(np.argmax(self.log_z_nodes))]
-        laid_out = LaidOut(self.laid_out.settings[at], (self.law,), self.laid_out.log_weights[at])
-        return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], laid_out)
+        own = NoiseNodes(self.nodes.settings[at], (self.law,), self.nodes.log_weights[at])
+        return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], own)
 
 
 def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
@@ -84,22 +84,22 @@ def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     is judged without the bias of residuals that were fitted as if white. Where the floor of the sd is above what is
     left, the integral over the sd is taken to be as wide as elsewhere.
     """
-    laid_out = noise.laws(found.predicted)
+    every = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
-    out = np.empty(len(laid_out.laws))
-    normal = [node for node, law in enumerate(laid_out.laws) if law.tail.is_normal]
+    out = np.empty(len(every.laws))
+    normal = [node for node, law in enumerate(every.laws) if law.tail.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
-        out[nodes] = _of_normal_laws(found, [laid_out.laws[node] for node in nodes], joined)
+        out[nodes] = _of_normal_laws(found, [every.laws[node] for node in nodes], joined)
     tailed: dict[tuple[tuple[bytes, bytes, bytes], bool], list[int]] = {}  # by whitening, flat tops apart
     for node in sorted({*range(len(out))} - {*normal}):
-        law = laid_out.laws[node]
+        law = every.laws[node]
         tailed.setdefault((law.linear, law.flat > 0), []).append(node)
     for nodes in tailed.values():
-        out[nodes] = _of_tails(found, [laid_out.laws[node] for node in nodes], joined)
-    out += [law.log_extra for law in laid_out.laws]
-    out += laid_out.log_weights + log_multiplicity(found.model.sensor)
-    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, laid_out)
+        out[nodes] = _of_tails(found, [every.laws[node] for node in nodes], joined)
+    out += [law.log_extra for law in every.laws]
+    out += every.log_weights + log_multiplicity(found.model.sensor)
+    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
 
 
 def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
@@ -190,7 +190,7 @@ class Linearised:
         turned, sigma = law(slopes), law.scale(whitened)
         known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.floor)
         sigma = np.where(sigma > 0, sigma, found.sd)
-        free = degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
+        free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
         sigma = sigma if known else sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))

@@ -72,7 +72,7 @@ class CalibratedSensor(ABC):
 
     @property
     @abstractmethod
-    def worth(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """How many Gaussians its SSF is as free as."""
 
     @property
@@ -150,7 +150,7 @@ class SensorCoordinates(CalibratedSensor):
         return 6 * self.n_gaussians + 1
 
     @property
-    def worth(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """As many Gaussians as it has."""
         return self.n_gaussians
 

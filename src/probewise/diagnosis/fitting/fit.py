@@ -17,7 +17,7 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES
 
-__all__ = ["Fit", "Model", "degrees_of_freedom", "fit", "start_with_more_gaussians", "starts_of_one_gaussian"]
+__all__ = ["Fit", "Model", "fit", "residual_degrees_of_freedom", "start_with_more_gaussians", "starts_of_one_gaussian"]
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
@@ -179,7 +179,7 @@ def fit(
     return Fit(model, z, predicted, readings - predicted, slopes, sd, best)
 
 
-def degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
+def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
     """Count the readings that no parameter takes: n less the number of parameters that they, not the priors, settle.
 
     Parameters

@@ -54,7 +54,7 @@ class FreeForm(CalibratedSensor):
         return 7 + N_BENDS
 
     @property
-    def worth(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """As two: from one Gaussian to any form is one step."""
         return 2
 

@@ -61,7 +61,7 @@ class Null(Protocol):
         ...
 
     @property
-    def worth(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """How many Gaussians its SSF is as free as."""
         ...
 

@@ -60,7 +60,7 @@ class OwnModel:
         return 0
 
     @property
-    def worth(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """None."""
         return 0
 

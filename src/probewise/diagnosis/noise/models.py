@@ -17,7 +17,7 @@ from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["LaidOut", "NoiseModel", "hides_the_noise", "least_sd", "log_lost_value", "rough_sd"]
+__all__ = ["NoiseModel", "NoiseNodes", "hides_the_noise", "least_sd", "log_lost_value", "rough_sd"]
 
 _FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
 _MANY = 12  # nodes of one effect that beside another's would be too many
@@ -30,7 +30,7 @@ _FINE = 0.01  # noise sd: how exactly a lost reading holds its value where nothi
 
 
 @dataclass(frozen=True, eq=False)
-class LaidOut:
+class NoiseNodes:
     """The laws of a noise model about a fit, one a node, with settings (n_nodes, n_params) and log prior weights."""
 
     settings: FloatArray
@@ -86,7 +86,7 @@ class NoiseModel:
                 out[effect.name] = nodes[1::3], -math.log(len(nodes[1::3]))
         return out
 
-    def laws(self, predicted: FloatArray) -> LaidOut:
+    def laws(self, predicted: FloatArray) -> NoiseNodes:
         """Lay out every combination of the effects' nodes about predictions of the usable rows, (n_usable,)."""
         residuals = self._readings - predicted
         # Rounded readings can all be as predicted; what rounding alone leaves is not far.
@@ -109,8 +109,8 @@ class NoiseModel:
             (law,) = laws
             halves, log_weights = _beside_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
-            return LaidOut(np.repeat(settings, len(laws), axis=0), laws, log_weights)
-        return LaidOut(settings, laws, np.full(len(laws), log_weight))
+            return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, log_weights)
+        return NoiseNodes(settings, laws, np.full(len(laws), log_weight))
 
     def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, float]:
         """Give the nodes of one effect and the log prior weight of each."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
 from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
-from probewise.diagnosis.search.weighed import Candidate, Search
+from probewise.diagnosis.search.weighed_fit import Search, WeighedFit
 from probewise.effects import EFFECTS
 
 __all__ = ["Ensemble"]
@@ -35,7 +35,7 @@ class Ensemble:
     rng: np.random.Generator
     _known: dict[tuple[Names, bool], ModelSamples] = field(default_factory=dict)
 
-    def of(self, candidate: Candidate) -> ModelSamples:
+    def of(self, candidate: WeighedFit) -> ModelSamples:
         """Draw from the posterior of a candidate's hypothesis, over all SSF orders of its form that matter."""
         key = candidate.names, candidate.found.model.sensor.exchangeable
         if key not in self._known:
@@ -47,7 +47,7 @@ class Ensemble:
             self._known[key] = over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
         return self._known[key]
 
-    def likely(self, best: Candidate) -> dict[Names, float]:
+    def likely(self, best: WeighedFit) -> dict[Names, float]:
         """Weigh what one model can hold beside the best candidate: under its noise, by the form of its SSF."""
         out: dict[Names, float] = {}
         for names in dict.fromkeys(names for _, names in self.search.candidates):
@@ -58,7 +58,7 @@ class Ensemble:
         total = np.logaddexp.reduce(list(out.values()))
         return {names: math.exp(value - total) for names, value in out.items()}
 
-    def averaged(self, best: Candidate, probabilities: Mapping[Names, float]) -> ModelSamples:
+    def averaged(self, best: WeighedFit, probabilities: Mapping[Names, float]) -> ModelSamples:
         """Mix the samples of the best candidate with those of its rivals, by probability, as far as one model can."""
         kept = [(self.of(best), best, probabilities[best.names])]
         for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
@@ -73,7 +73,7 @@ class Ensemble:
         null = self.search.sensors[max(part.n_gaussians for part in parts)]
         return over_hypotheses(parts, shares, null, self.search.recording.plan, rng=self.rng)
 
-    def _of_form(self, best: Candidate, names: Names) -> list[Candidate]:
+    def _of_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
         """List the refitted candidates of a combination whose SSF is of the form that the best one's is."""
         form = best.found.model.sensor.exchangeable
         return [
@@ -82,6 +82,6 @@ class Ensemble:
             if key == names and c.found.model.sensor.exchangeable == form
         ]
 
-    def _drawn(self, candidate: Candidate) -> ModelSamples:
+    def _drawn(self, candidate: WeighedFit) -> ModelSamples:
         evidence = candidate.evidence[self.noise]
         return sample_model(candidate.found, evidence, self.search.recording, weights=candidate.weights, rng=self.rng)

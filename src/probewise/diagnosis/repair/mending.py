@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.gain import blocks_kept_back, held_out_gain, parts_kept_back
+from probewise.diagnosis.evidence.held_out import held_out_blocks, held_out_gain, held_out_parts
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.repair.unknown import correct
 from probewise.diagnosis.residuals.locate import ALARM, global_p_value
-from probewise.diagnosis.search.weighed import Candidate, Search
+from probewise.diagnosis.search.weighed_fit import Search, WeighedFit
 
 __all__ = ["Improvement", "corrected", "improvement_of"]
 
@@ -37,8 +37,8 @@ class Improvement:
 
 def improvement_of(
     search: Search,
-    null: Candidate,
-    best: Candidate,
+    null: WeighedFit,
+    best: WeighedFit,
     noise: Names,
     after: Linearised,
     p_value: float,
@@ -72,8 +72,8 @@ def improvement_of(
 
 def corrected(
     search: Search,
-    null: Candidate,
-    best: Candidate,
+    null: WeighedFit,
+    best: WeighedFit,
     problem: Linearised,
     noise: Names,
     plain: Improvement,
@@ -90,11 +90,11 @@ def corrected(
     improvement, change
         `plain` with what the correction adds, and the correction of the usable readings, (n_usable,).
     """
-    parts, part_names = parts_kept_back(search.recording)
+    parts, part_names = held_out_parts(search.recording)
     fixed = correct(best.found, problem, search.unknown_bases, parts)
     gain = plain
     if fixed.gains_nothing:
-        parts, part_names = blocks_kept_back(search.recording)
+        parts, part_names = held_out_blocks(search.recording)
         fixed = correct(best.found, problem, search.unknown_bases, parts)
         gain = replace(plain, heldout_by_scan=())
     if fixed.gains_nothing:

@@ -154,7 +154,7 @@ def sample_model(
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
     if law.flat:  # as each node of its law has it: beside rounding where that is an effect, else with it
-        each = [own.sigma * (1.0 if of_lattice else own.widening) for own in noise.laid_out.laws]
+        each = [own.sigma * (1.0 if of_lattice else own.widening) for own in noise.nodes.laws]
         noise_sd = np.array(each)[nodes]
     else:
         noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
@@ -210,7 +210,7 @@ def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatA
 
 def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:
     """Draw one effect's parameters about the nodes drawn, as far as half way to the next: (n_samples, n_params)."""
-    settings = noise.laid_out.settings[:, noise.noise.columns_of(effect.name)]
+    settings = noise.nodes.settings[:, noise.noise.columns_of(effect.name)]
     values, units = settings[nodes], effect.prior.to_unit_cube(settings)
     gaps = np.array([np.diff(np.unique(np.round(column, 9))).min(initial=1.0) for column in units.T])
     spread = np.array([len(np.unique(column)) > 1 for column in settings.T])

@@ -21,10 +21,10 @@ class PriorOdds:
 
     Of the mean: `clean_mean`, `unknown`, and the rest shared out over combinations, by size, then evenly;
     `unknown_beside` is the share of those in which something unknown is at work besides. Half of what is
-    unknown (`foreseen`) is shared out over the effects of `UNNAMED`, the rest is like nothing foreseen.
-    Of the noise: `white`, the rest over noise models, by size, then evenly. `coincidence` (nats) is what
+    unknown (`out_of_vocabulary`) is shared out over the effects of `UNNAMED`, the rest has no formula.
+    Of the noise: `white`, the rest over noise models, by size, then evenly. `complexity_penalty` (nats) is what
     speaks against an effect that makes a Gaussian of the SSF superfluous, for each one: that physics looks
-    like an SSF's shape takes more than an even chance to believe; `unknown_coincidence` the same of what has
+    like an SSF's shape takes more than an even chance to believe; `unknown_complexity_penalty` the same of what has
     no name, which bends to any shape: before it is believed, the SSF may have its Gaussians.
     """
 
@@ -33,13 +33,13 @@ class PriorOdds:
     n_noises: int = 6
     clean_mean: float = 0.60
     unknown: float = 0.06
-    foreseen: float = 0.5
+    out_of_vocabulary: float = 0.5
     by_size: tuple[float, ...] = (0.33, 0.0095, 0.0005)
     unknown_beside: float = 0.01
     white: float = 0.94
     noise_by_size: tuple[float, ...] = (0.057, 0.003)
-    coincidence: float = 8.0
-    unknown_coincidence: float = 24.0
+    complexity_penalty: float = 8.0
+    unknown_complexity_penalty: float = 24.0
 
     @classmethod
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
@@ -54,7 +54,7 @@ class PriorOdds:
         log_p = self._log_of_named(len(named))
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
-            log_p += math.log(share * self.foreseen / (self.n_unnamed - k))
+            log_p += math.log(share * self.out_of_vocabulary / (self.n_unnamed - k))
         return log_p
 
     def _log_of_named(self, n: int) -> float:
@@ -64,7 +64,7 @@ class PriorOdds:
         """Log prior of something that nobody foresaw, beside a combination of effects on the mean."""
         if names:
             return self.log_mean(names) + math.log(self.unknown_beside)
-        return math.log(self.unknown * (1 - self.foreseen if self.n_unnamed else 1.0))
+        return math.log(self.unknown * (1 - self.out_of_vocabulary if self.n_unnamed else 1.0))
 
     def alone(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
         """Give what is believed of clean, unknown and single effects on the mean where no reading says anything.

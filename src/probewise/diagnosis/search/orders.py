@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.search.growing import WORTH_REFITTING
-from probewise.diagnosis.search.pool import Pool
-from probewise.diagnosis.search.refits import acts
-from probewise.diagnosis.search.weighed import Candidate
+from probewise.diagnosis.search.forward_selection import REFITTED_WITHIN
+from probewise.diagnosis.search.refits import is_significant
+from probewise.diagnosis.search.state import SearchState
+from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["at_other_orders"]
 
@@ -20,7 +20,7 @@ _AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orde
 _LEAST_ELSEWHERE = 1e-4  # probability of such a combination, among those with a formula
 
 
-def at_other_orders(pool: Pool, by_mean: Mapping[Names, float]) -> None:
+def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
     """Refit the most probable combinations wherever that is worth it.
 
     What has no name may lead at an order at which no name was tried yet: that must not keep the names from it.
@@ -28,38 +28,42 @@ def at_other_orders(pool: Pool, by_mean: Mapping[Names, float]) -> None:
     known = sum(p for names, p in by_mean.items() if names != ("unknown",))
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
     for names in leaders[:_AT_OTHER_ORDERS]:
-        held = pool.of(names)
+        held = state.of(names)
         if held and by_mean[names] >= _LEAST_ELSEWHERE * known:
             source = max(held, key=lambda c: c.log_z)
-            for n in _rival_orders(pool, source):
-                _carry_over(pool, source, n)
+            for n in _rival_orders(state, source):
+                _carry_over(state, source, n)
 
 
-def _rival_orders(pool: Pool, source: Candidate) -> list[int]:
+def _rival_orders(state: SearchState, source: WeighedFit) -> list[int]:
     """List the SSF orders at which what is refitted at one is worth another refit."""
-    own = pool.candidates[source.n_gaussians, ()].log_z
-    behind = own - WORTH_REFITTING
+    own = state.candidates[source.n_gaussians, ()].log_z
+    behind = own - REFITTED_WITHIN
     return [
         n
-        for n, sensor in pool.sensors.items()
-        if (n, source.names) not in pool.candidates
+        for n, sensor in state.sensors.items()
+        if (n, source.names) not in state.candidates
         # A freer SSF that does not pay by itself does not pay beside an effect.
-        and (sensor.worth < source.worth or pool.candidates[n, ()].log_z > behind)
-        and (sensor.worth <= source.worth + 1 or pool.candidates[n, ()].log_z > own)
+        and (sensor.degrees_of_freedom < source.degrees_of_freedom or state.candidates[n, ()].log_z > behind)
+        and (sensor.degrees_of_freedom <= source.degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
     ]
 
 
-def _carry_over(pool: Pool, source: Candidate, n: int) -> None:
+def _carry_over(state: SearchState, source: WeighedFit, n: int) -> None:
     """Refit a candidate's effects at another SSF order; keep it where they are felt."""
-    null, sensor = pool.candidates[n, ()], pool.sensors[n]
+    null, sensor = state.candidates[n, ()], state.sensors[n]
     own = source.found.z[source.found.model.sensor.n_params :]
-    candidate = pool.refits.weighed(
+    candidate = state.refits.weighed(
         Model(sensor, source.found.model.effects, source.found.model.plan),
         np.concatenate([null.found.z, own])[None, :],
-        pool.refits.law_of(source),
+        state.refits.law_of(source),
         max_steps=15,
     )
-    log_share = source.log_share + pool.coincidence(source.worth) - pool.coincidence(sensor.worth)
+    log_share = (
+        source.log_share
+        + state.complexity_penalty(source.degrees_of_freedom)
+        - state.complexity_penalty(sensor.degrees_of_freedom)
+    )
     candidate = candidate.as_share(log_share, source.weights)
-    if acts(candidate, null):
-        pool.keep(candidate)
+    if is_significant(candidate, null):
+        state.keep(candidate)

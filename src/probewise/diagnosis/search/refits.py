@@ -21,10 +21,10 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.weighed import Candidate
+from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
 
-__all__ = ["Refits", "acts"]
+__all__ = ["Refits", "is_significant"]
 
 Names = tuple[str, ...]
 
@@ -39,11 +39,11 @@ class Refits:
     noises: Noises
     templates: TemplateMemory
 
-    def law_of(self, candidate: Candidate) -> NoiseLaw:
+    def law_of(self, candidate: WeighedFit) -> NoiseLaw:
         """Give the most probable law of the noise about a fit."""
         return self.noises.best(candidate.evidence).law
 
-    def weighed(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> Candidate:
+    def weighed(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> WeighedFit:
         """Fit under a law of the noise, weigh under every noise model, refit where another one is more probable."""
         found = self._fit(model, starts, law, max_steps)
         for _ in range(2):
@@ -55,11 +55,11 @@ class Refits:
             found = self._fit(model, found.z[None, :], law, max_steps)
         else:
             evidence = self.noises.weigh(found)
-        return Candidate.of(found, law, evidence, log_visible(found, law, self.templates.usable))
+        return WeighedFit.of(found, law, evidence, log_visible(found, law, self.templates.usable))
 
     def extended(
-        self, parent: Candidate, effect: NamedEffect[Any], against: float = 0.0
-    ) -> tuple[Candidate, dict[Names, float]]:
+        self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0
+    ) -> tuple[WeighedFit, dict[Names, float]]:
         """Refit with one more effect, in the likely ones of its variants.
 
         Returns
@@ -104,13 +104,13 @@ class Refits:
 
     def _of_variant(
         self,
-        parent: Candidate,
+        parent: WeighedFit,
         effect: NamedEffect[Any],
         templates: EffectTemplates,
         scores: FloatArray,
         variant: int,
         problems: Sequence[Linearised],
-    ) -> Candidate:
+    ) -> WeighedFit:
         """Refit with one variant of one more effect, from the best entries of its bank."""
         own = np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
@@ -127,13 +127,13 @@ class Refits:
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
         return self.weighed(model, np.stack(starts), problems[0].law)
 
-    def _plainly(self, parent: Candidate, problem: Linearised) -> list[Linearised]:
+    def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
         """Lay a fit out under the plainest law of the noise, where that is another one."""
         plain = parent.evidence[self.noises.certain].law
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
 
 
-def acts(candidate: Candidate, parent: Candidate) -> bool:
+def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
     """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
     law = candidate.law
 

@@ -18,17 +18,17 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.noise.law import steps_within_scans
 from probewise.diagnosis.residuals.bases import unknown_templates, unlike_named
 from probewise.diagnosis.residuals.covariates import covariates_of, slope_along_the_move
-from probewise.diagnosis.search.apart import take_apart
-from probewise.diagnosis.search.growing import WORTH_GROWING, grow
+from probewise.diagnosis.search.backward_elimination import eliminate_backward
+from probewise.diagnosis.search.forward_selection import EXTENDED_WITHIN, select_forward
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.orders import at_other_orders
-from probewise.diagnosis.search.pool import Pool
+from probewise.diagnosis.search.pruning import prune
 from probewise.diagnosis.search.refits import Refits
+from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import Unknown
-from probewise.diagnosis.search.unnamed import give_way
-from probewise.diagnosis.search.weighed import Search, weighed
+from probewise.diagnosis.search.weighed_fit import Search, weighed
 from probewise.effects import UNNAMED, NamedEffect, NoiseEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -72,10 +72,10 @@ def search(
     noises = Noises(recording, on_noise, prior)
     templates = TemplateMemory(np.flatnonzero(recording.usable))
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
-    pool = Pool(on_mean, prior, noises, templates, Refits(sensor, noises, templates))
-    fit_nulls(pool, sensor, max_order=max_order)
-    null = pool.null
-    unknown = _unknown(pool)
+    state = SearchState(on_mean, prior, noises, templates, Refits(sensor, noises, templates))
+    fit_nulls(state, sensor, max_order=max_order)
+    null = state.null
+    unknown = _unknown(state)
 
     def weighed_up() -> Search:
         return weighed(
@@ -84,9 +84,9 @@ def search(
                 effects,
                 noises.models,
                 noises.certain,
-                pool.sensors,
-                pool.candidates,
-                pool.screened(),
+                state.sensors,
+                state.candidates,
+                state.screened(),
                 unknown.log_z,
                 prior,
                 unknown.covariates,
@@ -97,40 +97,40 @@ def search(
             )
         )
 
-    grow(pool, beam=beam, depth=depth)
-    take_apart(pool)
+    select_forward(state, beam=beam, depth=depth)
+    eliminate_backward(state)
     # Beside a form of the SSF that the readings refute, it is the form that is missing.
-    unknown.weigh([c for c in pool.nulls if c.log_z > pool.null.log_z - WORTH_GROWING])
+    unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
     for _ in range(_MOST_THAT_MATTER):
         by_mean = weighed_up().by_mean
-        settled = {(), ("unknown",)} | pool.not_felt | pool.refitted
+        settled = {(), ("unknown",)} | state.undetected | state.refitted
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
         if by_mean.get(names, 0.0) <= _MATTERS or not names:
             break
-        pool.reach(names)
+        state.reach(names)
     if sensor is None:
-        at_other_orders(pool, weighed_up().by_mean)
-    pool.candidates, pool.spoken_for = give_way(pool.candidates, noises)
-    refitted = [c for c in pool.candidates.values() if c.names]
+        at_other_orders(state, weighed_up().by_mean)
+    state.candidates, state.pruned = prune(state.candidates, noises)
+    refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
-    unknown.give_way(pool.candidates.values())
+    unknown.prune(state.candidates.values())
     return weighed_up()
 
 
-def _unknown(pool: Pool) -> Unknown:
+def _unknown(state: SearchState) -> Unknown:
     """Lay out what has no name about the best null."""
-    null, recording = pool.null, pool.noises.recording
+    null, recording = state.null, state.noises.recording
     usable = np.flatnonzero(recording.usable)
     level, model, z = null.found.predicted, null.found.model, null.found.z[None, :]
     slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
     covariates = covariates_of(recording.plan, usable, level, slope)
     starts = np.flatnonzero(steps_within_scans(recording) == 0)
     bases = unknown_templates(covariates, level - level.min(), slope, starts)
-    named = [effect for name, effect in pool.effects.items() if name not in UNNAMED]
-    problem = Linearised.of(null.found, pool.refits.law_of(null))
+    named = [effect for name, effect in state.effects.items() if name not in UNNAMED]
+    problem = Linearised.of(null.found, state.refits.law_of(null))
     return Unknown(
-        unlike_named(bases, pool.templates.bank(null.found, named), problem),
+        unlike_named(bases, state.templates.bank(null.found, named), problem),
         tuple(covariates),
-        pool.noises,
-        lambda worth: pool.coincidence(worth, pool.prior.unknown_coincidence),
+        state.noises,
+        lambda worth: state.complexity_penalty(worth, state.prior.unknown_complexity_penalty),
     )

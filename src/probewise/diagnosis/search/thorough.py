@@ -20,7 +20,7 @@ from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
-from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary, weighed
+from probewise.diagnosis.search.weighed_fit import Search, WeighedFit, in_vocabulary, weighed
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.errors import DoubtfulResultWarning
 
@@ -78,13 +78,13 @@ def weigh_thoroughly(
     return _moved(search, {key: w.gap - common for key, w in weighings.items()}), told
 
 
-def _leaders(search: Search) -> list[tuple[Candidate, Names]]:
+def _leaders(search: Search) -> list[tuple[WeighedFit, Names]]:
     """List the leading refitted hypotheses about the mean, each under its best noise, then the null if not among them.
 
     All under the SSF order that has the most evidence for each, the null under that of the first.
     """
     merged = search.by_mean
-    out: list[tuple[Candidate, Names]] = []
+    out: list[tuple[WeighedFit, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
         if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
             break
@@ -105,7 +105,7 @@ def _noise_of(search: Search, mean: Names) -> Names:
 
 
 def _weigh(
-    candidate: Candidate,
+    candidate: WeighedFit,
     noise: Names,
     search: Search,
     *,
@@ -164,7 +164,7 @@ def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.rando
         theta = found.samples(_N_SAMPLES, rng=rng)
 
 
-def _of_laplace(candidate: Candidate, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
+def _of_laplace(candidate: WeighedFit, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
     """Draw from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
     root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.information)

@@ -15,7 +15,7 @@ from probewise.diagnosis.evidence.screening import log_mean, score_unknown
 from probewise.diagnosis.residuals.covariates import Covariate
 from probewise.diagnosis.residuals.outlying import outlying, score_together
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.weighed import TOO_ALIKE, Candidate, outside
+from probewise.diagnosis.search.weighed_fit import ALIASED_NATS, WeighedFit, out_of_vocabulary
 
 __all__ = ["Unknown"]
 
@@ -34,20 +34,20 @@ class Unknown:
         Along which readings that are far out may lie together.
     noises
         The noise models.
-    coincidence
+    complexity_penalty
         The nats against it beside an SSF worth so many Gaussians.
     """
 
     bases: Bank
     covariates: tuple[Covariate, ...]
     noises: Noises
-    coincidence: Callable[[int], float]
+    complexity_penalty: Callable[[int], float]
     log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
     """Log evidence by (order, mean, noise)."""
     shares: dict[str, float] = field(default_factory=dict)
     """How much of it each family of bases has, beside the null that it explains most beside."""
 
-    def weigh(self, candidates: Iterable[Candidate]) -> None:
+    def weigh(self, candidates: Iterable[WeighedFit]) -> None:
         """Weigh it beside each candidate."""
         best = -np.inf
         for candidate in candidates:
@@ -60,32 +60,32 @@ class Unknown:
                     continue
                 value = evidence.log_z + log_mean(np.array(list(by_family.values())))
                 if not candidate.names:
-                    value -= self.coincidence(candidate.worth)
+                    value -= self.complexity_penalty(candidate.degrees_of_freedom)
                 self.log_z[candidate.n_gaussians, candidate.names, noise] = value
                 if value > best and not candidate.names:
                     best = value
                     total = logsumexp(list(by_family.values()))
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
-    def give_way(self, candidates: Collection[Candidate]) -> None:
+    def prune(self, candidates: Collection[WeighedFit]) -> None:
         """Leave it out by itself where one name explains as much, and leaves nothing for it to explain.
 
         A basis of many columns, what differs from scan to scan say, holds the traces of named effects too.
         """
         alone = max((self._beside(c) for c in candidates if not c.names), default=-np.inf)
-        believed = {c: self._believed(c) for c in candidates if len(c.names) == 1 and not outside(c.names)}
+        believed = {c: self._believed(c) for c in candidates if len(c.names) == 1 and not out_of_vocabulary(c.names)}
         for candidate in sorted(believed, key=lambda c: -believed[c]):
-            if believed[candidate] < alone - TOO_ALIKE:
+            if believed[candidate] < alone - ALIASED_NATS:
                 break
             if self._beside(candidate) == -np.inf:
                 self.weigh([candidate])
-            if self._beside(candidate) - believed[candidate] < TOO_ALIKE:
+            if self._beside(candidate) - believed[candidate] < ALIASED_NATS:
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1]}
                 break
 
-    def _believed(self, candidate: Candidate) -> float:
+    def _believed(self, candidate: WeighedFit) -> float:
         return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
 
-    def _beside(self, candidate: Candidate) -> float:
+    def _beside(self, candidate: WeighedFit) -> float:
         own = candidate.n_gaussians, candidate.names
         return self.noises.over_all({key[2]: value for key, value in self.log_z.items() if key[:2] == own})

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise.diagnosis.evidence.gain import compare_scans, parts_kept_back
+from probewise.diagnosis.evidence.held_out import compare_parts, held_out_parts
 from probewise.recordings import Recording, paper_plan
 
 PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))
 
 
 def test_a_few_scans_are_kept_back_one_by_one():
-    parts, names = parts_kept_back(PAPER)
+    parts, names = held_out_parts(PAPER)
     np.testing.assert_array_equal(parts, PAPER.plan.scan)
     assert names == PAPER.plan.scan_names
 
@@ -29,9 +29,9 @@ def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
             "scan_names": tuple(f"line_{k}" for k in range(16)),
         }
     )
-    parts, names = parts_kept_back(Recording(many, np.zeros(len(many))))
+    parts, names = held_out_parts(Recording(many, np.zeros(len(many))))
     assert len(names) == 2
     assert names[0].endswith("0 degrees")
     np.testing.assert_array_equal(parts, np.round(many.orientation_rad / (np.pi / 2)).astype(int) - int(parts[0] != 0))
-    held = compare_scans(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
+    held = compare_parts(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
     assert dict(held.by_scan) == {names[0]: 1.0, names[1]: -1.0}

@@ -15,17 +15,17 @@ from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.odds import PriorOdds
-from probewise.diagnosis.search.refits import Refits, acts
-from probewise.diagnosis.search.weighed import Candidate, outside
+from probewise.diagnosis.search.refits import Refits, is_significant
+from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import NamedEffect
 
-__all__ = ["Pool", "rivals_of"]
+__all__ = ["SearchState", "rivals_of"]
 
 Names = tuple[str, ...]
 
 
 @dataclass(eq=False)
-class Pool:
+class SearchState:
     """The memory of a search, filled as it goes on.
 
     Parameters
@@ -47,27 +47,27 @@ class Pool:
     noises: Noises
     templates: TemplateMemory
     refits: Refits
-    candidates: dict[tuple[int, Names], Candidate] = field(default_factory=dict)
+    candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)
     """By SSF order."""
     about_null: dict[tuple[Names, Names], float] = field(default_factory=dict)
     """Log evidence of (mean, noise) by screening about a null."""
     about_parts: dict[tuple[Names, Names], float] = field(default_factory=dict)
     """The same about a fit that holds all of the mean but one effect."""
-    not_felt: set[Names] = field(default_factory=set)
+    undetected: set[Names] = field(default_factory=set)
     """Combinations of which a refit has shown that one effect does nothing."""
-    grown: set[tuple[Candidate, str]] = field(default_factory=set)
+    extended: set[tuple[WeighedFit, str]] = field(default_factory=set)
     """What was refitted: from which candidate, with which effect more."""
-    spoken_for: set[Names] = field(default_factory=set)
+    pruned: set[Names] = field(default_factory=set)
     """Combinations without a name that are not to be told from what has one."""
 
     @property
-    def nulls(self) -> list[Candidate]:
+    def nulls(self) -> list[WeighedFit]:
         """List the candidates without effects, one an SSF order."""
         return [c for (_, names), c in self.candidates.items() if not names]
 
     @property
-    def null(self) -> Candidate:
+    def null(self) -> WeighedFit:
         """The best of them."""
         return max(self.nulls, key=lambda c: c.log_z)
 
@@ -76,45 +76,47 @@ class Pool:
         """Combinations that are candidates, at any order."""
         return {names for _, names in self.candidates}
 
-    def of(self, names: Names) -> list[Candidate]:
+    def of(self, names: Names) -> list[WeighedFit]:
         """List the candidates of one combination, one an SSF order."""
         return [c for (_, key), c in self.candidates.items() if key == names]
 
-    def odds(self, candidate: Candidate) -> float:
+    def odds(self, candidate: WeighedFit) -> float:
         """Log evidence of a candidate and log prior odds of its effects."""
         return candidate.log_z + self.prior.log_mean(candidate.names)
 
-    def bank(self, null: Candidate) -> Bank:
+    def bank(self, null: WeighedFit) -> Bank:
         """Lay out the templates of all effects about a null."""
         return self.templates.bank(null.found, list(self.effects.values()))
 
-    def coincidence(self, worth: int, each: float | None = None) -> float:
-        """Give the nats against effects beside an SSF worth so few Gaussians, where the null alone takes more.
+    def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
+        """Give the nats against effects beside an SSF of so few degrees of freedom, where the null alone takes more.
 
         Averaged over the null's orders: what an order wins by chance, by a fraction of a nat, must not count whole.
         """
         nulls = self.nulls
         log_z = np.array([c.log_z for c in nulls])
-        spared = np.array([max(c.worth - worth, 0) for c in nulls])
-        return float(logsumexp(log_z) - logsumexp(log_z - (self.prior.coincidence if each is None else each) * spared))
+        spared = np.array([max(c.degrees_of_freedom - degrees_of_freedom, 0) for c in nulls])
+        return float(
+            logsumexp(log_z) - logsumexp(log_z - (self.prior.complexity_penalty if each is None else each) * spared)
+        )
 
-    def keep(self, candidate: Candidate) -> Candidate:
+    def keep(self, candidate: WeighedFit) -> WeighedFit:
         """Take a candidate in, in the place of the one it had."""
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
-    def refit(self, parent: Candidate, added: str) -> Candidate | None:
+    def refit(self, parent: WeighedFit, added: str) -> WeighedFit | None:
         """Refit a candidate with one more effect and keep the best of its kind, or note that the effect is not felt.
 
         Returns
         -------
         The best candidate of that kind, an earlier one perhaps; None where there is none.
         """
-        against = 0.0 if parent.names else self.coincidence(parent.worth)
+        against = 0.0 if parent.names else self.complexity_penalty(parent.degrees_of_freedom)
         candidate, scores = self.refits.extended(parent, self.effects[added], against)
-        self.grown.add((parent, added))
+        self.extended.add((parent, added))
         known = self.candidates.get((candidate.n_gaussians, candidate.names), candidate)
-        if acts(candidate, parent):
+        if is_significant(candidate, parent):
             return self.keep(max(known, candidate, key=lambda c: c.log_z))
         if known is not candidate:
             return known
@@ -123,7 +125,7 @@ class Pool:
         names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():
             self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
-        self.not_felt.add(names)
+        self.undetected.add(names)
         return None
 
     def reach(self, names: Names) -> None:
@@ -131,14 +133,14 @@ class Pool:
         parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
         held = max(parts, key=lambda c: (len(c.names), c.log_z))
         for added in [n for n in names if n not in held.names]:
-            grown = self.refit(held, added)
-            if grown is None:
-                self.not_felt.add(names)
+            extended = self.refit(held, added)
+            if extended is None:
+                self.undetected.add(names)
                 for noise, evidence in held.evidence.items():
                     known = self.about_parts.get((names, noise), np.inf)
                     self.about_parts[names, noise] = min(known, evidence.log_z)
                 break
-            held = grown
+            held = extended
 
     def screened(self) -> dict[tuple[Names, Names], float]:
         """Give the log evidence of what was not refitted, by screening.
@@ -156,9 +158,9 @@ class Pool:
             ]
             out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
         out |= self.about_parts
-        return {key: value for key, value in out.items() if key[0] not in refitted | self.spoken_for}
+        return {key: value for key, value in out.items() if key[0] not in refitted | self.pruned}
 
 
-def rivals_of(names: Names, among: Iterable[Candidate]) -> list[Candidate]:
+def rivals_of(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
     """List those that a combination competes with: what has no name does not keep names from being tried."""
-    return [c for c in among if outside(names) or not outside(c.names)]
+    return [c for c in among if out_of_vocabulary(names) or not out_of_vocabulary(c.names)]

@@ -1,4 +1,4 @@
-"""How combinations grow: recordings that were named wrong while the right name never had a fair fit."""
+"""How combinations select_forward: recordings that were named wrong while the right name never had a fair fit."""
 
 from __future__ import annotations
 

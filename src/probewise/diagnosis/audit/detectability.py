@@ -22,7 +22,16 @@ from probewise.effects import Extent, NamedEffect
 from probewise.recordings.plan import Plan
 from probewise.sensor import Stage
 
-__all__ = ["ALIAS", "LAMBDA", "LEAST_NATS", "LEAST_SHARE", "Expected", "LaidOut", "Survivors", "nats_between"]
+__all__ = [
+    "ALIAS",
+    "LAMBDA",
+    "LEAST_NATS",
+    "LEAST_SHARE",
+    "Expected",
+    "PlanTemplates",
+    "ProjectedTemplates",
+    "nats_between",
+]
 
 LAMBDA = 8.0  # size of an effect at which a plan is judged
 LEAST_NATS = 3.0  # least that tells two effects apart
@@ -47,7 +56,7 @@ class Expected:
 
 
 @dataclass(frozen=True, eq=False)
-class LaidOut:
+class PlanTemplates:
     """The templates of one plan, in units of the noise sd.
 
     `columns` (n_points, n_columns) come in entries, the settings of an effect's bank; `entry` (n_columns,)
@@ -110,14 +119,14 @@ class LaidOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Survivors:
+class ProjectedTemplates:
     """What survives of every entry's columns on some rows, in noise sds: `left` (n_rows, n_columns).
 
     `basis` holds each entry's columns made orthonormal; `raw` and `kept` (n_entries,) are the entries'
     norms before and after.
     """
 
-    laid: LaidOut
+    laid: PlanTemplates
     left: FloatArray
     basis: FloatArray
     raw: FloatArray
@@ -125,7 +134,7 @@ class Survivors:
     n_points: int
 
     @classmethod
-    def of(cls, laid: LaidOut, rows: IntArray) -> Self:
+    def of(cls, laid: PlanTemplates, rows: IntArray) -> Self:
         """Project the sensor's parameters, with their prior, out of the templates of these rows."""
         slopes, columns = laid.slopes[rows], laid.columns[rows]
         n_points, n_params = slopes.shape
@@ -134,7 +143,7 @@ class Survivors:
         left[:n_points] += columns
         return cls(laid, left, _orthonormal(left, laid.entry), laid.norms(columns), laid.norms(left), n_points)
 
-    def sights(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
+    def detectability(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
         """Give the surviving share of each effect that is asked about, and its cosine to every visible other one.
 
         Both are medians over the effect's settings: what is true of a typical one. The cosine is to the

@@ -24,7 +24,7 @@ from probewise.diagnosis.advice.commands import (
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["layings"]
+__all__ = ["target_swaps"]
 
 _FLAT_ROWS = 20  # readings of a plain surface
 _FOOTPRINT = 1 / 14  # of a scan's length, as wide as is believed before any reading
@@ -34,7 +34,7 @@ _STRIPES = (5, 10)  # how many go into a scan
 _STRIDE = 4
 
 
-def layings(plan: Plan) -> list[Command]:
+def target_swaps(plan: Plan) -> list[Command]:
     """List scans over plain surfaces, along the other axis, and over an edge of the plan laid otherwise.
 
     All begin as the plan's first scan that moves does, or as its first over a `HalfPlane`, the sensor as it was there.

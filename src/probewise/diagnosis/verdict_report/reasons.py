@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.residuals.outlying import FAR_OUT
-from probewise.diagnosis.search.weighed import Search
-from probewise.diagnosis.statement.verdict import EffectFound, Hypothesis, Verdict
-from probewise.diagnosis.statement.words import p_in_words
+from probewise.diagnosis.search.weighed_fit import Search
+from probewise.diagnosis.verdict_report.verdict import EffectFound, Hypothesis, Verdict
+from probewise.diagnosis.verdict_report.words import p_in_words
 
 __all__ = ["reason_of"]
 

@@ -17,7 +17,7 @@ from probewise.diagnosis.repair.mending import Improvement
 from probewise.diagnosis.repair.repaired import ModelSamples
 from probewise.diagnosis.residuals.locate import Place
 from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.statement.words import p_in_words
+from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Recording
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fitting.fit import Fit, degrees_of_freedom, fit
+from probewise.diagnosis.fitting.fit import Fit, fit, residual_degrees_of_freedom
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["HeldOut", "blocks_kept_back", "compare_scans", "held_out_gain", "parts_kept_back"]
+__all__ = ["HeldOut", "compare_parts", "held_out_blocks", "held_out_gain", "held_out_parts"]
 
 _LEAST_ROWS = 8
 _MOST_SCANS = 10
@@ -37,10 +37,10 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw)
     """Refit both models without one scan at a time and compare how they predict it, reading by reading.
 
     Each reading counts by itself, as the law of the noise has it. Scans of fewer than eight readings stay
-    in; of more than ten longer ones see `parts_kept_back`.
+    in; of more than ten longer ones see `held_out_parts`.
     """
     plan, usable = recording.plan, recording.usable
-    parts, names = parts_kept_back(recording)
+    parts, names = held_out_parts(recording)
 
     def gain(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
@@ -48,10 +48,10 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw)
         repaired_one, null_one = (_log_density(f, recording, rows, law, out) for f in (repaired, null))
         return repaired_one - null_one
 
-    return compare_scans(parts, gain, names)
+    return compare_parts(parts, gain, names)
 
 
-def parts_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
+def held_out_parts(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
     """Divide usable readings into the parts that are kept back in turn: their numbers (n_usable,), and their names.
 
     Its scans; where more than ten are long enough, all those over one pattern in one orientation together, if there are
@@ -69,7 +69,7 @@ def parts_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
     return scan, plan.scan_names
 
 
-def blocks_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
+def held_out_blocks(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
     """Divide usable readings into blocks of eight that follow each other, every fifth of which is kept back together.
 
     What is local in time tells nothing of another scan; of readings between those that are known it does, and a block
@@ -79,7 +79,7 @@ def blocks_kept_back(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
     return block % _BLOCKS, tuple(f"every fifth block of {_LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
-def compare_scans(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
+def compare_parts(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
     """Keep one scan back at a time and gather the gains of its readings.
 
     Parameters
@@ -117,7 +117,7 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     asked = np.flatnonzero(rows & recording.usable)
     predicted, slopes = (part[asked] for part in found.model.jacobian(without.z))
     turned = rest(without.slopes)
-    free = degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
+    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
     sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_points / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.search.pruning import prune
 from probewise.diagnosis.search.unknown import Unknown
-from probewise.diagnosis.search.unnamed import give_way
 
 N = 50
 NAME, PUSH = ("sensor_tilt",), ("arm_knock",)
@@ -51,21 +51,21 @@ def by_key(*candidates):
 
 @pytest.mark.parametrize(("ahead", "believed"), [(-1.0, -1.0), (2.0, 0.0), (4.0, 4.0)])
 def test_what_is_ahead_of_a_name_by_less_than_the_readings_tell_is_believed_no_more(ahead, believed):
-    stay, spoken_for = give_way(by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES)
+    stay, pruned = prune(by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES)
     assert stay[1, PUSH].log_z == pytest.approx(believed)
     assert stay[1, NAME].log_z == 0.0
-    assert spoken_for == set()
+    assert pruned == set()
 
 
 def test_what_predicts_the_same_as_a_name_is_left_out():
     """Half of the squared distance is 50 * 0.3^2 / 2, less than three nats."""
-    stay, spoken_for = give_way(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
-    assert spoken_for == {PUSH}
+    stay, pruned = prune(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
+    assert pruned == {PUSH}
     assert (1, PUSH) not in stay
 
 
 def test_two_names_do_not_speak_for_one_effect_without():
-    stay, _ = give_way(by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES)
+    stay, _ = prune(by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES)
     assert stay[1, PUSH].log_z == 2.0
 
 
@@ -76,6 +76,6 @@ def test_two_names_do_not_speak_for_one_effect_without():
 )
 def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
     unknown = Unknown(None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
-    unknown.give_way([Held((), -50.0), Held(NAME, name)])
+    unknown.prune([Held((), -50.0), Held(NAME, name)])
     assert ((1, (), ()) not in unknown.log_z) == speaks
     assert (1, NAME, ()) in unknown.log_z

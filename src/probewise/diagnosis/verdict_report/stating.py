@@ -12,9 +12,9 @@ from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.fit import fit
 from probewise.diagnosis.noise.law import noise_statistics, steps_within_scans
 from probewise.diagnosis.repair.repaired import N_SAMPLES, ModelSamples, sample_model
-from probewise.diagnosis.search.weighed import Candidate, Search, in_vocabulary
-from probewise.diagnosis.statement.verdict import EffectFound, Hypothesis, NoiseFound, ParameterFound
-from probewise.diagnosis.statement.words import unit_in_words
+from probewise.diagnosis.search.weighed_fit import Search, WeighedFit, in_vocabulary
+from probewise.diagnosis.verdict_report.verdict import EffectFound, Hypothesis, NoiseFound, ParameterFound
+from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import NUISANCES, UNNAMED, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -30,7 +30,7 @@ _N_DRAWS = 999
 def effects_found(
     search: Search,
     hypotheses: tuple[Hypothesis, ...],
-    best: Candidate,
+    best: WeighedFit,
     samples: ModelSamples,
     noise_of: Names,
     *,
@@ -78,7 +78,7 @@ def effects_found(
     return tuple(sorted(out, key=lambda e: -e.probability))
 
 
-def _holder(search: Search, name: str) -> tuple[Candidate | None, Names]:
+def _holder(search: Search, name: str) -> tuple[WeighedFit | None, Names]:
     """Find the most probable refitted candidate that holds an effect."""
     ranked = sorted(search.probabilities.items(), key=lambda item: -item[1])
     for (mean, noise), p in ranked:
@@ -119,12 +119,12 @@ def _too_small(
     return effect, values, float(np.linalg.norm(projected @ amount))
 
 
-def _size(search: Search, holder: Candidate, name: str, noise: Names) -> float:
+def _size(search: Search, holder: WeighedFit, name: str, noise: Names) -> float:
     """Measure lambda: what is left on noise-free readings after a full refit without the effect."""
     law = holder.evidence[noise].law
     found = holder.found
     if name in search.certain:
-        step = holder.evidence[noise].laid_out.settings[0, holder.evidence[noise].noise.columns_of(name)]
+        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of(name)]
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
     if search.effects[name].stage is Stage.NOISE:
         # On the noise: the evidence for it, as the effect of that many sd on the mean would leave.
@@ -141,7 +141,13 @@ def _size(search: Search, holder: Candidate, name: str, noise: Names) -> float:
 
 
 def noise_found(
-    search: Search, best: Candidate, noise: Names, after: Linearised, samples: ModelSamples, *, rng: np.random.Generator
+    search: Search,
+    best: WeighedFit,
+    noise: Names,
+    after: Linearised,
+    samples: ModelSamples,
+    *,
+    rng: np.random.Generator,
 ) -> NoiseFound:
     """Test the repaired model's residual for memory, heavy tails and a spread that follows the level."""
     steps = steps_within_scans(search.recording)

@@ -24,19 +24,28 @@ from probewise.effects import NUISANCES, UNNAMED, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["STEERING", "TOO_ALIKE", "Candidate", "Search", "in_vocabulary", "nats_apart", "outside", "weighed"]
+__all__ = [
+    "ALIASED_NATS",
+    "STEERING",
+    "Search",
+    "WeighedFit",
+    "expected_nats",
+    "in_vocabulary",
+    "out_of_vocabulary",
+    "weighed",
+]
 
 Names = tuple[str, ...]
 
 STEERING = 3.0
 """Nats behind the best: a noise model further back does not say what to look for next."""
 
-TOO_ALIKE = 3.0
+ALIASED_NATS = 3.0
 """Nats that readings are expected to tell between two hypotheses; with fewer they cannot tell."""
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class WeighedFit:
     """A combination of effects on the mean at one SSF order, refitted and weighed under each noise model."""
 
     found: Fit
@@ -52,7 +61,7 @@ class Candidate:
         return tuple(sorted(self.found.model.names))
 
     @classmethod
-    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_visible: float) -> Candidate:
+    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_visible: float) -> WeighedFit:
         """Take a fit with the evidence of its parameters, as if nothing else had been chosen."""
         return cls(found, law, {}, 0.0, log_visible, {}).with_evidence(plain)
 
@@ -61,15 +70,15 @@ class Candidate:
         """Log of what the evidence of its parameters alone is multiplied by."""
         return self.log_share + self.log_visible
 
-    def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> Candidate:
+    def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
         """Take the evidence of its parameters under each noise model."""
         return replace(self, evidence=plain).moved(self.log_factor)
 
-    def as_share(self, log_share: float, weights: Mapping[str, FloatArray]) -> Candidate:
+    def as_share(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
         """Let it stand for all the variants of its effects."""
         return replace(self.moved(log_share - self.log_share), log_share=log_share, weights=weights)
 
-    def moved(self, by: float) -> Candidate:
+    def moved(self, by: float) -> WeighedFit:
         """Move its log evidence under every noise model alike."""
         return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
 
@@ -84,9 +93,9 @@ class Candidate:
         return self.found.sd * self.law.widening
 
     @property
-    def worth(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """How many Gaussians its SSF is as free as."""
-        return self.found.model.sensor.worth
+        return self.found.model.sensor.degrees_of_freedom
 
     @property
     def log_z(self) -> float:
@@ -114,7 +123,7 @@ class Search:
     noise_models: Mapping[Names, NoiseModel]
     certain: Names  # effects on the noise that the readings show without doubt
     sensors: Mapping[int, Null]
-    candidates: Mapping[tuple[int, Names], Candidate]
+    candidates: Mapping[tuple[int, Names], WeighedFit]
     screened: Mapping[tuple[Names, Names], float]  # (mean, noise) -> log evidence
     unknown: Mapping[tuple[int, Names, Names], float]  # (order, mean, noise) -> log evidence
     prior: PriorOdds
@@ -126,7 +135,7 @@ class Search:
     probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
     order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
 
-    def best(self, names: Names, noise: Names) -> Candidate | None:
+    def best(self, names: Names, noise: Names) -> WeighedFit | None:
         """Return the refitted candidate of these effects with the most evidence over orders."""
         options = [c for (_, key), c in self.candidates.items() if key == names]
         return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
@@ -137,7 +146,7 @@ class Search:
             key
             for (n, key), other in self.candidates.items()
             if names and key and key != names and (n, names) in self.candidates
-            if nats_apart(self.candidates[n, names], other) < TOO_ALIKE
+            if expected_nats(self.candidates[n, names], other) < ALIASED_NATS
         )
 
     @property
@@ -148,7 +157,7 @@ class Search:
             out[mean] = out.get(mean, 0.0) + p
         return out
 
-    def beside(self, noise: Names) -> Candidate | None:
+    def beside(self, noise: Names) -> WeighedFit | None:
         """Give the fit beside which something unknown most probably is; None where nothing unknown was weighed."""
         scores = {
             (n, names): value + self.prior.log_unknown(names)
@@ -179,7 +188,7 @@ class Search:
         return max(by_order, key=lambda n: by_order[n])
 
 
-def nats_apart(first: Candidate, second: Candidate) -> float:
+def expected_nats(first: WeighedFit, second: WeighedFit) -> float:
     """Log Bayes factor to be expected between two refitted models if the first is true.
 
     Half of the squared distance between their predictions, in sds of the noise as the first has it.
@@ -193,7 +202,7 @@ def in_vocabulary(noise: Names) -> Names:
     return tuple(name for name in noise if name not in NUISANCES)
 
 
-def outside(mean: Names) -> Names:
+def out_of_vocabulary(mean: Names) -> Names:
     """Keep those of a combination on the mean that have a formula and no name in the vocabulary."""
     return tuple(name for name in mean if name in UNNAMED)
 

@@ -7,7 +7,7 @@ from importlib.resources import files
 from typing import Any
 
 from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.statement.verdict import Diagnosis, ParameterFound
+from probewise.diagnosis.verdict_report.verdict import Diagnosis, ParameterFound
 
 __all__ = ["NEXT_PLAN", "diagnosis_json", "diagnosis_schema"]
 
@@ -16,7 +16,7 @@ NEXT_PLAN = "next_plan.csv"
 
 def diagnosis_schema() -> dict[str, Any]:
     """Return the JSON schema of diagnosis.json, format "diagnosis/1"."""
-    text = files("probewise.diagnosis.statement").joinpath("diagnosis.schema.json").read_text(encoding="utf-8")
+    text = files("probewise.diagnosis.verdict_report").joinpath("diagnosis.schema.json").read_text(encoding="utf-8")
     schema: dict[str, Any] = json.loads(text)
     return schema
 

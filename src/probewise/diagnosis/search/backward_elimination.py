@@ -1,0 +1,44 @@
+"""Take leading combinations apart, and select_forward them again from what is left."""
+
+from __future__ import annotations
+
+from probewise.diagnosis.search.forward_selection import promising, proposals_for
+from probewise.diagnosis.search.state import SearchState
+from probewise.diagnosis.search.weighed_fit import STEERING, WeighedFit, out_of_vocabulary
+
+__all__ = ["eliminate_backward"]
+
+Names = tuple[str, ...]
+
+_TAKEN_APART = 3  # leading combinations, of which each effect is left out in turn
+_SWAPPED = 2  # that lead beside what is left, what was left out or another
+
+
+def eliminate_backward(state: SearchState) -> None:
+    """Refit the leading combinations less one effect, and select_forward them again from there.
+
+    What screening put first may be superfluous, or have stood for another effect while there was but one. And the
+    scans that an effect is bound to, or the place it is at, were chosen while it stood for both.
+    """
+    several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.odds(c))
+    named, rest = (
+        [c for c in several if not out_of_vocabulary(c.names)],
+        [c for c in several if out_of_vocabulary(c.names)],
+    )
+    for candidate in [*named[:_TAKEN_APART], *rest[:1]]:
+        for left_out in candidate.names:
+            others = tuple(name for name in candidate.names if name != left_out)
+            if others not in state.refitted | state.undetected:
+                state.reach(others)
+            held = state.of(others)
+            if held:
+                _select_again(state, max(held, key=lambda c: c.log_z), candidate.names)
+
+
+def _select_again(state: SearchState, held: WeighedFit, names: Names) -> None:
+    """Refit a candidate with what makes it these names, and with what leads beside it."""
+    proposals = proposals_for(state, held, {})
+    chosen = [names, *promising(state, proposals, width=_SWAPPED, behind=STEERING)[:_SWAPPED]]
+    for added in [proposals[key].added for key in chosen if key in proposals]:
+        if (held, added) not in state.extended:
+            state.refit(held, added)

@@ -1,0 +1,145 @@
+"""Grow combinations of effects: screen what could be added to a fit, refit the best of each size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs
+from probewise.diagnosis.search.state import SearchState, rivals_of
+from probewise.diagnosis.search.weighed_fit import STEERING, WeighedFit, out_of_vocabulary
+from probewise.effects import EFFECTS
+
+__all__ = ["EXTENDED_WITHIN", "REFITTED_WITHIN", "Proposal", "promising", "proposals_for", "select_forward"]
+
+Names = tuple[str, ...]
+
+EXTENDED_WITHIN = 20.0
+"""Nats behind the best of its size: nothing more grows from there."""
+
+REFITTED_WITHIN = 6.0
+"""Nats behind the best so far: screening about a fit that one effect has bent is so far off."""
+
+# An effect may look like another Gaussian, and be explained better by its name at fewer of them.
+_ORDERS_WITHIN = 100.0  # nats behind the best: an SSF order so far back is not searched
+_WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
+_PAIRED = 12  # effects that pairs are screened of, the best alone
+_SINGLES = 6  # effects that are refitted alone
+_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
+_FAINT = 0.35  # of a trace; where a null leaves no more to first order, a large effect may show in another way
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A refit that screening promises `score` of, in log evidence: of a candidate, with one more effect."""
+
+    score: float
+    parent: WeighedFit
+    added: str
+
+
+def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
+    """Refit the best combinations of each size, each extended from the best of the size before."""
+    null = state.null
+    if depth > 1:
+        _screen_pairs(state, null)
+    extended = [
+        c
+        for c in state.nulls
+        if c.log_z > null.log_z - (_ORDERS_WITHIN if c.degrees_of_freedom <= null.degrees_of_freedom else STEERING)
+    ]
+    for size in range(1, min(depth, len(state.effects)) + 1):
+        proposals: dict[Names, Proposal] = {}
+        for parent in extended:
+            proposals = proposals_for(state, parent, proposals)
+        if size == 2:
+            proposals = _together(state, proposals)
+        chosen = (
+            promising(state, proposals, width=beam, behind=STEERING) if size > 1 else _alone(state, null, proposals)
+        )
+        refitted = [state.refit(proposals[names].parent, proposals[names].added) for names in chosen]
+        extended = [c for c in refitted if c is not None]
+        if not extended:
+            break
+        extended = [
+            c for c in extended if c.log_z > max(r.log_z for r in rivals_of(c.names, extended)) - EXTENDED_WITHIN
+        ]
+
+
+def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
+    """Weigh all pairs about a null by templates, under the noise models that steer."""
+    for noise, evidence in null.steering():
+        problem = Linearised.of(null.found, evidence.law)
+        singles = score_effects(problem, state.bank(null))
+        ranked = sorted(singles, key=lambda name: -float(singles[name].max()))[:_PAIRED]
+        if not ranked or log_mean(singles[ranked[0]]) < _WORTH_PAIRING:
+            continue
+        singles = {name: singles[name] for name in ranked}
+        templates = {name: state.templates.of(null.found, state.effects[name]) for name in ranked}
+        for pair, value in score_pairs(problem, templates, singles).items():
+            state.about_null[pair, noise] = evidence.log_z + value
+
+
+def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
+    """Screen every effect that a fit does not hold yet, by its templates about the null of the same SSF.
+
+    Returns
+    -------
+    The best of these proposals and those already had, by the combination that would come of them.
+    """
+    bank = state.bank(state.candidates[parent.n_gaussians, ()])
+    against = 0.0 if parent.names else state.complexity_penalty(parent.degrees_of_freedom)
+    known = state.about_parts if parent.names else state.about_null
+    out = dict(proposals)
+    for noise, evidence in parent.steering():
+        for name, own in score_effects(Linearised.of(parent.found, evidence.law), bank).items():
+            if name in parent.names:
+                continue
+            names = tuple(sorted((*parent.names, name)))
+            score = evidence.log_z + log_mean(own) - against
+            if names not in state.undetected:  # a refit has said more
+                known[names, noise] = max(score, known.get((names, noise), score))
+            if names not in out or score > out[names].score:
+                out[names] = Proposal(score, parent, name)
+    return out
+
+
+def promising(state: SearchState, proposals: Mapping[Names, Proposal], *, width: int, behind: float) -> list[Names]:
+    """Choose the combinations of the best odds by screening, up to `width` of names alone.
+
+    One that screening puts `behind` nats behind what it competes with is seldom worth its cost.
+    """
+    odds = {names: proposal.score + state.prior.log_mean(names) for names, proposal in proposals.items()}
+    ranked = sorted(odds, key=lambda names: -odds[names])
+    named, rest = [n for n in ranked if not out_of_vocabulary(n)], [n for n in ranked if out_of_vocabulary(n)]
+    return [
+        names
+        for names in [*named[:width], *rest[:_OUT_OF_VOCABULARY]]
+        if odds[names] >= max(state.odds(c) for c in rivals_of(names, state.candidates.values())) - behind
+    ]
+
+
+def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
+    """Choose the effects that are refitted alone: the leader, what is not far behind, and what screening cannot judge.
+
+    A user's own effect was named to be tried, however far it leads from where screening is linear; and screening says
+    nothing of what the null takes up all but a little of to first order.
+    """
+    ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
+    left = state.bank(null).surviving(Linearised.of(null.found, null.law))
+    faint = {name for name, members in state.bank(null).members.items() if left[members].max() < _FAINT}
+    always = (state.effects.keys() - EFFECTS) | faint
+    chosen = promising(state, proposals, width=_SINGLES, behind=REFITTED_WITHIN)
+    return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
+
+
+def _together(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
+    """Let pairs promise what they do about the null, where neither effect leads alone."""
+    best: dict[Names, float] = {}
+    for (names, _), value in state.about_null.items():
+        best[names] = max(value, best.get(names, value))
+    return {
+        names: replace(proposal, score=best[names]) if best.get(names, proposal.score) > proposal.score else proposal
+        for names, proposal in proposals.items()
+    }

@@ -31,9 +31,9 @@ fig.tight_layout()
 # Residuals against the predicted reading, before and after the repair.
 fig, ax = plt.subplots(figsize=(8, 4))
 plots.residuals_against(
-    diagnosis.predicted_before,
-    diagnosis.residuals_before,
-    diagnosis.residuals_after,
+    diagnosis.repair.before.readings,
+    diagnosis.repair.before.residuals,
+    diagnosis.repair.after.residuals,
     label="predicted reading (LEGO units)",
     unit="LEGO",
     ax=ax,

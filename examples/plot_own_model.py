@@ -174,11 +174,11 @@ print(diagnosis.summary())
 fig, (above, below) = plt.subplots(2, 1, figsize=(8, 6), sharex=True)
 time_s = recording.plan.time_s
 above.plot(time_s, recording.readings, "k.", markersize=2, label="recorded")
-above.plot(time_s, diagnosis.predicted_before, color="tab:red", label="two tanks")
-above.plot(time_s, diagnosis.predicted_after, color="tab:blue", label="repaired")
+above.plot(time_s, diagnosis.repair.before.readings, color="tab:red", label="two tanks")
+above.plot(time_s, diagnosis.repair.after.readings, color="tab:blue", label="repaired")
 above.set_ylabel("level of the lower tank (V)")
 above.legend(frameon=False)
 plots.residuals_against(
-    time_s, diagnosis.residuals_before, diagnosis.residuals_after, label="time (s)", unit="V", ax=below
+    time_s, diagnosis.repair.before.residuals, diagnosis.repair.after.residuals, label="time (s)", unit="V", ax=below
 )
 fig.tight_layout()

@@ -68,7 +68,7 @@ def test_a_recording_without_effects_is_clean():
     assert found.p_value > 0.01
     assert found.repaired.theta.shape == (500, 8)
     assert document["next_measurement"]["readings"] >= 1
-    assert found.noise.parameters[0].interval95[0] < NOISE_SD < found.noise.parameters[0].interval95[1]
+    assert found.report.noise.parameters[0].interval95[0] < NOISE_SD < found.report.noise.parameters[0].interval95[1]
 
 
 @pytest.mark.parametrize(
@@ -83,9 +83,9 @@ def test_a_recording_without_effects_is_clean():
 def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value, n_asked):
     """One to three Gaussians and a free form are fitted, then fine structure; the next is asked on an alarm."""
     left = list(seen)
-    monkeypatch.setattr("probewise.diagnosis.engine.global_p_value", lambda *_: left.pop(0))
+    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.global_p_value", lambda *_: left.pop(0))
     found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
-    assert sorted(found.order_probabilities) == [1, 2, 3, N_FREE_FORM]
+    assert sorted(found.judged.order_probabilities) == [1, 2, 3, N_FREE_FORM]
     assert found.p_value == p_value
     assert len(seen) - len(left) == n_asked
 
@@ -95,7 +95,7 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     found = diagnose(recording("two_way", hidden.GainDrift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"  # a battery that tires as the lamp does
     assert found.combination in (("gain_drift",), ("battery_sag",))
-    assert found.unknown_probability < 0.05
+    assert found.judged.unknown_probability < 0.05
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -103,7 +103,7 @@ def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
     """What differs between ways to come holds hysteresis and more; were it not spoken for, a tenth would be unknown."""
     found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=seed), rng=np.random.default_rng(0))
     assert found.combination == ("hysteresis",)
-    assert found.unknown_probability < 0.03
+    assert found.judged.unknown_probability < 0.03
 
 
 def test_backlash_is_named_measured_located_and_repaired():
@@ -123,14 +123,14 @@ def test_backlash_is_named_measured_located_and_repaired():
     assert gain.rms_after < gain.rms_before
     assert gain.p_value_after > 0.01
     assert found.effects[0].size_lambda > 5
-    np.testing.assert_allclose(found.predicted_after + found.residuals_after, found.recording.readings)
+    np.testing.assert_allclose(found.repair.after.readings + found.repair.after.residuals, found.recording.readings)
     sensor = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
     assert sensor.effects == ("backlash",)
     assert sensor.names[-1] == "backlash.width_mm"
 
 
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
-    monkeypatch.setattr("probewise.diagnosis.engine.global_p_value", lambda *_: 0.2)
+    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.global_p_value", lambda *_: 0.2)
     found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("cannot_tell", ())
     assert found.hypotheses[0].effects == ("hysteresis",)
@@ -143,7 +143,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
     plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)
     answers = [found_out, plain]
-    monkeypatch.setattr("probewise.diagnosis.engine.improvement_of", lambda *_, **__: answers.pop(0))
+    monkeypatch.setattr("probewise.diagnosis.repair.best.improvement_of", lambda *_, **__: answers.pop(0))
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
@@ -158,7 +158,7 @@ def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     strict(found)
     assert found.verdict == "cannot_tell"
     assert found.p_value < 1e-6
-    cosines = {alias.effects: alias.cosine for alias in found.aliases}
+    cosines = {alias.effects: alias.cosine for alias in found.judged.aliases}
     assert cosines["backlash", "edge_misplacement"] > 0.99
     assert cosines["edge_misplacement", "sensor_tilt"] > 0.99
     # The repaired sensor holds what is left open, each in its share: no prediction is surer than the verdict.
@@ -240,7 +240,7 @@ def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
     assert found.improvement.rms_after < found.improvement.rms_before
     assert found.improvement.heldout_log_density_per_reading > 0
     assert (found.where[0].covariate, found.where[0].scan) == ("scan", "edge_90_out")
-    assert found.corrected
+    assert found.repair.by_rows
     assert "sensor.json does not carry it" in found.summary()
 
 
@@ -332,7 +332,7 @@ def test_what_has_a_name_of_our_own_is_unknown_and_its_repair_predicts():
     assert found.verdict == "unknown"
     assert found.combination == ("unknown",)
     assert document["unknown_candidates"][0]["name"] == "arm_knock"
-    assert not found.corrected
+    assert not found.repair.by_rows
     assert found.repaired.effects == ("arm_knock",)
     assert found.improvement.rms_after < 1.1 * NOISE_SD
     assert found.improvement.p_value_after > 0.001
@@ -387,7 +387,7 @@ def asked_about(monkeypatch, of: Recording) -> tuple[list, float, Diagnosis]:
     """Diagnose, and tell which rivals the next readings were to part, and in what noise."""
     seen: list = []
 
-    def next_scans(rivals, sd, plan):
+    def next_scans(rivals, sd, plan, apparatus):
         seen.append((list(rivals), sd))
 
     monkeypatch.setattr("probewise.diagnosis.advice.rivals.next_scans", next_scans)
@@ -404,7 +404,7 @@ def test_all_that_is_likely_is_a_rival_in_the_noise_of_the_first(monkeypatch):
     likely = [h for h in found.hypotheses if h.probability >= 0.011 and h.effects != ("unknown",)]
     assert len(rivals) >= min(len(likely), 5)
     assert sd == pytest.approx(NOISE_SD, rel=0.1)
-    assert np.std(found.residuals_before) > 1.2 * NOISE_SD
+    assert np.std(found.repair.before.residuals) > 1.2 * NOISE_SD
 
 
 def test_where_nothing_is_found_a_rival_is_imagined_that_would_have_been_seen_here(monkeypatch):

@@ -31,11 +31,12 @@ from probewise.diagnosis.fitting.earlier import sensor_from_posterior
 from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.joining import join
+from probewise.diagnosis.judgement.judged import Hypothesis, credible_set, decide
+from probewise.diagnosis.light_sensor.covariates import covariate_of
 from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_within_scans, white
 from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places, places_of_effect, windows
-from probewise.diagnosis.verdict_report.verdict import Hypothesis, credible_set, decide
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
@@ -59,6 +60,12 @@ def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
         instrumentation=Instrumentation(unit=unit),
     )
     return Recording(plan, np.linspace(1.0, 2.0, n * scans), source=f"{unit}.csv")
+
+
+def placed(effect, change, without, plan, covariates):
+    shows_in = covariate_of(effect, change, without, plan, covariates)
+    scans = next((c for c in covariates if c.name == "scan"), None)
+    return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0, sd=0.5)
 
 
 @pytest.mark.parametrize("n_gaussians", [1, 2, 3])
@@ -328,7 +335,7 @@ def test_an_effect_is_where_it_has_half_its_strength():
     change[101:] *= 0.9
     glint = VOCABULARY["glint"].for_extent(EXTENT)
     across = Covariate("place", both[1][101:], np.arange(101, 202))
-    (found,) = places_of_effect(glint, change, change, plan, [across], change, p_value=0.001, size=8.0, sd=0.5)
+    (found,) = placed(glint, change, 0 * change, plan, [across])
     half = 8 * math.sqrt(2 * math.log(2))
     assert (found.covariate, found.scan) == ("place", None)
     assert found.start == pytest.approx(10 - half, abs=1)
@@ -342,9 +349,7 @@ def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
     level = Covariate("level", np.minimum(without, 52.0), np.arange(101))
     effect = VOCABULARY["saturation"].for_extent(EXTENT)
     plan = line(101, scans=1).plan
-    (found,) = places_of_effect(
-        effect, change, without + change, plan, [level], change, p_value=0.001, size=8.0, sd=0.5
-    )
+    (found,) = placed(effect, change, without, plan, [level])
     assert found.covariate == "level"
     assert found.start == pytest.approx(50.5, abs=0.6)
     assert found.end == pytest.approx(60.0, abs=1e-9)
@@ -354,7 +359,7 @@ def test_an_effect_of_one_scan_is_in_that_scan():
     scan = Covariate("scan", np.repeat([0.0, 1.0], 6), np.arange(12), groups=True)
     effect = replace(VOCABULARY["scan_misplacement"].for_extent(EXTENT), scans=("s1",))
     one = np.repeat([0.0, 1.0], 6)
-    (found,) = places_of_effect(effect, one, one, line(6).plan, [scan], one, p_value=0.001, size=8.0, sd=0.5)
+    (found,) = placed(effect, one, 0 * one, line(6).plan, [scan])
     assert (found.covariate, found.scan, found.start) == ("scan", "s1", None)
 
 
@@ -364,7 +369,7 @@ def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_fi
     scan = Covariate("scan", np.repeat([0.0, 1.0, 2.0], 6), np.arange(18), groups=True)
     effect = replace(VOCABULARY["scan_angle_error"].for_extent(EXTENT), scans=plan.scan_names)
     change = np.repeat([0.5, 0.001, -2.0], 6)
-    found = places_of_effect(effect, change, change, plan, [scan], change, p_value=0.001, size=8.0, sd=0.5)
+    found = placed(effect, change, 0 * change, plan, [scan])
     assert [place.scan for place in found] == ["s2", "s0"]
 
 

@@ -139,7 +139,7 @@ def _said(diagnosis: Diagnosis) -> dict[str, Any]:
         "hypotheses": [
             [list(h.effects), h.probability] for h in diagnosis.hypotheses if h.probability > _LEAST_PROBABILITY
         ],
-        "credible_set": list(diagnosis.credible),
+        "credible_set": list(diagnosis.judged.credible),
     }
 
 

@@ -6,7 +6,6 @@ the gain is shown on readings kept back.
 """
 
 from probewise.diagnosis.advice.aliases import Alias
-from probewise.diagnosis.advice.commands import MOST_READINGS
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.audit.document import CURE_PLAN, audit_json
 from probewise.diagnosis.audit.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
@@ -15,23 +14,20 @@ from probewise.diagnosis.fitting.earlier import SensorPrior
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.own_model import OwnModel, Parameters
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.repair.chosen import model_with
-from probewise.diagnosis.repair.mending import Improvement
-from probewise.diagnosis.repair.repaired import ModelSamples
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
+from probewise.diagnosis.model_with import model_with
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.repair.improvement import Improvement
+from probewise.diagnosis.repair.repair import Predicted, Repair
+from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.residuals.locate import ALARM, Place
-from probewise.diagnosis.search.odds import PriorOdds
+from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.unknown_shape import SensorAndShape
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
-from probewise.diagnosis.verdict_report.verdict import (
-    Diagnosis,
-    EffectFound,
-    Hypothesis,
-    NoiseFound,
-    ParameterFound,
-    Verdict,
-)
+from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound, ParameterFound
 from probewise.diagnosis.verdict_report.words import p_in_words
 
 __all__ = [
@@ -46,6 +42,7 @@ __all__ = [
     "EffectFound",
     "Hypothesis",
     "Improvement",
+    "Judged",
     "ModelSamples",
     "NextMeasurement",
     "NoiseFound",
@@ -55,12 +52,15 @@ __all__ = [
     "Parameters",
     "Place",
     "PlanAudit",
+    "Predicted",
     "PriorOdds",
+    "Repair",
     "SensorAndShape",
     "SensorPrior",
     "Smallest",
     "Thorough",
     "Verdict",
+    "VerdictReport",
     "Weighing",
     "audit_json",
     "audit_plan",

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray, frozen
 from probewise.diagnosis.fitting.coordinates import FARTHEST, CalibratedSensor, known_scene
 from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
-from probewise.diagnosis.verdict_report.verdict import Diagnosis
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.priors import Prior

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.residuals.covariates import covariates_of, slope_along_the_move
+from probewise.diagnosis.light_sensor.covariates import covariates_of, slope_along_the_move
 from probewise.report.words import unit_name
 
 __all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words", "family_words"]
@@ -61,7 +61,7 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
         return {}
     plan = diagnosis.recording.plan
     usable = np.flatnonzero(diagnosis.recording.usable)
-    covariates = covariates_of(plan, usable, diagnosis.predicted_before[usable], _slope(diagnosis)[usable])
+    covariates = covariates_of(plan, usable, diagnosis.repair.before.readings[usable], _slope(diagnosis)[usable])
     out = {}
     for place in diagnosis.where:
         values = np.full(len(plan), np.nan)

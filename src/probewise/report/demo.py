@@ -223,7 +223,7 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     """Draw what the page shows of a diagnosis: PNG by file name."""
     likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
     labels = [h.label.replace("+", " + ") for h in likely]
-    recording, before, after = diagnosis.recording, diagnosis.predicted_before, diagnosis.predicted_after
+    recording, before, after = diagnosis.recording, diagnosis.repair.before.readings, diagnosis.repair.after.readings
     drawn = {
         "explanations.png": png(hypothesis_probabilities(labels, [h.probability for h in likely])),
         "scans.png": png(residuals_by_scan(recording, before, after)),

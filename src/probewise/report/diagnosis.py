@@ -55,7 +55,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
     return [
         Section("What it could be", _explanations(diagnosis)),
         Section("Where it shows", _places(diagnosis, drawn)),
-        Section("Before and after the repair" if diagnosis.is_repaired else "The model", _fits(diagnosis, drawn)),
+        Section("Before and after the repair" if diagnosis.repair.changes_predictions else "The model", _fits(diagnosis, drawn)),
         Section("Does the repaired model predict held-out readings?", _gain(diagnosis, drawn)),
         Section("Aliased effects, and what would separate them", _aliases(diagnosis)),
         Section("Noise", _noise(diagnosis, drawn)),
@@ -97,7 +97,7 @@ def _first_caption(diagnosis: Diagnosis) -> str:
         return "The readings in the order of taking. Below: prior probabilities; these readings do not change them."
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
-    after = ", blue squares the repaired model" if diagnosis.is_repaired else ""
+    after = ", blue squares the repaired model" if diagnosis.repair.changes_predictions else ""
     where = f" {_where(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: the model as calibrated{after}."
     band = "95 % of such means lie in the grey band by chance alone."
@@ -108,16 +108,16 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Answer, in words that need no statistics: what to do now, what was found, is it real, does the repair help."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(_found(diagnosis)))]
-    if not diagnosis.few:
+    if not diagnosis.judged.too_little:
         facts.append(("Could it be chance?", _chance(diagnosis)))
-    if gain.heldout_by_scan and diagnosis.is_repaired:
+    if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
         facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
-    if diagnosis.is_repaired:
+    if diagnosis.repair.changes_predictions:
         left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
         only_here = ". What has no name is corrected in these readings alone; sensor.json does not carry it"
-        facts.append(("Residuals", f"{left}{only_here if diagnosis.corrected else ''}."))
-    if diagnosis.left_open:
-        facts.append(("In the repaired sensor", _shares(diagnosis.left_open)))
+        facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
+    if diagnosis.repair.left_open:
+        facts.append(("In the repaired sensor", _shares(diagnosis.repair.left_open)))
     return facts
 
 
@@ -168,7 +168,7 @@ def _chance(diagnosis: Diagnosis) -> str:
 
 def _next_in_words(diagnosis: Diagnosis) -> str:
     plan = diagnosis.next_measurement
-    if plan is None and diagnosis.few:
+    if plan is None and diagnosis.judged.too_little:
         return "Scan across an edge, and take more readings."
     if plan is None:
         return "Nothing that this apparatus can do would tell more."
@@ -191,7 +191,7 @@ def _plain(label: str) -> str:
 
 
 def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    credible = [hypothesis_in_words(_effects_of(label)) for label in diagnosis.credible]
+    credible = [hypothesis_in_words(_effects_of(label)) for label in diagnosis.judged.credible]
     return (
         *(
             paragraph(_sentence(f"{effect_in_words(e.name)} ({probability(e.probability)}): {e.sentence}"))
@@ -228,7 +228,7 @@ def _credible(names: Sequence[str]) -> tuple[Markup, ...]:
 
 def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Say what something unknown may be, where it may be there at all."""
-    likely = [(name, p) for name, p in diagnosis.unknown_candidates if p > _LIKELY]
+    likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
     said = ", ".join(f"{_candidate(name)} ({probability(p)})" for name, p in likely)
@@ -249,7 +249,7 @@ def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Set both evidences of what was weighed twice side by side."""
-    if not diagnosis.weighings:
+    if not diagnosis.report.weighings:
         return ()
     return (
         table(
@@ -262,7 +262,7 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                     readable(give_or_take(w.nested, w.error)),
                     ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
                 )
-                for w in diagnosis.weighings
+                for w in diagnosis.report.weighings
             ),
             caption="Log evidence ln Z (nats) by the Laplace approximation and by nested sampling.",
         ),
@@ -284,8 +284,8 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
 
 
 def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    which = "The scan that the repair changes most" if diagnosis.is_repaired else "One scan"
-    colours = "solid orange as calibrated, dashed blue repaired" if diagnosis.is_repaired else "orange"
+    which = "The scan that the repair changes most" if diagnosis.repair.changes_predictions else "One scan"
+    colours = "solid orange as calibrated, dashed blue repaired" if diagnosis.repair.changes_predictions else "orange"
     return (
         figure(
             drawn["before_after.svg"],
@@ -316,7 +316,7 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
         definition_list(
             (
                 *((("gain on held-out readings", held),) if gain.heldout_by_scan else ()),
-                *(repaired if diagnosis.is_repaired else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)),
+                *(repaired if diagnosis.repair.changes_predictions else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)),
                 ("test that nothing more is missing", readable(p_in_words(gain.p_value_after))),
             )
         ),
@@ -324,13 +324,13 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
 
 
 def _nothing_held_out(diagnosis: Diagnosis) -> str:
-    if not diagnosis.is_repaired:
+    if not diagnosis.repair.changes_predictions:
         return "The predicted mean is as calibrated: there is no repair to test on held-out readings."
     return "No scan could be held out: that takes two scans of eight readings or more."
 
 
 def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    noise = diagnosis.noise
+    noise = diagnosis.report.noise
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = listed(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
@@ -390,8 +390,8 @@ def _unit(found: ParameterFound) -> str:
 
 def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """List pairs that look alike, those among the credible explanations first and the rest folded away."""
-    credible = {name for label in diagnosis.credible for name in label.split("+")}
-    ranked = sorted(diagnosis.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
+    credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
+    ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
         return (paragraph("None: each effect that could show here changes these readings in a way of its own."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]

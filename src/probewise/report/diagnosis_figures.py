@@ -58,7 +58,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
 
 def shown_first(diagnosis: Diagnosis, chance: Chance | None = None) -> Witness | str:
     """Say what the first figure shows: residuals along a witness, or of the noise the effect that is named."""
-    if diagnosis.few:
+    if diagnosis.judged.too_little:
         return "readings"
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
@@ -112,7 +112,7 @@ def _along(diagnosis: Diagnosis, chance: Chance, witness: Witness, *, after: boo
         chance.means(diagnosis, witness, after=after),
         label=witness.label,
         unit=unit_name(diagnosis.recording.plan.instrumentation.unit),
-        each=(at, diagnosis.residuals_before) if each else None,
+        each=(at, diagnosis.repair.before.residuals) if each else None,
         window=witness.window,
         names=names,
         ax=ax,
@@ -131,15 +131,15 @@ def _side_by_side(at: FloatArray) -> FloatArray:
 def _before_and_after(diagnosis: Diagnosis) -> bytes:
     """Draw the scan that the repair changes most, or the longest: readings, models, and the residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    change = np.abs(diagnosis.predicted_after - diagnosis.predicted_before)
+    change = np.abs(diagnosis.repair.after.readings - diagnosis.repair.before.readings)
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
     rows = max(scans, key=lambda r: (float(np.sqrt(np.mean(change[r] ** 2))), r.size))
     shown = along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
-    models = [(BEFORE, diagnosis.predicted_before[rows]), (AFTER, diagnosis.predicted_after[rows])]
+    models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = unit_name(plan.instrumentation.unit)
-    models = models if diagnosis.is_repaired else models[:1]
+    models = models if diagnosis.repair.changes_predictions else models[:1]
     return svg(one_scan(shown.at[rows], readings, models, label=shown.label, unit=unit))
 
 
@@ -147,9 +147,9 @@ def _residuals(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals in time and by predicted reading, before and after."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
-    models = [(BEFORE, diagnosis.residuals_before), (AFTER, diagnosis.residuals_after)]
-    covariates = (("time (s)", plan.time_s), (covariate_label("level", unit), diagnosis.predicted_before))
-    return svg(residual_clouds(covariates, models if diagnosis.is_repaired else models[:1], unit=unit_name(unit)))
+    models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
+    covariates = (("time (s)", plan.time_s), (covariate_label("level", unit), diagnosis.repair.before.readings))
+    return svg(residual_clouds(covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_name(unit)))
 
 
 def _noise(diagnosis: Diagnosis, chance: Chance) -> bytes:
@@ -162,15 +162,15 @@ def _noise(diagnosis: Diagnosis, chance: Chance) -> bytes:
 
 def _noise_panel(diagnosis: Diagnosis, chance: Chance, name: str) -> Callable[[Axes], Axes]:
     """Choose the panel that shows an effect on the noise; the spread by level where it has none of its own."""
-    recording, residuals = diagnosis.recording, np.array(diagnosis.residuals_after)
+    recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
     unit = unit_name(recording.plan.instrumentation.unit)
-    found = {p.name: p.mean for p in diagnosis.noise.parameters}
+    found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
     if "share" in found and "value" in found:  # lost readings say nothing of the others' noise
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * float(chance.sd.mean()))
         lost &= np.abs(residuals) > _LOST * float(chance.sd.mean())
         residuals[lost] = np.nan
         if name == "dropouts":
-            return lambda ax: lost_readings(diagnosis.predicted_after, recording.readings, lost, unit=unit, ax=ax)
+            return lambda ax: lost_readings(diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax)
     if name == "quantisation" and "step" in found:
         return lambda ax: lattice_of_readings(recording.readings, found["step"], unit=unit, ax=ax)
     if name == "correlated_noise":
@@ -178,4 +178,4 @@ def _noise_panel(diagnosis: Diagnosis, chance: Chance, name: str) -> Callable[[A
     if name == "outliers":
         return lambda ax: tails(residuals, float(chance.sd.mean()), ax=ax)
     model_sd = chance.sd if "ratio" in found else None
-    return lambda ax: spread_by_level(diagnosis.predicted_after, residuals, unit=unit, model_sd=model_sd, ax=ax)
+    return lambda ax: spread_by_level(diagnosis.repair.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax)

@@ -28,7 +28,7 @@ def headline(diagnosis: Diagnosis) -> str:
 def _sayings(diagnosis: Diagnosis) -> list[str]:
     """List what could be said, the fullest first; the last is short whatever the diagnosis holds."""
     n = int(diagnosis.recording.usable.sum())
-    if diagnosis.few:
+    if diagnosis.judged.too_little:
         return [_too_little(diagnosis, n)]
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
@@ -67,7 +67,7 @@ def _left_out(diagnosis: Diagnosis, opening: str) -> list[str]:
 
 
 def _unknown(diagnosis: Diagnosis) -> list[str]:
-    shares = diagnosis.unknown_shares
+    shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
     covariate = covariate_words(top.partition(", ")[0].removesuffix(" within scans"))
     known = [effect_in_words(e.name) for e in diagnosis.effects if e.probability >= _SURE]

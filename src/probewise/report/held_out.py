@@ -17,7 +17,7 @@ def most_gained(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
     None where nothing was repaired, or nothing could be held out.
     """
     gains = diagnosis.improvement.heldout_by_scan
-    if not diagnosis.is_repaired or not gains:
+    if not diagnosis.repair.changes_predictions or not gains:
         return None
     name, gain = max(gains, key=lambda pair: pair[1])
     part, names = parts_kept_back(diagnosis.recording)

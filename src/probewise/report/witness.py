@@ -53,10 +53,10 @@ class Chance:
     @classmethod
     def of(cls, diagnosis: Diagnosis) -> Chance:
         """Take the noise model of a diagnosis."""
-        found = {p.name: p.mean for p in diagnosis.noise.parameters}
+        found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
         sd = np.full(len(diagnosis.recording), float(diagnosis.repaired.noise_sd.mean()))
         if "ratio" in found:
-            level = diagnosis.predicted_after
+            level = diagnosis.repair.after.readings
             share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
             sd = sd * np.sqrt(1 + found["ratio"] * share)
         null = diagnosis.null
@@ -67,8 +67,8 @@ class Chance:
         """Average the residuals of a diagnosis along a witness."""
         return mean_residuals(
             witness.at,
-            diagnosis.residuals_before,
-            diagnosis.residuals_after if after and diagnosis.is_repaired else None,
+            diagnosis.repair.before.residuals,
+            diagnosis.repair.after.residuals if after and diagnosis.repair.changes_predictions else None,
             sd=self.sd,
             rho=self.rho,
             scan=diagnosis.recording.plan.scan,
@@ -92,11 +92,11 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
         if place.covariate == "scan" and place.scan is not None:
             found.append(along_scan(diagnosis, place.scan, place))
         found.append(of_place(diagnosis, place, values[place.witness]))
-    if diagnosis.is_repaired and diagnosis.verdict != "clean":
+    if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_by_change(diagnosis))
     if not found:
         unit = diagnosis.recording.plan.instrumentation.unit
-        return Witness(np.array(diagnosis.predicted_before), covariate_label("level", unit))
+        return Witness(np.array(diagnosis.repair.before.readings), covariate_label("level", unit))
     sizes = [chance.means(diagnosis, witness, after=False).stands_out for witness in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
@@ -132,7 +132,7 @@ def _on_a_line(x_mm: FloatArray, y_mm: FloatArray) -> bool:
 
 def _likeness(diagnosis: Diagnosis, place: Place) -> float:
     """Give the share of the unknown that depends on a place's covariate; 0 where something has a name."""
-    shares = diagnosis.unknown_shares
+    shares = diagnosis.judged.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
         return 0.0
     within = " within scans" if place.scan is not None and place.covariate != "scan" else ""
@@ -159,7 +159,7 @@ def _folded(diagnosis: Diagnosis) -> list[Witness]:
 
 def _by_change(diagnosis: Diagnosis) -> Witness:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
-    return Witness(diagnosis.predicted_after - diagnosis.predicted_before, f"change that the repair makes ({unit})")
+    return Witness(diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})")
 
 
 def _window(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:

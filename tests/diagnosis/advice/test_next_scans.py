@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.advice.commands import MOST_READINGS, commands, excerpts, in_turn, one_after_another, put_off
 from probewise.diagnosis.advice.next_scans import PredictiveNormal, Rival, mutual_information, next_scans
-from probewise.diagnosis.advice.target_swaps import target_swaps
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.light_sensor.commands import commands, excerpts
+from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.target_swaps import target_swaps
+from probewise.diagnosis.scheduling import MOST_READINGS, in_turn, one_after_another, put_off
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
@@ -76,7 +78,9 @@ def rival(name: str, probability: float, settings: list[float], plan: Plan) -> R
 )
 def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
     plan = paper_plan()
-    asked = next_scans([rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan)
+    asked = next_scans(
+        [rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan, LightSensor()
+    )
     assert asked is not None
     assert len(asked.plan) <= MOST_READINGS
     assert {asked.plan.pattern_names[k] for k in asked.plan.pattern} - plan.patterns.keys()
@@ -95,7 +99,7 @@ def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
 def test_lag_against_backlash_wants_the_other_way():
     plan = paper_plan()
     lag, play = rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)
-    asked = next_scans([lag, play], 0.4, plan)
+    asked = next_scans([lag, play], 0.4, plan, LightSensor())
     assert asked is not None
     assert "backwards" in asked.description or "forth and back" in asked.description
 
@@ -103,7 +107,7 @@ def test_lag_against_backlash_wants_the_other_way():
 def test_a_plan_that_moves_nowhere_has_no_next_scan():
     plan = paper_plan().take(np.arange(404, 408))
     rivals = [rival("hysteresis", 0.5, [0.5], paper_plan()), rival("lag", 0.5, [0.5], paper_plan())]
-    assert next_scans([replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan) is None
+    assert next_scans([replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensor()) is None
 
 
 def read_by(plan: Plan) -> np.ndarray:
@@ -203,7 +207,7 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     everywhere, rows = one_after_another(commands(plan)[:3], plan)
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
-    asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan)
+    asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor())
     assert asked is not None
     assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)

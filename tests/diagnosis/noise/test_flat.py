@@ -11,11 +11,13 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
+from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.noise.flat import Flat
 from probewise.diagnosis.noise.law import NoiseLaw, forms
 from probewise.diagnosis.noise.models import NoiseModel, least_sd, rough_sd
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.search import search
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
@@ -191,7 +193,7 @@ def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
 @pytest.mark.parametrize("noise_sd", [0.9, 1.4])
 def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):
     found = diagnose(as_declared(rounded(noise_sd, 1)), rng=np.random.default_rng(0))
-    assert (found.verdict, found.noise.model) == ("clean", "white")
+    assert (found.verdict, found.report.noise.model) == ("clean", "white")
     assert found.p_value > 0.01  # one test each
     sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
     assert sigma == pytest.approx(np.hypot(noise_sd, STEP / np.sqrt(12)), rel=0.15)
@@ -212,14 +214,14 @@ def test_where_no_three_readings_follow_each_other_nothing_says_that_a_step_is_c
     readings = World(spot).expected(whole) + 0.6 * np.random.default_rng(2).standard_normal(len(whole))
     readings = np.where(np.arange(len(whole)) % 2, np.nan, np.round(readings, 2))
     found = diagnose(Recording(whole, readings), rng=np.random.default_rng(0))
-    assert (found.verdict, found.noise.model) == ("clean", "white")
+    assert (found.verdict, found.report.noise.model) == ("clean", "white")
 
 
 def test_what_rivals_are_told_by_is_the_noise_of_a_reading_rounding_and_all():
     """A whole step of noise and rounding is no less than either: of the normal part alone it would be."""
     recording = as_declared(rounded(0.4, 1))
-    found = search(recording, {}, sensor=None, max_order=1)
-    (null,) = found.candidates.values()
+    found = search(Prepared(recording, {}, None, LightSensor(), recording), max_order=1)
+    (null,) = found.evidences.fits.values()
     assert null.law.flat > 0
     rms = np.sqrt(np.mean(null.found.residuals**2))
     assert null.sd == pytest.approx(rms, rel=0.15)

@@ -10,7 +10,7 @@ import pytest
 
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
-from probewise.diagnosis.repair.repaired import ModelSamples
+from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import ACCURATE_NODES

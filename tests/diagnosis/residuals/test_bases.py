@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from probewise.diagnosis.light_sensor.covariates import covariates_of
 from probewise.diagnosis.residuals.bases import unknown_templates
-from probewise.diagnosis.residuals.covariates import covariates_of
 from probewise.recordings import two_way_plan
 
 PLAN = two_way_plan()

@@ -8,7 +8,7 @@ from scipy.stats import betabinom
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import windows
 from probewise.diagnosis.residuals.outlying import outlying, score_together
 from probewise.recordings import Recording, paper_plan

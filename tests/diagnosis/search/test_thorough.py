@@ -9,6 +9,8 @@ import pytest
 
 from probewise import nested
 from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, weigh_thoroughly
+from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.weighed_twice import Weighing, with_agreement
@@ -42,7 +44,8 @@ def line_recording(step: float) -> Recording:
 def searched(recording):
     names = ("ambient_step", "hysteresis")
     effects = {name: VOCABULARY[name].for_extent(Extent.of(recording)) for name in names}
-    return search(recording, {k: e for k, e in effects.items() if e is not None}, sensor=LINE, max_order=1)
+    built = {name: effect for name, effect in effects.items() if effect is not None}
+    return search(Prepared(recording, built, LINE, LightSensor(), recording))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +73,7 @@ def test_the_null_is_always_weighed_too(stepped):
     found, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
     assert {"ambient_step", "clean"} <= {w.label for w in weighings}
     assert all(w.agree for w in weighings)
-    assert found.probabilities == stepped.probabilities
+    assert found.posterior.probabilities == stepped.posterior.probabilities
 
 
 def test_where_no_density_fits_the_runs_themselves_become_sharp(stepped, monkeypatch):
@@ -138,20 +141,20 @@ def moved(stepped, monkeypatch, gap, doubts=()):
 
 def odds(found):
     """Odds of a step against a clean mean, under white noise."""
-    return found.probabilities[("ambient_step",), ()] / found.probabilities[(), ()]
+    return found.posterior.probabilities[("ambient_step",), ()] / found.posterior.probabilities[(), ()]
 
 
 def test_nested_sampling_wins_where_it_disagrees(stepped, monkeypatch):
     """What it finds beyond Laplace, less what it finds of the null, moves the odds by as many nats."""
     found, _ = moved(stepped, monkeypatch, 2.5)
     assert odds(found) / odds(stepped) == pytest.approx(math.exp(2.0))
-    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert sum(found.posterior.probabilities.values()) == pytest.approx(1.0)
 
 
 def test_what_is_unknown_beside_a_hypothesis_moves_with_it(stepped, monkeypatch):
     found, _ = moved(stepped, monkeypatch, 2.5)
-    for key, value in found.unknown.items():
-        assert value - stepped.unknown[key] == pytest.approx(2.0 if key[1] else 0.0)
+    for key, value in found.evidences.unknown.items():
+        assert value - stepped.evidences.unknown[key] == pytest.approx(2.0 if key[1] else 0.0)
 
 
 def test_within_a_nat_laplace_stands(stepped, monkeypatch):
@@ -195,9 +198,9 @@ def test_a_recording_is_weighed_alike_both_ways():
     samples = truth + spread * np.random.default_rng(0).standard_normal((500, 8))
     known = SimpleNamespace(names=names, samples=samples)
     found = diagnose(recording, sensor=known, thorough=again, rng=np.random.default_rng(1))
-    assert "ambient_step" in {w.label for w in found.weighings}
-    assert {w.label for w in found.weighings} == set(seen)
-    assert all(w.agree for w in found.weighings)
+    assert "ambient_step" in {w.label for w in found.report.weighings}
+    assert {w.label for w in found.report.weighings} == set(seen)
+    assert all(w.agree for w in found.report.weighings)
     assert found.reason.endswith("nested sampling agrees within a nat.")
-    assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.weighings)
+    assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.report.weighings)
     assert "thorough" not in diagnosis_json(replace(found, weighings=()))

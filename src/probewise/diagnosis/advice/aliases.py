@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.advice.commands import MOST_READINGS, commands, one_after_another
-from probewise.diagnosis.advice.target_swaps import target_swaps
-from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.apparatus import Apparatus
+from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.scheduling import MOST_READINGS, one_after_another
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.effects import NamedEffect
 
-__all__ = ["Alias", "aliases", "settle", "surviving_cosine"]
+__all__ = ["Alias", "aliased_pairs", "aliases", "settle", "surviving_cosine"]
 
 ALIAS_COSINE = 0.9
 
@@ -46,7 +48,7 @@ def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
     return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
 
 
-def aliases(problem: Linearised, templates: Mapping[str, FloatArray]) -> list[Alias]:
+def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
     """List pairs of effects whose surviving templates have a cosine of 0.9 or more; `settle` says what would part them.
 
     Parameters
@@ -55,16 +57,46 @@ def aliases(problem: Linearised, templates: Mapping[str, FloatArray]) -> list[Al
         The null fit.
     templates
         For each effect its most telling columns (n_points, k).
+    otherwise
+        What is said of a pair as long as nothing settles it.
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
         cosine = surviving_cosine(problem, templates[pair[0]], templates[pair[1]])
         if cosine >= ALIAS_COSINE:
-            out.append(Alias(pair, cosine, "no reading that this apparatus can take tells them apart", 0))
+            out.append(Alias(pair, cosine, otherwise, 0))
     return sorted(out, key=lambda alias: -alias.cosine)
 
 
-def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float) -> list[Alias]:
+def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
+    """Compare what survives of the effects, each by the entry of its bank that fits best here, and say what parts them.
+
+    Parameters
+    ----------
+    searched
+        What was searched.
+    problem, found
+        The null.
+    """
+    prepared, screening = searched.prepared, searched.screening
+    telling: dict[str, FloatArray] = {}
+    chosen: dict[str, NamedEffect[Any]] = {}
+    for name, effect in prepared.effects.items():
+        if name in prepared.on_noise or out_of_vocabulary((name,)):
+            continue
+        templates = screening.templates.of(screening.about, effect.coarse())
+        blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
+        scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
+        best = int(np.argmax(scores))
+        telling[name], chosen[name] = templates.columns[best], templates.variant(best)
+    apparatus = prepared.apparatus
+    pairs = aliases(problem, telling, otherwise=apparatus.words.settles_nothing)
+    return settle(pairs, found, chosen, problem.sd, apparatus)
+
+
+def settle(
+    pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
+) -> list[Alias]:
     """Say which candidate plan tells aliased effects apart, pair by pair, and by how many readings.
 
     Each effect is taken at the size at which 400 readings would show it at lambda 8; the plan of the
@@ -79,7 +111,7 @@ def settle(pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect
         here = model.predict(z[None, :])[0] - null
         shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
     best = {pair.effects: (0.0, pair) for pair in pairs}
-    scans = [*commands(found.model.plan, level=null), *target_swaps(found.model.plan)]
+    scans = apparatus.commands(found.model.plan, level=null)
     if not (best and scans):
         return list(pairs)
     everywhere, rows_of = one_after_another(scans, found.model.plan)

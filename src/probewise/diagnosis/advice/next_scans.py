@@ -16,9 +16,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.advice.commands import MOST_READINGS, Command, commands, in_turn, one_after_another
-from probewise.diagnosis.advice.target_swaps import target_swaps
+from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.scheduling import MOST_READINGS, Command, in_turn, one_after_another
 from probewise.recordings.plan import Plan
 
 __all__ = ["NextMeasurement", "Rival", "mutual_information", "next_scans"]
@@ -83,7 +83,7 @@ class PredictiveNormal:
         return np.asarray(np.eye(len(self.mean)) + self.factor @ self.factor.T)
 
 
-def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasurement | None:
+def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus) -> NextMeasurement | None:
     """Choose the scans that tell the rivals apart, at most 102 readings; None where nothing can be done, or told.
 
     Parameters
@@ -94,10 +94,12 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan) -> NextMeasuremen
         Noise of a reading.
     plan
         What was measured.
+    apparatus
+        What could measure more.
     """
     leader = max(rivals, key=lambda rival: rival.probability)
     level = leader.model.predict(leader.z[None, :])[0]
-    offered = [*commands(plan, strides=_STRIDES, level=level), *target_swaps(plan)]
+    offered = apparatus.commands(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
     offered = [offered[k] for k in _promising(rivals, sd, offered, plan)]

@@ -10,7 +10,8 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
-from probewise.diagnosis.search.weighed_fit import Search, WeighedFit
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["next_readings"]
 
@@ -22,44 +23,46 @@ _LEFT = 2.0  # times that it may change the readings taken, all told: what takes
 _SIZES = 4  # tried until it does not, each a quarter of the one before
 
 
-def next_readings(search: Search, null: WeighedFit) -> NextMeasurement | None:
+def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | None:
     """Ask for the readings that tell the leading refitted hypotheses about the mean apart."""
-    by_mean = search.by_mean
+    by_mean = searched.posterior.by_mean
     # What has no name at all predicts no more than the null does.
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
     found: list[WeighedFit] = []
     for names in ranked:
-        candidate = search.best(names, search.certain) if names else null
+        candidate = searched.best(names, searched.certain) if names else null
         # Of what is named the next is a rival however improbable; of nothing, something that could be there.
         second = len(found) == 1 and bool(found[0].names)
         if candidate is not None and (not found or second or probabilities[names] >= _LEAST_PROBABILITY):
             found.append(candidate)
         if len(found) == _MOST_RIVALS:
             break
-    sd, plan = found[0].sd, search.recording.plan
-    rivals = [_as_rival(candidate, probabilities[candidate.names]) for candidate in found]
+    prepared = searched.prepared
+    sd, plan, apparatus = found[0].sd, prepared.recording.plan, prepared.apparatus
+    as_calibrated = f"{apparatus.words.null} as calibrated"
+    rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated) for candidate in found]
     if len(rivals) > 1:
-        return next_scans(rivals, sd, plan)
-    others = dict.fromkeys(n for names in ranked for n in names if n in search.effects)
-    imagined = (_imagined(search, null, name) for name in others)
+        return next_scans(rivals, sd, plan, apparatus)
+    others = dict.fromkeys(n for names in ranked for n in names if n in prepared.effects)
+    imagined = (_imagined(searched, null, name) for name in others)
     tried = islice((rival for rival in imagined if rival is not None), _TRIED)
-    wanted = (next_scans([*rivals, rival], sd, plan) for rival in tried)
+    wanted = (next_scans([*rivals, rival], sd, plan, apparatus) for rival in tried)
     return next((asked for asked in wanted if asked is not None), None)
 
 
-def _as_rival(candidate: WeighedFit, probability: float) -> Rival:
-    label = " with ".join(candidate.names).replace("_", " ") or "the sensor as calibrated"
+def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> Rival:
+    label = " with ".join(candidate.names).replace("_", " ") or as_calibrated
     return Rival(label, candidate.found.model, candidate.found.z, _root_of(candidate), probability)
 
 
-def _imagined(search: Search, null: WeighedFit, name: str) -> Rival | None:
+def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
     """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here. None where none can."""
-    effect, found = search.effects[name], null.found
+    effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
-    templates = search.templates.of(found, effect)
+    templates = searched.screening.templates.of(found, effect)
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
     at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNFELT))))
     setting = templates.settings[at][0].copy()
@@ -68,7 +71,7 @@ def _imagined(search: Search, null: WeighedFit, name: str) -> Rival | None:
     model = found.model.with_effect(templates.variant(at))
 
     def change(z: FloatArray) -> FloatArray:
-        return np.asarray(model.predict(z[None, :])[0, search.recording.usable] - found.predicted)
+        return np.asarray(model.predict(z[None, :])[0, searched.prepared.usable] - found.predicted)
 
     for _ in range(_SIZES if amplitudes else 1):
         z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])

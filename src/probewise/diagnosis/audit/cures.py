@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.diagnosis.advice.commands import Command, behind, commands, put_off
-from probewise.diagnosis.advice.target_swaps import target_swaps
 from probewise.diagnosis.audit.detectability import (
     LEAST_NATS,
     LEAST_SHARE,
@@ -19,6 +17,9 @@ from probewise.diagnosis.audit.detectability import (
     ProjectedTemplates,
     nats_between,
 )
+from probewise.diagnosis.light_sensor.commands import commands
+from probewise.diagnosis.light_sensor.target_swaps import target_swaps
+from probewise.diagnosis.scheduling import Command, behind, put_off
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 

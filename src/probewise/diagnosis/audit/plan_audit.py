@@ -16,13 +16,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
-from probewise.diagnosis.advice.commands import behind
 from probewise.diagnosis.audit.cures import cures_of
 from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected, PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.verdict_report.verdict import Diagnosis
+from probewise.diagnosis.scheduling import behind
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError

@@ -1,7 +1,4 @@
-"""Does the repaired model predict readings kept back? Leave one scan out; rows left out at random would leak.
-
-So would one of many scans that lie side by side: of those all over one pattern the same way are left out together.
-"""
+"""Does the repaired model predict held-out readings? Rows left out at random would leak, so whole parts are."""
 
 from __future__ import annotations
 
@@ -16,16 +13,23 @@ from probewise.diagnosis.fitting.fit import Fit, fit, residual_degrees_of_freedo
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["HeldOut", "compare_parts", "held_out_blocks", "held_out_gain", "held_out_parts"]
+__all__ = ["LEAST_ROWS", "MOST_PARTS", "HeldOut", "Parts", "compare_parts", "held_out_blocks", "held_out_gain"]
 
-_LEAST_ROWS = 8
-_MOST_SCANS = 10
+LEAST_ROWS = 8
+"""Of a part: a shorter one is not held out."""
+
+MOST_PARTS = 10
+"""That are held out in turn."""
+
+Parts = tuple[IntArray, tuple[str, ...]]
+"""Numbers of the parts that usable readings are held out in, (n_usable,), and their names."""
+
 _BLOCKS = 5
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Gain of a model over the null on readings kept back, nats a reading, and the sd of that mean."""
+    """Gain of a model over the null on held-out readings, nats per reading, and the sd of that mean."""
 
     per_reading: float
     sd: float
@@ -33,14 +37,13 @@ class HeldOut:
     by_scan: tuple[tuple[str, float], ...]
 
 
-def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw) -> HeldOut:
-    """Refit both models without one scan at a time and compare how they predict it, reading by reading.
+def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOut:
+    """Refit both models without one part at a time and compare how they predict it, reading by reading.
 
-    Each reading counts by itself, as the law of the noise has it. Scans of fewer than eight readings stay
-    in; of more than ten longer ones see `held_out_parts`.
+    Each reading counts by itself, as the law of the noise has it. Parts of fewer than eight readings stay in.
     """
     plan, usable = recording.plan, recording.usable
-    parts, names = held_out_parts(recording)
+    parts, names = held_out
 
     def gain(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
@@ -51,51 +54,33 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw)
     return compare_parts(parts, gain, names)
 
 
-def held_out_parts(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
-    """Divide usable readings into the parts that are kept back in turn: their numbers (n_usable,), and their names.
-
-    Its scans; where more than ten are long enough, all those over one pattern in one orientation together, if there are
-    several such parts.
-    """
-    plan, usable = recording.plan, recording.usable
-    scan = plan.scan[usable]
-    if np.sum(np.bincount(scan) >= _LEAST_ROWS) > _MOST_SCANS:
-        views = np.stack([plan.pattern[usable].astype(np.float64), np.round(plan.orientation_rad[usable], 6)])
-        kinds, part = np.unique(views, axis=1, return_inverse=True)
-        if kinds.shape[1] > 1:
-            return part.reshape(-1), tuple(
-                f"{plan.pattern_names[int(code)]}, {np.degrees(turn):.0f} degrees" for code, turn in kinds.T
-            )
-    return scan, plan.scan_names
-
-
-def held_out_blocks(recording: Recording) -> tuple[IntArray, tuple[str, ...]]:
-    """Divide usable readings into blocks of eight that follow each other, every fifth of which is kept back together.
+def held_out_blocks(recording: Recording) -> Parts:
+    """Divide usable readings into blocks of eight that follow each other, every fifth of which is held out together.
 
     What is local in time tells nothing of another scan; of readings between those that are known it does, and a block
     is long enough that its middle is no neighbour of theirs.
     """
-    block = np.arange(int(recording.usable.sum())) // _LEAST_ROWS
-    return block % _BLOCKS, tuple(f"every fifth block of {_LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
+    block = np.arange(int(recording.usable.sum())) // LEAST_ROWS
+    return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
 def compare_parts(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
-    """Keep one scan back at a time and gather the gains of its readings.
+    """Hold one part out at a time and gather the gains of its readings.
 
     Parameters
     ----------
     scan
         Scan of each usable reading, (n_usable,).
     gain
-        For a mask of the readings kept back (n_usable,), the gain of each of them, in nats.
+        For a mask of the held-out readings (n_usable,), the gain of each of them, in nats.
     scan_names
         Names of the scans; without, their numbers.
     """
-    long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= _LEAST_ROWS]
+    long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= LEAST_ROWS]
     if len(long_enough) < 2:
         return HeldOut(0.0, 0.0, 0, ())
-    if len(long_enough) > _MOST_SCANS:
-        long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, _MOST_SCANS).round()]
+    if len(long_enough) > MOST_PARTS:
+        long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, MOST_PARTS).round()]
     gains = [gain(np.asarray(scan == k)) for k in long_enough]
     by_scan = tuple(
         (scan_names[k] if scan_names else str(k), float(g.mean())) for k, g in zip(long_enough, gains, strict=True)
@@ -106,7 +91,7 @@ def compare_parts(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_
 
 
 def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray) -> FloatArray:
-    """Log predictive density of each reading kept back, by itself, by a refit to the others.
+    """Log predictive density of each held-out reading, by itself, by a refit to the others.
 
     `rows` (n_points,) and `out` (n_usable,) are the same readings. What a law says of lost readings is the
     same for every model of the mean, and left out.

@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.repair.repaired import ModelSamples
+from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 from probewise.sensor import ACCURATE_NODES

@@ -9,18 +9,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
-from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
-from probewise.diagnosis.search.weighed_fit import Search, WeighedFit
+from probewise.diagnosis.repair.best import Best, ruins
+from probewise.diagnosis.repair.samples import ModelSamples, sample_model
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import EFFECTS
 
-__all__ = ["Ensemble"]
+__all__ = ["Drawn", "Ensemble", "draw_models"]
 
 Names = tuple[str, ...]
 
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _LEAST_OF_A_RIVAL = 0.02  # probability of a hypothesis, below which the model does without it
 _MOST = 6  # hypotheses in one model
+_LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
+_DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +36,7 @@ class Ensemble:
     What goes into one model has an SSF of one form: mixtures of any number of Gaussians, or the free form.
     """
 
-    search: Search
+    searched: Searched
     noise: Names
     rng: np.random.Generator
     _known: dict[tuple[Names, bool], ModelSamples] = field(default_factory=dict)
@@ -50,11 +56,11 @@ class Ensemble:
     def likely(self, best: WeighedFit) -> dict[Names, float]:
         """Weigh what one model can hold beside the best candidate: under its noise, by the form of its SSF."""
         out: dict[Names, float] = {}
-        for names in dict.fromkeys(names for _, names in self.search.candidates):
+        for names in dict.fromkeys(names for _, names in self.searched.evidences.fits):
             log_z = [c.evidence[self.noise].log_z for c in self._of_form(best, names)]
             # No file holds a user's own effect; a user's own model has it where it is best itself.
             if log_z and {*names} <= {*EFFECTS, *best.names}:
-                out[names] = float(np.logaddexp.reduce(log_z)) + self.search.prior.log_mean(names)
+                out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_mean(names)
         total = np.logaddexp.reduce(list(out.values()))
         return {names: math.exp(value - total) for names, value in out.items()}
 
@@ -70,18 +76,58 @@ class Ensemble:
         if len(kept) == 1:
             return kept[0][0]
         parts, shares = [part for part, _, _ in kept], np.array([p for _, _, p in kept])
-        null = self.search.sensors[max(part.n_gaussians for part in parts)]
-        return over_hypotheses(parts, shares, null, self.search.recording.plan, rng=self.rng)
+        null = self.searched.nulls[max(part.n_gaussians for part in parts)]
+        return over_hypotheses(parts, shares, null, self.searched.prepared.recording.plan, rng=self.rng)
 
     def _of_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
         """List the refitted candidates of a combination whose SSF is of the form that the best one's is."""
         form = best.found.model.sensor.exchangeable
         return [
             c
-            for (_, key), c in self.search.candidates.items()
+            for (_, key), c in self.searched.evidences.fits.items()
             if key == names and c.found.model.sensor.exchangeable == form
         ]
 
     def _drawn(self, candidate: WeighedFit) -> ModelSamples:
-        evidence = candidate.evidence[self.noise]
-        return sample_model(candidate.found, evidence, self.search.recording, weights=candidate.weights, rng=self.rng)
+        evidence, recording = candidate.evidence[self.noise], self.searched.prepared.recording
+        return sample_model(candidate.found, evidence, recording, weights=candidate.weights, rng=self.rng)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Posterior samples of the null, of the best hypothesis, and of the model that is handed on."""
+
+    null: ModelSamples
+    best: ModelSamples
+    model: ModelSamples
+
+
+def draw_models(searched: Searched, test: GlobalTest, judged: Judged, best: Best, *, rng: np.random.Generator) -> Drawn:
+    """Draw from the posterior of the repaired model, with what a verdict leaves open in its share.
+
+    The best hypothesis alone would be sure and, at times, wrong: what is unknown may not be what it looks like, and
+    what leads but little has rivals.
+    """
+    ensemble, fit, null = Ensemble(searched, best.noise, rng), best.fit, test.null
+    model = samples = ensemble.of(fit)
+    if judged.verdict == "unknown":
+        doubt = _DOUBT_BESIDE
+        if best.out_of_vocabulary:
+            doubt = max(1 - searched.posterior.by_mean[best.out_of_vocabulary], _LEAST_DOUBT)
+        model = ensemble.averaged(fit, {fit.names: 1 - doubt, (): doubt})
+    elif judged.verdict in ("named", "cannot_tell") and fit.names:
+        model = ensemble.averaged(fit, ensemble.likely(fit))
+    elif not (judged.too_little or judged.withdrawn):
+        model = _left_open(ensemble, searched, test, best.noise)
+    return Drawn(samples if fit is null else ensemble.of(null), samples, model)
+
+
+def _left_open(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: Names) -> ModelSamples:
+    """Average over hypotheses where none is stated: what has a name may be it all the same, the rest is the null."""
+    by_mean = searched.posterior.by_mean
+    named = {names for _, names in searched.evidences.fits if not out_of_vocabulary(names)}
+    fit = searched.best(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
+    if fit.names and ruins(Best.of(searched, test, fit, noise, rng=ensemble.rng).improvement):
+        return ensemble.of(test.null)
+    shares = {names: by_mean.get(names, 0.0) for names in ensemble.likely(fit) if names}
+    return ensemble.averaged(fit, {**shares, (): 1 - sum(shares.values())})

@@ -16,7 +16,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
-from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.covariate import Covariate
 
 __all__ = ["unknown_templates", "unlike_named"]
 

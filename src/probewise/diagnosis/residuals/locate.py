@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, frozen
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.residuals.covariates import Covariate
-from probewise.effects import NamedEffect, sign_of_move
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 
 __all__ = ["ALARM", "Place", "global_p_value", "places", "places_of_effect", "windows"]
@@ -203,29 +203,29 @@ def places(
 def places_of_effect(
     effect: NamedEffect[Any],
     change: FloatArray,
-    predicted: FloatArray,
+    covariate: Covariate,
+    scans: Covariate | None,
     plan: Plan,
-    covariates: Sequence[Covariate],
     residuals: FloatArray,
     *,
     p_value: float,
     size: float,
     sd: float,
 ) -> list[Place]:
-    """Say where a named effect is: in the first of its covariates that varies here, where it has half its strength.
+    """Say where a named effect is: where in a covariate it has half its strength.
 
     Parameters
     ----------
     effect
-        The effect; one that is bound to scans is in those of them where it is felt.
+        The effect; one that is bound to scans is in those of them where it is significant.
     change
         What it makes of the readings, (n_points,).
-    predicted
-        The readings with it, (n_points,): a level is what would be read without it.
+    covariate
+        In which it shows.
+    scans
+        The covariate `scan`, where there are several.
     plan
-        Of the readings: a place is along the scans in which it is strongest.
-    covariates
-        Those of the recording.
+        Of the readings.
     residuals
         Of the null, (n_points,), for the witness curve.
     p_value, size
@@ -233,44 +233,25 @@ def places_of_effect(
     sd
         Of the noise.
     """
-    known = {c.name: c for c in covariates if c.scan is None}
-    sign = sign_of_move(plan)
-    if "direction" not in known and np.ptp(sign) > 0:  # to stand still is no direction, but tells what a move does
-        known["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
-    name = next((name for name in effect.covariates if name in known), None)
-    if name is None or not np.any(change):
-        return []
-    covariate = known[name]
-    level = predicted - change if name == "level" else None
-    if level is not None:
-        covariate = replace(covariate, values=level[covariate.rows])
-    if name == "place":
-        covariate = _along_the_strongest(change, plan) or covariate
-    curve = _curve(covariate, residuals, sd)
-    if name == "scan" or (effect.scans and "scan" in effect.covariates and "scan" in known):
-        curve = _curve(known["scan"], residuals, sd)
+    name = covariate.name
+    if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
+        curve = _curve(scans, residuals, sd)
         return [Place("scan", scan, None, None, p_value, size, *curve) for scan in _felt_in(effect.scans, change, plan)]
     strength = np.abs(change[covariate.rows])
-    # What sets in at a level is there from where it is first felt.
+    # What sets in at a level is there from where it is first significant.
     felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
     values = covariate.values[felt]
+    level = covariate.values if name == "level" else None
+    curve = _curve(covariate, residuals, sd)
     return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve, level=level)]
 
 
 def _felt_in(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
-    """Keep the scans in which something is felt, the strongest first: a sheet of one albedo looks the same turned."""
+    """Keep the scans in which something is significant, the strongest first: a plain sheet looks the same turned."""
     rows = {scan: plan.scan == plan.scan_names.index(scan) for scan in scans}
     strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
     felt = [scan for scan in scans if strength[scan] >= _FELT * max(strength.values())]
     return sorted(felt, key=lambda scan: -strength[scan])
-
-
-def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:
-    """Take the places along X or along Y, of readings that were come to that way: where a change is greater."""
-    along_x, along_y = (np.flatnonzero(plan.direction[:, k] != 0) for k in (0, 1))
-    strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
-    rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
-    return Covariate("place", values[rows], rows) if rows.size else None
 
 
 def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:

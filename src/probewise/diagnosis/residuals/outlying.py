@@ -14,7 +14,7 @@ from scipy.special import betaln
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.screening import log_mean
 from probewise.diagnosis.noise.law import NoiseLaw, Tail
-from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import windows
 
 __all__ = ["FAR_OUT", "outlying", "score_together"]

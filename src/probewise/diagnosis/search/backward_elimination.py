@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from probewise.diagnosis.search.constants import ELIMINATED, STEERING, SWAPPED
 from probewise.diagnosis.search.forward_selection import promising, proposals_for
 from probewise.diagnosis.search.state import SearchState
-from probewise.diagnosis.search.weighed_fit import STEERING, WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 
 __all__ = ["eliminate_backward"]
 
 Names = tuple[str, ...]
-
-_TAKEN_APART = 3  # leading combinations, of which each effect is left out in turn
-_SWAPPED = 2  # that lead beside what is left, what was left out or another
 
 
 def eliminate_backward(state: SearchState) -> None:
@@ -25,7 +23,7 @@ def eliminate_backward(state: SearchState) -> None:
         [c for c in several if not out_of_vocabulary(c.names)],
         [c for c in several if out_of_vocabulary(c.names)],
     )
-    for candidate in [*named[:_TAKEN_APART], *rest[:1]]:
+    for candidate in [*named[:ELIMINATED], *rest[:1]]:
         for left_out in candidate.names:
             others = tuple(name for name in candidate.names if name != left_out)
             if others not in state.refitted | state.undetected:
@@ -38,7 +36,7 @@ def eliminate_backward(state: SearchState) -> None:
 def _select_again(state: SearchState, held: WeighedFit, names: Names) -> None:
     """Refit a candidate with what makes it these names, and with what leads beside it."""
     proposals = proposals_for(state, held, {})
-    chosen = [names, *promising(state, proposals, width=_SWAPPED, behind=STEERING)[:_SWAPPED]]
+    chosen = [names, *promising(state, proposals, width=SWAPPED, behind=STEERING)[:SWAPPED]]
     for added in [proposals[key].added for key in chosen if key in proposals]:
         if (held, added) not in state.extended:
             state.refit(held, added)

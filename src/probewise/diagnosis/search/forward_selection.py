@@ -7,27 +7,24 @@ from dataclasses import dataclass, replace
 
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs
+from probewise.diagnosis.search.constants import (
+    EXTENDED_WITHIN,
+    FAINT,
+    MOST_OUT_OF_VOCABULARY,
+    ORDERS_WITHIN,
+    PAIRED,
+    PAIRED_FROM,
+    REFITTED_WITHIN,
+    SINGLES,
+    STEERING,
+)
 from probewise.diagnosis.search.state import SearchState, rivals_of
-from probewise.diagnosis.search.weighed_fit import STEERING, WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import EFFECTS
 
-__all__ = ["EXTENDED_WITHIN", "REFITTED_WITHIN", "Proposal", "promising", "proposals_for", "select_forward"]
+__all__ = ["Proposal", "promising", "proposals_for", "select_forward"]
 
 Names = tuple[str, ...]
-
-EXTENDED_WITHIN = 20.0
-"""Nats behind the best of its size: nothing more grows from there."""
-
-REFITTED_WITHIN = 6.0
-"""Nats behind the best so far: screening about a fit that one effect has bent is so far off."""
-
-# An effect may look like another Gaussian, and be explained better by its name at fewer of them.
-_ORDERS_WITHIN = 100.0  # nats behind the best: an SSF order so far back is not searched
-_WORTH_PAIRING = 2.0  # nats of the best effect alone, below which no pair stands out either
-_PAIRED = 12  # effects that pairs are screened of, the best alone
-_SINGLES = 6  # effects that are refitted alone
-_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
-_FAINT = 0.35  # of a trace; where a null leaves no more to first order, a large effect may show in another way
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +44,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
     extended = [
         c
         for c in state.nulls
-        if c.log_z > null.log_z - (_ORDERS_WITHIN if c.degrees_of_freedom <= null.degrees_of_freedom else STEERING)
+        if c.log_z > null.log_z - (ORDERS_WITHIN if c.degrees_of_freedom <= null.degrees_of_freedom else STEERING)
     ]
     for size in range(1, min(depth, len(state.effects)) + 1):
         proposals: dict[Names, Proposal] = {}
@@ -72,8 +69,8 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     for noise, evidence in null.steering():
         problem = Linearised.of(null.found, evidence.law)
         singles = score_effects(problem, state.bank(null))
-        ranked = sorted(singles, key=lambda name: -float(singles[name].max()))[:_PAIRED]
-        if not ranked or log_mean(singles[ranked[0]]) < _WORTH_PAIRING:
+        ranked = sorted(singles, key=lambda name: -float(singles[name].max()))[:PAIRED]
+        if not ranked or log_mean(singles[ranked[0]]) < PAIRED_FROM:
             continue
         singles = {name: singles[name] for name in ranked}
         templates = {name: state.templates.of(null.found, state.effects[name]) for name in ranked}
@@ -115,7 +112,7 @@ def promising(state: SearchState, proposals: Mapping[Names, Proposal], *, width:
     named, rest = [n for n in ranked if not out_of_vocabulary(n)], [n for n in ranked if out_of_vocabulary(n)]
     return [
         names
-        for names in [*named[:width], *rest[:_OUT_OF_VOCABULARY]]
+        for names in [*named[:width], *rest[:MOST_OUT_OF_VOCABULARY]]
         if odds[names] >= max(state.odds(c) for c in rivals_of(names, state.candidates.values())) - behind
     ]
 
@@ -128,9 +125,9 @@ def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Propo
     """
     ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
     left = state.bank(null).surviving(Linearised.of(null.found, null.law))
-    faint = {name for name, members in state.bank(null).members.items() if left[members].max() < _FAINT}
+    faint = {name for name, members in state.bank(null).members.items() if left[members].max() < FAINT}
     always = (state.effects.keys() - EFFECTS) | faint
-    chosen = promising(state, proposals, width=_SINGLES, behind=REFITTED_WITHIN)
+    chosen = promising(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
 
 

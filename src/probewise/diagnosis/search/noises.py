@@ -14,15 +14,14 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
 from probewise.diagnosis.evidence.templates import subsets
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
-from probewise.diagnosis.search.odds import PriorOdds
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.search.constants import NOISE_PAIR_WITHIN
 from probewise.effects import NoiseEffect, Quantisation, lattice_step
 from probewise.recordings.plan import Recording
 
 __all__ = ["Noises"]
 
 Names = tuple[str, ...]
-
-_WORTH_A_PAIR = 3.0  # nats over white noise from which a second fault of the noise is looked for
 
 
 @dataclass(eq=False)
@@ -79,7 +78,7 @@ class Noises:
         """Where one fault stands out about a fit, add the pairs that rival it; tell whether it was looked for."""
         single = {names: e for names, e in evidence.items() if names != self.certain}
         first = max(single, key=lambda names: single[names].log_z, default=self.certain)
-        if first == self.certain or single[first].log_z < evidence[self.certain].log_z + _WORTH_A_PAIR:
+        if first == self.certain or single[first].log_z < evidence[self.certain].log_z + NOISE_PAIR_WITHIN:
             return False
         (name,) = (n for n in first if n not in self.certain)
         likely = {name: single[first].likely_nodes(name)}
@@ -90,6 +89,6 @@ class Noises:
                 continue
             model = self._model(both, likely | self.models[other].every_third())
             value = weigh(found, model).log_z
-            if value + self.log_prior(both) > best - _WORTH_A_PAIR:
+            if value + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
                 self.models[both] = model
         return True

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.search.forward_selection import REFITTED_WITHIN
+from probewise.diagnosis.search.constants import MOST_AT_OTHER_ORDERS, REFITTED_AT_OTHER_ORDERS, REFITTED_WITHIN
 from probewise.diagnosis.search.refits import is_significant
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
@@ -15,9 +15,6 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 __all__ = ["at_other_orders"]
 
 Names = tuple[str, ...]
-
-_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
-_LEAST_ELSEWHERE = 1e-4  # probability of such a combination, among those with a formula
 
 
 def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
@@ -27,9 +24,9 @@ def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
     """
     known = sum(p for names, p in by_mean.items() if names != ("unknown",))
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
-    for names in leaders[:_AT_OTHER_ORDERS]:
+    for names in leaders[:MOST_AT_OTHER_ORDERS]:
         held = state.of(names)
-        if held and by_mean[names] >= _LEAST_ELSEWHERE * known:
+        if held and by_mean[names] >= REFITTED_AT_OTHER_ORDERS * known:
             source = max(held, key=lambda c: c.log_z)
             for n in _rival_orders(state, source):
                 _carry_over(state, source, n)

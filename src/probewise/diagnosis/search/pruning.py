@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.weighed_fit import ALIASED_NATS, WeighedFit, expected_nats, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, out_of_vocabulary
 
 __all__ = ["prune"]
 

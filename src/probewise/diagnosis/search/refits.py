@@ -20,6 +20,7 @@ from probewise.diagnosis.evidence.visible import log_visible
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.search.constants import VARIANTS_TRIED
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
@@ -27,8 +28,6 @@ from probewise.effects import NamedEffect
 __all__ = ["Refits", "is_significant"]
 
 Names = tuple[str, ...]
-
-_WORTH_TRYING = 0.05  # of the leading variant's weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,4 +150,4 @@ def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:
     """
     first, *others = np.argsort(-weights)[:2].tolist()
     bound = templates.variants[first].scans or templates.variants[first].patterns
-    return [first, *(k for k in others if bound and weights[k] > _WORTH_TRYING * weights[first])]
+    return [first, *(k for k in others if bound and weights[k] > VARIANTS_TRIED * weights[first])]

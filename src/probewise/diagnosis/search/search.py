@@ -7,130 +7,114 @@ Laplace weighs.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.templates import TemplateMemory
-from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.noise.law import steps_within_scans
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.bases import unknown_templates, unlike_named
-from probewise.diagnosis.residuals.covariates import covariates_of, slope_along_the_move
 from probewise.diagnosis.search.backward_elimination import eliminate_backward
-from probewise.diagnosis.search.forward_selection import EXTENDED_WITHIN, select_forward
+from probewise.diagnosis.search.constants import (
+    EXTENDED_WITHIN,
+    FEW_READINGS,
+    MAX_ORDER,
+    MOST_REFITTED_LATE,
+    REFITTED_LATE,
+    WITH_UNKNOWN,
+)
+from probewise.diagnosis.search.forward_selection import select_forward
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.orders import at_other_orders
 from probewise.diagnosis.search.pruning import prune
 from probewise.diagnosis.search.refits import Refits
+from probewise.diagnosis.search.searched import Evidences, Posterior, Screening, Searched, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import Unknown
-from probewise.diagnosis.search.weighed_fit import Search, weighed
-from probewise.effects import UNNAMED, NamedEffect, NoiseEffect
-from probewise.recordings.plan import Recording
-from probewise.sensor import Stage
+from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
+from probewise.effects import NoiseEffect
 
 __all__ = ["search"]
 
-_WITH_UNKNOWN = 4  # refitted candidates that something unknown is weighed beside
-_MATTERS = 0.02  # probability by screening alone, from which on a combination is refitted
-_MOST_THAT_MATTER = 6
-
 
 def search(
-    recording: Recording,
-    effects: Mapping[str, NamedEffect[Any]],
+    prepared: Prepared,
     *,
-    sensor: Null | None,
     prior: PriorOdds | None = None,
-    max_order: int = 3,
+    max_order: int | None = None,
     beam: int = 8,
     depth: int = 3,
-) -> Search:
+) -> Searched:
     """Weigh every combination of effects.
 
     Parameters
     ----------
-    recording
-        What was read.
-    effects
-        The vocabulary to search, by name.
-    sensor
-        What is believed of the sensor, or of any other model; None: calibrated from the recording alone.
+    prepared
+        What is to be diagnosed.
     prior
-        Prior odds.
+        Prior odds; the apparatus's by default.
     max_order
-        Largest number of Gaussians tried without a sensor; one more where that is not far behind.
+        Largest number of Gaussians tried without a null; one more where that is not far behind. By default three, of
+        few readings one.
     beam, depth
         How many combinations of each size above one are refitted, and the largest size.
     """
-    prior = prior or PriorOdds.over(effects)
-    on_noise = {name: cast(NoiseEffect, e) for name, e in effects.items() if e.stage is Stage.NOISE}
+    recording, effects = prepared.recording, prepared.effects
+    if max_order is None:
+        max_order = 1 if len(prepared.usable) < FEW_READINGS else MAX_ORDER
+    prior = prior or prepared.apparatus.prior_odds(effects)
+    on_noise = {name: cast(NoiseEffect, effects[name]) for name in effects if name in prepared.on_noise}
     noises = Noises(recording, on_noise, prior)
-    templates = TemplateMemory(np.flatnonzero(recording.usable))
+    templates = TemplateMemory(prepared.usable)
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
-    state = SearchState(on_mean, prior, noises, templates, Refits(sensor, noises, templates))
-    fit_nulls(state, sensor, max_order=max_order)
-    null = state.null
-    unknown = _unknown(state)
+    state = SearchState(on_mean, prior, noises, templates, Refits(prepared.null, noises, templates))
+    fit_nulls(state, prepared, max_order=max_order)
+    unknown = _unknown(state, prepared)
+    screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)
 
-    def weighed_up() -> Search:
-        return weighed(
-            Search(
-                recording,
-                effects,
-                noises.models,
-                noises.certain,
-                state.sensors,
-                state.candidates,
-                state.screened(),
-                unknown.log_z,
-                prior,
-                unknown.covariates,
-                unknown.bases,
-                unknown.shares,
-                null.found,
-                templates,
-            )
-        )
+    def evidences() -> Evidences:
+        return Evidences(state.candidates, state.screened(), unknown.log_z, unknown.shares)
+
+    def posterior() -> Posterior:
+        return posterior_of(evidences(), prior, certain=noises.certain, n_forms=len(state.sensors))
 
     select_forward(state, beam=beam, depth=depth)
     eliminate_backward(state)
     # Beside a form of the SSF that the readings refute, it is the form that is missing.
     unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
-    for _ in range(_MOST_THAT_MATTER):
-        by_mean = weighed_up().by_mean
+    for _ in range(MOST_REFITTED_LATE):
+        by_mean = posterior().by_mean
         settled = {(), ("unknown",)} | state.undetected | state.refitted
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
-        if by_mean.get(names, 0.0) <= _MATTERS or not names:
+        if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
             break
         state.reach(names)
-    if sensor is None:
-        at_other_orders(state, weighed_up().by_mean)
+    if prepared.null is None:
+        at_other_orders(state, posterior().by_mean)
     state.candidates, state.pruned = prune(state.candidates, noises)
     refitted = [c for c in state.candidates.values() if c.names]
-    unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
+    unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
     unknown.prune(state.candidates.values())
-    return weighed_up()
+    return Searched(prepared, prior, noises.models, noises.certain, state.sensors, screening, evidences(), posterior())
 
 
-def _unknown(state: SearchState) -> Unknown:
-    """Lay out what has no name about the best null."""
-    null, recording = state.null, state.noises.recording
-    usable = np.flatnonzero(recording.usable)
-    level, model, z = null.found.predicted, null.found.model, null.found.z[None, :]
-    slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
-    covariates = covariates_of(recording.plan, usable, level, slope)
+def _unknown(state: SearchState, prepared: Prepared) -> Unknown:
+    """Build what has no name about the best null."""
+    null, recording = state.null, prepared.recording
+    covariates, slope = prepared.apparatus.covariates(null.found, recording)
+    level = null.found.predicted
     starts = np.flatnonzero(steps_within_scans(recording) == 0)
     bases = unknown_templates(covariates, level - level.min(), slope, starts)
-    named = [effect for name, effect in state.effects.items() if name not in UNNAMED]
+    named = [effect for name, effect in state.effects.items() if not out_of_vocabulary((name,))]
     problem = Linearised.of(null.found, state.refits.law_of(null))
+    each = state.prior.unknown_complexity_penalty
     return Unknown(
         unlike_named(bases, state.templates.bank(null.found, named), problem),
         tuple(covariates),
         state.noises,
-        lambda worth: state.complexity_penalty(worth, state.prior.unknown_complexity_penalty),
+        lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
     )

@@ -13,8 +13,8 @@ from scipy.special import logsumexp
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.odds import PriorOdds
 from probewise.diagnosis.search.refits import Refits, is_significant
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import NamedEffect

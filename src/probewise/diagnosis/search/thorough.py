@@ -20,7 +20,8 @@ from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
-from probewise.diagnosis.search.weighed_fit import Search, WeighedFit, in_vocabulary, weighed
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.errors import DoubtfulResultWarning
 
@@ -41,8 +42,8 @@ Run = Callable[..., nested.NestedResult]
 
 
 def weigh_thoroughly(
-    search: Search, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress | None = None
-) -> tuple[Search, tuple[Weighing, ...]]:
+    searched: Searched, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress | None = None
+) -> tuple[Searched, tuple[Weighing, ...]]:
     """Weigh two or three leading hypotheses, and the null, by nested sampling.
 
     Where the two disagree by more than a nat, and no run has doubts, nested sampling wins: the evidence of what
@@ -52,7 +53,7 @@ def weigh_thoroughly(
 
     Parameters
     ----------
-    search
+    searched
         What Laplace's approximation has weighed.
     rng
         Source of randomness.
@@ -68,46 +69,48 @@ def weigh_thoroughly(
     the most probable first.
     """
     weighings: dict[tuple[int, Names], Weighing] = {}
-    for (candidate, noise), own in zip(leaders := _leaders(search), rng.spawn(len(leaders)), strict=True):
+    for (candidate, noise), own in zip(leaders := _leaders(searched), rng.spawn(len(leaders)), strict=True):
         key = candidate.n_gaussians, candidate.names
-        weighings[key] = _weigh(candidate, noise, search, rng=own, n_live=n_live, progress=progress)
+        weighings[key] = _weigh(candidate, noise, searched, rng=own, n_live=n_live, progress=progress)
     told = tuple(weighings.values())
     if all(w.agree for w in told) or any(w.doubts for w in told):
-        return search, told
+        return searched, told
     common = next((w.gap for (_, names), w in weighings.items() if not names), 0.0)
-    return _moved(search, {key: w.gap - common for key, w in weighings.items()}), told
+    return searched.with_evidences(
+        searched.evidences.moved({key: w.gap - common for key, w in weighings.items()})
+    ), told
 
 
-def _leaders(search: Search) -> list[tuple[WeighedFit, Names]]:
+def _leaders(searched: Searched) -> list[tuple[WeighedFit, Names]]:
     """List the leading refitted hypotheses about the mean, each under its best noise, then the null if not among them.
 
     All under the SSF order that has the most evidence for each, the null under that of the first.
     """
-    merged = search.by_mean
+    merged = searched.posterior.by_mean
     out: list[tuple[WeighedFit, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
         if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
             break
-        noise = _noise_of(search, mean)
-        candidate = search.best(mean, noise)
+        noise = _noise_of(searched, mean)
+        candidate = searched.best(mean, noise)
         if candidate is not None:
             out.append((candidate, noise))
-    null = search.candidates[out[0][0].n_gaussians if out else search.order, ()]
+    null = searched.evidences.fits[out[0][0].n_gaussians if out else searched.order, ()]
     if all(candidate.names for candidate, _ in out):
-        out.append((null, _noise_of(search, ())))
+        out.append((null, _noise_of(searched, ())))
     return out
 
 
-def _noise_of(search: Search, mean: Names) -> Names:
+def _noise_of(searched: Searched, mean: Names) -> Names:
     """Find the noise model under which a hypothesis about the mean is most probable."""
-    own = {noise: p for (names, noise), p in search.probabilities.items() if names == mean}
+    own = {noise: p for (names, noise), p in searched.posterior.probabilities.items() if names == mean}
     return max(own, key=lambda noise: own[noise])
 
 
 def _weigh(
     candidate: WeighedFit,
     noise: Names,
-    search: Search,
+    searched: Searched,
     *,
     rng: np.random.Generator,
     n_live: int,
@@ -116,7 +119,7 @@ def _weigh(
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = JointProblem(candidate.found.model, search.recording, evidence)
+    problem = JointProblem(candidate.found.model, searched.prepared.recording, evidence)
     once = folded(problem, candidate.found.z)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
@@ -179,12 +182,3 @@ class _Evidence:
     log_z: float
     error: float
     warnings: tuple[str, ...] = ()
-
-
-def _moved(search: Search, gaps: dict[tuple[int, Names], float]) -> Search:
-    """Move the evidence of candidates, and of what is unknown beside them, under every noise model alike."""
-    candidates = dict(search.candidates)
-    for key, gap in gaps.items():
-        candidates[key] = candidates[key].moved(gap)
-    unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in search.unknown.items()}
-    return weighed(replace(search, candidates=candidates, unknown=unknown))

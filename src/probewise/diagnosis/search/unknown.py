@@ -12,10 +12,11 @@ from scipy.special import logsumexp
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_unknown
-from probewise.diagnosis.residuals.covariates import Covariate
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.outlying import outlying, score_together
+from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.weighed_fit import ALIASED_NATS, WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 
 __all__ = ["Unknown"]
 

@@ -1,47 +1,27 @@
-"""What a search has weighed: combinations refitted, the rest by screening, all turned into probabilities."""
+"""A combination of effects, refitted and weighed."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
-from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.residuals.covariates import Covariate
-from probewise.diagnosis.search.odds import PriorOdds
-from probewise.effects import NUISANCES, UNNAMED, NamedEffect
-from probewise.recordings.plan import Recording
-from probewise.sensor import Stage
+from probewise.diagnosis.search.constants import STEERING
+from probewise.effects import NUISANCES, UNNAMED
 
 __all__ = [
-    "ALIASED_NATS",
-    "STEERING",
-    "Search",
     "WeighedFit",
     "expected_nats",
     "in_vocabulary",
     "out_of_vocabulary",
-    "weighed",
 ]
 
 Names = tuple[str, ...]
-
-STEERING = 3.0
-"""Nats behind the best: a noise model further back does not say what to look for next."""
-
-ALIASED_NATS = 3.0
-"""Nats that readings are expected to tell between two hypotheses; with fewer they cannot tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,83 +91,6 @@ class WeighedFit:
         return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
 
 
-@dataclass(frozen=True, eq=False)
-class Search:
-    """Everything weighed: refitted candidates by (order, names), and the screened rest.
-
-    Hypotheses are pairs (mean, noise) of names; the mean ("unknown",) is what has no name, alone or beside others.
-    """
-
-    recording: Recording
-    effects: Mapping[str, NamedEffect[Any]]
-    noise_models: Mapping[Names, NoiseModel]
-    certain: Names  # effects on the noise that the readings show without doubt
-    sensors: Mapping[int, Null]
-    candidates: Mapping[tuple[int, Names], WeighedFit]
-    screened: Mapping[tuple[Names, Names], float]  # (mean, noise) -> log evidence
-    unknown: Mapping[tuple[int, Names, Names], float]  # (order, mean, noise) -> log evidence
-    prior: PriorOdds
-    covariates: tuple[Covariate, ...]
-    unknown_bases: Bank
-    unknown_shares: Mapping[str, float]
-    about: Fit  # where the templates of the tests are laid out
-    templates: TemplateMemory
-    probabilities: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
-    order_probabilities: Mapping[int, float] = field(default_factory=dict)  # of the clean mean
-
-    def best(self, names: Names, noise: Names) -> WeighedFit | None:
-        """Return the refitted candidate of these effects with the most evidence over orders."""
-        options = [c for (_, key), c in self.candidates.items() if key == names]
-        return max(options, key=lambda c: c.evidence[noise].log_z, default=None)
-
-    def alike(self, names: Names) -> frozenset[Names]:
-        """Give the other combinations that these readings cannot tell from this one, at any SSF order; () has none."""
-        return frozenset(
-            key
-            for (n, key), other in self.candidates.items()
-            if names and key and key != names and (n, names) in self.candidates
-            if expected_nats(self.candidates[n, names], other) < ALIASED_NATS
-        )
-
-    @property
-    def by_mean(self) -> dict[Names, float]:
-        """Probability of each hypothesis about the mean, under any noise."""
-        out: dict[Names, float] = {}
-        for (mean, _), p in self.probabilities.items():
-            out[mean] = out.get(mean, 0.0) + p
-        return out
-
-    def beside(self, noise: Names) -> WeighedFit | None:
-        """Give the fit beside which something unknown most probably is; None where nothing unknown was weighed."""
-        scores = {
-            (n, names): value + self.prior.log_unknown(names)
-            for (n, names, own), value in self.unknown.items()
-            if own == noise
-        }
-        return self.candidates[max(scores, key=lambda key: scores[key])] if scores else None
-
-    def looks(self, found: Fit) -> list[Bank]:
-        """List every template that a test looks at about a fit: of the effects that it lacks, and the unknown.
-
-        All are laid out about one fit: those of one recording predict much the same, and which templates a test looks
-        with is its own choice.
-        """
-        on_mean = [effect for effect in self.effects.values() if effect.stage is not Stage.NOISE]
-        missing = [effect for effect in on_mean if effect.name not in found.model.names]
-        return [self.templates.bank(self.about, missing), self.unknown_bases]
-
-    @property
-    def order(self) -> int:
-        """SSF order of the most probable explanation, named or not: that at which the null is tested."""
-        by_order: dict[int, float] = {}
-        terms = [(n, c.log_z + self.prior.log_mean(names)) for (n, names), c in self.candidates.items()]
-        for (n, names, _), value in self.unknown.items():
-            terms.append((n, value + self.prior.log_unknown(names)))
-        for n, value in terms:
-            by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
-        return max(by_order, key=lambda n: by_order[n])
-
-
 def expected_nats(first: WeighedFit, second: WeighedFit) -> float:
     """Log Bayes factor to be expected between two refitted models if the first is true.
 
@@ -205,31 +108,3 @@ def in_vocabulary(noise: Names) -> Names:
 def out_of_vocabulary(mean: Names) -> Names:
     """Keep those of a combination on the mean that have a formula and no name in the vocabulary."""
     return tuple(name for name in mean if name in UNNAMED)
-
-
-def weighed(search: Search) -> Search:
-    """Turn evidences into probabilities of (mean, noise) hypotheses, summed over SSF orders."""
-    prior = search.prior
-    log_order = -math.log(len(search.sensors))
-    log_z: dict[tuple[Names, Names], float] = {}
-    for (_, names), candidate in search.candidates.items():
-        for noise, evidence in candidate.evidence.items():
-            log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
-    log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
-    for (_, names, noise), value in search.unknown.items():
-        key = ("unknown",), noise
-        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
-    for (names, noise), value in search.screened.items():
-        log_p[names, noise] = value + prior.log_mean(names)
-    for names, noise in log_p:
-        uncertain = tuple(n for n in noise if n not in search.certain)
-        log_p[names, noise] += log_order + prior.log_noise(uncertain)
-    total = float(logsumexp(list(log_p.values())))
-    nulls = {n: c for (n, names), c in search.candidates.items() if not names}
-    clean_by_order = {n: float(logsumexp([e.log_z for e in c.evidence.values()])) for n, c in nulls.items()}
-    norm = float(logsumexp(list(clean_by_order.values())))
-    return replace(
-        search,
-        probabilities={key: math.exp(value - total) for key, value in log_p.items()},
-        order_probabilities={n: math.exp(v - norm) for n, v in clean_by_order.items()},
-    )

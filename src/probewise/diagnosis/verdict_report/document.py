@@ -7,7 +7,8 @@ from importlib.resources import files
 from typing import Any
 
 from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.verdict_report.verdict import Diagnosis, ParameterFound
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.diagnosis.verdict_report.findings import ParameterFound
 
 __all__ = ["NEXT_PLAN", "diagnosis_json", "diagnosis_schema"]
 
@@ -45,12 +46,12 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for e in diagnosis.effects
         ],
-        "unknown_probability": diagnosis.unknown_probability,
-        "clean_probability": diagnosis.clean_probability,
+        "unknown_probability": diagnosis.judged.unknown_probability,
+        "clean_probability": diagnosis.judged.clean_probability,
         "unknown_candidates": [
-            {"name": name, "probability": probability} for name, probability in diagnosis.unknown_candidates
+            {"name": name, "probability": probability} for name, probability in diagnosis.judged.unknown_candidates
         ],
-        "credible_set": list(diagnosis.credible),
+        "credible_set": list(diagnosis.judged.credible),
         "where": [
             {
                 "covariate": place.covariate,
@@ -72,12 +73,12 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "aliases": [
             {"effects": list(a.effects), "cosine": a.cosine, "settle_by": a.settle_by, "readings": a.readings}
-            for a in diagnosis.aliases
+            for a in diagnosis.judged.aliases
         ],
         "noise": {
-            "model": diagnosis.noise.model,
-            "p_value": diagnosis.noise.p_value,
-            "parameters": [_parameter(p) for p in diagnosis.noise.parameters],
+            "model": diagnosis.report.noise.model,
+            "p_value": diagnosis.report.noise.p_value,
+            "parameters": [_parameter(p) for p in diagnosis.report.noise.parameters],
         },
         "next_measurement": None
         if plan is None
@@ -88,7 +89,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,
         },
     }
-    return document | ({"thorough": [_weighing(w) for w in diagnosis.weighings]} if diagnosis.weighings else {})
+    return document | (
+        {"thorough": [_weighing(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
+    )
 
 
 def _weighing(twice: Weighing) -> dict[str, Any]:

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
+from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.repair.samples import ModelSamples, sample_model
+from probewise.diagnosis.search.constants import MAX_ORDER
 from probewise.diagnosis.search.search import search
 from probewise.effects import EFFECTS, Extent, NamedEffect
 from probewise.errors import ParameterError
@@ -46,7 +49,8 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
         if effect is None:
             raise ParameterError("names", name, "effects of the vocabulary that can show in this recording")
         effects[name] = effect
-    found = search(recording, effects, sensor=None, depth=max(len(names), 1))
+    prepared = Prepared(recording, effects, None, LightSensor(), recording)
+    found = search(prepared, max_order=MAX_ORDER, depth=max(len(names), 1))
     on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
     on_noise = tuple(sorted(set(names) - set(on_mean)))
     noise = on_noise if on_noise in found.noise_models else found.certain

@@ -13,14 +13,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.advice.commands import (
-    Command,
-    distinct_scans,
-    excerpts,
-    reading_s,
-    rescheduled,
-    start_after,
-)
+from probewise.diagnosis.light_sensor.commands import distinct_scans, excerpts, reading_s, rescheduled
+from probewise.diagnosis.scheduling import Command, start_after
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 

@@ -8,19 +8,25 @@ and covariates; it names no physics, so the sensor written to sensor.json does n
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.held_out import HeldOut, compare_parts
+from probewise.diagnosis.evidence.held_out import HeldOut, compare_parts, held_out_blocks
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.repair.improvement import N_DRAWS, Improvement
+from probewise.diagnosis.residuals.locate import ALARM, global_p_value
+from probewise.diagnosis.search.searched import Searched
 
-__all__ = ["Correction", "correct"]
+__all__ = ["Correction", "correct", "corrected"]
 
 _ABOUT_EQUAL = 5.0  # nats
+_MOST_BASES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +70,63 @@ def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Cor
         return _log_density(found, problem, columns, out) - _log_density(found, problem, plain, out)
 
     return Correction(change, columns, compare_parts(scan, gain))
+
+
+def corrected(
+    searched: Searched, test: GlobalTest, best: Best, *, rng: np.random.Generator
+) -> tuple[Improvement, FloatArray]:
+    """Repair what the named effects leave by bases without a name, where that predicts held-out parts.
+
+    One basis at a time, the most telling, until nothing more is missing or the next gains nothing. Where the first
+    gains nothing on other scans, blocks within scans are held out instead: of what is local in time.
+
+    Returns
+    -------
+    improvement, change
+        That of `best` with what the correction adds, and the correction of the usable readings, (n_usable,).
+    """
+    prepared, bases, problem = searched.prepared, searched.screening.unknown_bases, best.problem
+    found, gain = best.fit.found, best.improvement
+    parts, part_names = prepared.apparatus.held_out_parts(prepared.recording)
+    fixed = correct(found, problem, bases, parts)
+    if fixed.gains_nothing:
+        parts, part_names = held_out_blocks(prepared.recording)
+        fixed = correct(found, problem, bases, parts)
+        gain = replace(gain, heldout_by_scan=())
+    change = np.zeros(len(fixed.change))
+    if fixed.gains_nothing:
+        return best.improvement, change
+    plain_z = test.null.evidence[best.noise].log_z
+    key = (best.fit.n_gaussians, best.fit.names, best.noise)
+    log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
+    for step in range(_MOST_BASES):
+        if step:
+            fixed = correct(found, problem, bases, parts)
+        held = fixed.held_out
+        if step and held.per_reading <= held.sd:
+            break
+        found = replace(
+            found,
+            residuals=found.residuals - fixed.change,
+            slopes=np.concatenate([found.slopes, fixed.columns], axis=1),
+            z=np.concatenate([found.z, np.zeros(fixed.columns.shape[1])]),
+        )
+        change = change + fixed.change
+        problem = Linearised.of(found, problem.law)
+        before = dict(gain.heldout_by_scan)
+        by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
+        gain = replace(
+            gain,
+            log_evidence=log_evidence,
+            heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
+            heldout_sd=math.hypot(gain.heldout_sd, held.sd),
+            heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
+            rms_after=float(np.sqrt(np.mean(found.residuals**2))),
+            p_value_after=global_p_value(problem, searched.looks(best.fit.found), problem.draws(N_DRAWS, rng=rng)),
+        )
+        if gain.p_value_after >= ALARM or not held.by_scan:
+            break
+    return gain, change
 
 
 def _without(

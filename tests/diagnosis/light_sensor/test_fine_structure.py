@@ -10,8 +10,8 @@ from probewise.diagnosis.fitting.coordinates import default_sensor, known_scene
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.fitting.own_model import OwnModel
+from probewise.diagnosis.light_sensor.fine_structure import fine_structure
 from probewise.diagnosis.noise.law import white
-from probewise.diagnosis.residuals.fine_structure import fine_structure
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import LogUniform, Product
 from probewise.recordings import Recording, paper_plan, two_way_plan

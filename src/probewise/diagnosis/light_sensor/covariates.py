@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.effects import edge_distance, sign_of_move
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.effects import NamedEffect, edge_distance, sign_of_move
 from probewise.recordings.plan import Plan
 from probewise.scene import region_of
 
-__all__ = ["Covariate", "covariates_of", "slope_along_the_move"]
+__all__ = ["covariate_of", "covariates_of", "slope_along_the_move"]
 
 
 _MOST_SCANS = 24  # beyond which no place is looked for in each scan by itself
-
-
-@dataclass(frozen=True, eq=False)
-class Covariate:
-    """One covariate of the usable rows.
-
-    `values` (n_usable,) in its unit; `rows` those usable rows it is defined for; `groups` says that
-    only whole groups of equal values make sense (an orientation, a scan). `scan` is the scan's name
-    where it is meant within one scan.
-    """
-
-    name: str
-    values: FloatArray
-    rows: IntArray
-    groups: bool = False
-    scan: str | None = None
 
 
 def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
@@ -95,6 +81,44 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
             if _varies(along):
                 out.append(Covariate("place", along, rows, scan=name))
     return out
+
+
+def covariate_of(
+    effect: NamedEffect[Any], change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
+) -> Covariate | None:
+    """Choose the first of an effect's covariates that varies here; None where none does, or nothing changes.
+
+    Parameters
+    ----------
+    effect
+        The effect.
+    change
+        What it makes of the readings, (n_points,).
+    without
+        What would be read without it, (n_points,), which is what a level is.
+    plan
+        Of the readings: a place is along the scans in which the change is greatest.
+    known
+        Covariates of the recording.
+    """
+    pooled = {c.name: c for c in known if c.scan is None}
+    sign = sign_of_move(plan)
+    if "direction" not in pooled and np.ptp(sign) > 0:  # to stand still is no direction, but tells what a move does
+        pooled["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
+    name = next((name for name in effect.covariates if name in pooled), None)
+    if name is None or not np.any(change):
+        return None
+    if name == "level":
+        return replace(pooled[name], values=without[pooled[name].rows])
+    return (_along_the_strongest(change, plan) if name == "place" else None) or pooled[name]
+
+
+def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:
+    """Take the places along X or along Y, of readings that were come to that way: where a change is greater."""
+    along_x, along_y = (np.flatnonzero(plan.direction[:, k] != 0) for k in (0, 1))
+    strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
+    rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
+    return Covariate("place", values[rows], rows) if rows.size else None
 
 
 def _edge_distance(plan: Plan) -> FloatArray:

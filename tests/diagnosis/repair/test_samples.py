@@ -11,7 +11,7 @@ from probewise.diagnosis.fitting.fit import Model, fit
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.noise.law import white
 from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.repair.repaired import ModelSamples, sample_model
+from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.effects import Extent
 from probewise.recordings import Recording, two_way_plan
 from probewise.sensor import total_variation

@@ -1,0 +1,39 @@
+"""The forms of an SSF that is calibrated from the recording itself: one Gaussian, any form, more Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, default_sensor
+from probewise.diagnosis.fitting.fit import Fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.effects import Extent
+
+__all__ = ["SsfForms"]
+
+_Start = tuple[CalibratedSensor, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class SsfForms:
+    """Sensors whose priors fit a recording of this extent, each with coordinates to fit it from."""
+
+    extent: Extent
+
+    def simplest(self) -> _Start:
+        """One Gaussian: typical, narrow and wide."""
+        one = default_sensor(self.extent, 1)
+        return one, starts_of_one_gaussian(one)
+
+    def free(self, found: Fit) -> _Start:
+        """Any form, unbent from the fit of one Gaussian."""
+        one = found.model.sensor
+        assert isinstance(one, SensorCoordinates)
+        free = FreeForm.about(one)
+        return free, free.start_from(found.z)
+
+    def one_more(self, found: Fit, order: int) -> _Start:
+        """So many Gaussians, the heaviest of the fit split in several ways."""
+        wanted = default_sensor(self.extent, order)
+        return wanted, start_with_more_gaussians(found.model.sensor, found.z, wanted)

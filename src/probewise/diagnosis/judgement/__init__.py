@@ -1,0 +1,1 @@
+"""What is believed: the test that nothing is missing, and the verdict."""

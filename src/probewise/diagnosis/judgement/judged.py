@@ -1,0 +1,200 @@
+"""The verdict: from probabilities, the test, and what these readings cannot tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+from probewise.diagnosis.advice.aliases import Alias, aliased_pairs
+from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.residuals.locate import ALARM
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import in_vocabulary, out_of_vocabulary
+
+__all__ = ["Hypothesis", "Judged", "Verdict", "credible_set", "decide", "hypotheses_of", "judge", "verdict_on"]
+
+Names = tuple[str, ...]
+
+Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
+
+_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of effects and its probability; () is clean, ("unknown",) what has no name."""
+
+    effects: Names
+    probability: float
+
+    @property
+    def label(self) -> str:
+        """Its name in a credible set."""
+        return "+".join(self.effects) or "clean"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What is believed of a recording.
+
+    Parameters
+    ----------
+    verdict
+        The verdict.
+    combination
+        Most probable set of effects, sorted; () when clean, ("unknown",) when unknown.
+    p_value
+        That nothing is missing from the mean, under the noise model found.
+    hypotheses
+        All, most probable first; they sum to one.
+    aliases
+        Effects that these readings cannot tell apart, in pairs.
+    order_probabilities
+        Probability of each number of Gaussians of a clean sensor's SSF.
+    unknown_shares
+        If something has no name, the probability that it depends on each covariate.
+    too_little
+        Whether there are too few readings to say anything, or all are equal.
+    withdrawn
+        Whether what leads is not named, since it predicts held-out readings far worse than the null does.
+    """
+
+    verdict: Verdict
+    combination: Names
+    p_value: float
+    hypotheses: tuple[Hypothesis, ...]
+    aliases: tuple[Alias, ...] = ()
+    order_probabilities: Mapping[int, float] | None = None
+    unknown_shares: Mapping[str, float] | None = None
+    too_little: bool = False
+    withdrawn: bool = False
+
+    def withdraw(self) -> Judged:
+        """Take back what was named."""
+        return replace(self, verdict="cannot_tell", combination=(), withdrawn=True)
+
+    @property
+    def unknown_probability(self) -> float:
+        """Of something that has no name."""
+        return next((h.probability for h in self.hypotheses if h.effects == ("unknown",)), 0.0)
+
+    @property
+    def clean_probability(self) -> float:
+        """That nothing is missing."""
+        return next((h.probability for h in self.hypotheses if not h.effects), 0.0)
+
+    @property
+    def credible(self) -> tuple[str, ...]:
+        """Labels of the fewest hypotheses that hold 0.95."""
+        return credible_set(self.hypotheses)
+
+    @property
+    def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
+        """What is out of vocabulary, by the covariate in which it shows, with its share of the unknown."""
+        if self.unknown_probability < 1e-3:
+            return ()
+        shares = sorted((self.unknown_shares or {}).items(), key=lambda item: -item[1])
+        return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
+
+
+def judge(searched: Searched, test: GlobalTest) -> Judged:
+    """Reach a verdict on what was searched and tested."""
+    prepared, posterior = searched.prepared, searched.posterior
+    hypotheses = hypotheses_of(posterior.probabilities)
+    pairs = tuple(aliased_pairs(searched, test.problem, test.null.found))
+
+    def aliased_with(combination: Names) -> frozenset[Names]:
+        """Give the combinations whose effects on the mean the readings cannot tell from these, the noise the same."""
+        noise = prepared.on_noise & {*combination}
+        others = searched.aliased_with(tuple(name for name in combination if name not in noise))
+        return frozenset(tuple(sorted({*names, *noise})) for names in others)
+
+    verdict, combination = (
+        ("cannot_tell", ())
+        if prepared.too_little
+        else verdict_on(
+            hypotheses, test.p_value, noise_names=prepared.on_noise, aliases=pairs, aliased_with=aliased_with
+        )
+    )
+    return Judged(
+        verdict,
+        combination,
+        test.p_value,
+        hypotheses,
+        aliases=pairs,
+        order_probabilities=dict(posterior.order_probabilities),
+        unknown_shares=searched.shares_of_the_unknown(),
+        too_little=prepared.too_little,
+    )
+
+
+def hypotheses_of(probabilities: Mapping[tuple[Names, Names], float]) -> tuple[Hypothesis, ...]:
+    """Join mean and noise into combinations; unknown is one hypothesis under any noise."""
+    joined: dict[Names, float] = {}
+    for (mean, noise), p in probabilities.items():
+        unknown = mean == ("unknown",) or out_of_vocabulary(mean)
+        key = ("unknown",) if unknown else tuple(sorted((*mean, *in_vocabulary(noise))))
+        joined[key] = joined.get(key, 0.0) + p
+    total = sum(joined.values())
+    ranked = sorted(joined.items(), key=lambda item: -item[1])
+    return tuple(Hypothesis(key, p / total) for key, p in ranked)
+
+
+def verdict_on(
+    hypotheses: tuple[Hypothesis, ...],
+    p_value: float,
+    *,
+    noise_names: frozenset[str],
+    aliases: tuple[Alias, ...],
+    aliased_with: Callable[[Names], frozenset[Names]],
+) -> tuple[Verdict, Names]:
+    """Decide by probabilities; name physics only where the test that counts every look has raised an alarm too."""
+    verdict, combination = decide(hypotheses, noise_names, aliases, aliased_with)
+    return ("cannot_tell", ()) if verdict == "named" and p_value > ALARM else (verdict, combination)
+
+
+def credible_set(hypotheses: tuple[Hypothesis, ...], mass: float = 0.95) -> tuple[str, ...]:
+    """Name the fewest hypotheses that hold `mass`."""
+    out, held = [], 0.0
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        out.append(hypothesis.label)
+        held += hypothesis.probability
+        if held >= mass:
+            break
+    return tuple(out)
+
+
+def decide(
+    hypotheses: tuple[Hypothesis, ...],
+    noise_names: frozenset[str],
+    aliases: tuple[Alias, ...],
+    aliased_with: Callable[[Names], frozenset[Names]],
+) -> tuple[Verdict, Names]:
+    """Turn probabilities into a verdict and the combination it names.
+
+    A class of aliases is the combinations that differ only by swapping aliased effects; where it holds
+    half the probability and none of its members does, the answer is `cannot_tell`. The same where
+    clean leads without holding half, and where the readings cannot tell the leader from another that is
+    not out of the question (`aliased_with`): what tells those apart is what was believed before, not what was read.
+    """
+    probability = {h.effects: h.probability for h in hypotheses}
+    if probability.get(("unknown",), 0.0) >= 0.5:
+        return "unknown", ("unknown",)
+    if probability.get((), 0.0) >= 0.5:
+        return "clean", ()
+    named = {effects: p for effects, p in probability.items() if effects not in ((), ("unknown",))}
+    if not named:
+        return "cannot_tell", ()
+    top = max(named, key=lambda effects: named[effects])
+    if named[top] >= 0.5:
+        if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
+            return "cannot_tell", top
+        return ("noise" if set(top) <= noise_names else "named"), top
+    both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
+    of_class = {top} | {tuple(sorted({*top} - {name} | {other})) for name, other in both_ways if name in top}
+    if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
+        return "cannot_tell", top
+    if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
+        return "cannot_tell", ()
+    return ("noise" if set(top) <= noise_names else "named"), top

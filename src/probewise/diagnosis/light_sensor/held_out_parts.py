@@ -1,0 +1,28 @@
+"""Which readings are held out together: scans, or of many scans those over one pattern in one orientation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise.diagnosis.evidence.held_out import LEAST_ROWS, MOST_PARTS, Parts
+from probewise.recordings.plan import Recording
+
+__all__ = ["held_out_parts"]
+
+
+def held_out_parts(recording: Recording) -> Parts:
+    """Divide usable readings into scans; where more than ten are long enough, into views of several scans.
+
+    One of many scans that lie side by side would leak into the others: all those over one pattern in one orientation
+    are held out together, if there are several such parts.
+    """
+    plan, usable = recording.plan, recording.usable
+    scan = plan.scan[usable]
+    if np.sum(np.bincount(scan) >= LEAST_ROWS) > MOST_PARTS:
+        views = np.stack([plan.pattern[usable].astype(np.float64), np.round(plan.orientation_rad[usable], 6)])
+        kinds, part = np.unique(views, axis=1, return_inverse=True)
+        if kinds.shape[1] > 1:
+            return part.reshape(-1), tuple(
+                f"{plan.pattern_names[int(code)]}, {np.degrees(turn):.0f} degrees" for code, turn in kinds.T
+            )
+    return scan, plan.scan_names

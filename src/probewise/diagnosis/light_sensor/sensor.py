@@ -1,0 +1,91 @@
+"""The paper's apparatus: its vocabulary, covariates, held-out parts, next scans, and words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.evidence.held_out import Parts
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.fitting.ssf_forms import SsfForms
+from probewise.diagnosis.light_sensor.commands import commands
+from probewise.diagnosis.light_sensor.covariates import covariate_of, covariates_of, slope_along_the_move
+from probewise.diagnosis.light_sensor.fine_structure import fine_structure
+from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
+from probewise.diagnosis.light_sensor.target_swaps import target_swaps
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.scheduling import Command
+from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
+from probewise.recordings.plan import Plan, Recording
+
+__all__ = ["LightSensor"]
+
+
+@dataclass(frozen=True)
+class LightSensor:
+    """A light sensor that an arm moves over patterns; `vocabulary` are the effects it may have, by name."""
+
+    vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: VOCABULARY)
+    words: ClassVar[Words] = Words(
+        null="the sensor",
+        find_signal="scan across an edge",
+        settles_nothing="no reading that this apparatus can take tells them apart",
+    )
+
+    def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
+        """Scale the vocabulary, and what has a formula beside it; leave out what the null takes up or has no place for.
+
+        Where no null is given the SSF is free, and takes up whole what is of the SSF.
+        """
+        extent, plan = Extent.of(recording), recording.plan
+        kinds = {**self.vocabulary, **UNNAMED, **NUISANCES}
+        able = {name: effect for name, kind in kinds.items() if (effect := kind.for_extent(extent)) is not None}
+        return {
+            name: effect
+            for name, effect in able.items()
+            if (null.admits(effect) if null is not None else not effect.is_of_the_ssf(plan))
+        }
+
+    def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
+        """Share the odds out over these effects."""
+        return PriorOdds.over(effects)
+
+    def null_forms(self, recording: Recording) -> SsfForms:
+        """Give the forms of its SSF."""
+        return SsfForms(Extent.of(recording))
+
+    def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+        """List the covariates that vary, and the slope of the readings along each one's direction of motion."""
+        usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
+        slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
+        return covariates_of(recording.plan, usable, found.predicted, slope), slope
+
+    def covariate_of(
+        self,
+        effect: NamedEffect[Any],
+        change: FloatArray,
+        without: FloatArray,
+        plan: Plan,
+        known: Sequence[Covariate],
+    ) -> Covariate | None:
+        """Choose the first of an effect's covariates that varies; see `light_sensor.covariates.covariate_of`."""
+        return covariate_of(effect, change, without, plan, known)
+
+    def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
+        """Differentiate by what is finer in an SSF than any form that is fitted to it."""
+        return fine_structure(found.model, found.z, usable)
+
+    def held_out_parts(self, recording: Recording) -> Parts:
+        """Hold out scans, or all over one pattern in one orientation."""
+        return held_out_parts(recording)
+
+    def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
+        """List what the arm can do, and what a hand can: swap the target, or turn it."""
+        return [*commands(plan, strides=strides, level=level), *target_swaps(plan)]

@@ -1,0 +1,105 @@
+"""What is to be diagnosed: the readings, the effects they could show, and the null."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.apparatus import Apparatus
+from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
+from probewise.diagnosis.fitting.earlier import SensorPrior, require_same_unit, sensor_of
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.joining import join
+from probewise.diagnosis.thinning import rows_to_diagnose
+from probewise.effects import NamedEffect
+from probewise.errors import ParameterError
+from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
+
+__all__ = ["Prepared", "prepare"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is to be diagnosed.
+
+    Parameters
+    ----------
+    recording
+        The readings that are compared.
+    effects
+        Those that could show in them, by name.
+    null
+        What is diagnosed; None: a null that is calibrated from the recording.
+    apparatus
+        What took the readings.
+    everything
+        All readings; `recording` itself where all are compared.
+    """
+
+    recording: Recording
+    effects: Mapping[str, NamedEffect[Any]]
+    null: Null | None
+    apparatus: Apparatus
+    everything: Recording
+
+    @property
+    def thinned(self) -> bool:
+        """Whether only some readings are compared."""
+        return self.everything is not self.recording
+
+    @cached_property
+    def usable(self) -> IntArray:
+        """Rows with a usable reading, (n_usable,)."""
+        return np.flatnonzero(self.recording.usable)
+
+    @cached_property
+    def on_noise(self) -> frozenset[str]:
+        """Names of the effects on the noise."""
+        return frozenset(name for name, effect in self.effects.items() if effect.stage is Stage.NOISE)
+
+    @property
+    def least_readings(self) -> int:
+        """Fewest usable readings that a verdict is given on."""
+        return LEAST_READINGS if self.null is None else self.null.least_readings
+
+    @property
+    def constant(self) -> bool:
+        """Whether all usable readings are equal."""
+        return float(np.ptp(self.recording.readings[self.usable])) == 0.0
+
+    @property
+    def too_little(self) -> bool:
+        """Whether the readings are too few to say anything, or all equal."""
+        return len(self.usable) < self.least_readings or self.constant
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Give every row its value, NaN where no reading is usable: (n_usable,) -> (n_points,)."""
+        out = np.full(len(self.recording), np.nan)
+        out[self.usable] = values
+        return out
+
+
+def prepare(
+    recordings: Recording | Sequence[Recording],
+    *,
+    sensor: SensorPrior | None = None,
+    null: Null | None = None,
+    apparatus: Apparatus,
+) -> Prepared:
+    """Join recordings, thin out long ones, build the effects; parameters and errors as in `diagnose`."""
+    if sensor is not None and null is not None:
+        raise ParameterError("sensor, null", "both", "one of them: a null holds what is known of its sensor")
+    everything = join([recordings] if isinstance(recordings, Recording) else list(recordings))
+    rows = rows_to_diagnose(everything)
+    recording = everything if len(rows) == len(everything) else everything.take(rows)
+    if sensor is not None:
+        require_same_unit(sensor, everything.plan)
+        null = sensor_of(sensor)
+    effects = apparatus.effects(recording, null)
+    return Prepared(recording, effects, null, apparatus, everything)

@@ -1,0 +1,81 @@
+"""Which refitted hypothesis repairs the model, and what it gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.repair.improvement import Improvement, improvement_of
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import WeighedFit
+
+__all__ = ["Best", "best_repair", "ruins"]
+
+Names = tuple[str, ...]
+
+_RUIN = -1.0  # nats per held-out reading, below which what was named repairs nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """The fit of the repaired model under its noise model, as a linear problem, and what it gains.
+
+    `out_of_vocabulary` is the combination that it was chosen for where the verdict is `unknown`, () if it has no
+    formula.
+    """
+
+    fit: WeighedFit
+    noise: Names
+    problem: Linearised
+    improvement: Improvement
+    out_of_vocabulary: Names = ()
+
+    @classmethod
+    def of(
+        cls,
+        searched: Searched,
+        test: GlobalTest,
+        fit: WeighedFit,
+        noise: Names,
+        *,
+        out_of_vocabulary: Names = (),
+        rng: np.random.Generator,
+    ) -> Best:
+        """Measure what a fit gains over the null."""
+        after = Linearised.of(fit.found, fit.evidence[noise].law)
+        gain = improvement_of(searched, test, fit, noise, after, rng=rng)
+        return cls(fit, noise, after, gain, out_of_vocabulary)
+
+
+def ruins(gain: Improvement) -> bool:
+    """Tell whether a repair predicts held-out readings far worse than the null does."""
+    return gain.heldout_log_density_per_reading < _RUIN
+
+
+def best_repair(
+    searched: Searched, test: GlobalTest, judged: Judged, *, rng: np.random.Generator
+) -> tuple[Judged, Best]:
+    """Choose the fit that goes with a verdict, the null where nothing was found.
+
+    Returns
+    -------
+    The verdict, withdrawn where what was named fails on held-out readings; and the fit.
+    """
+    null, noise = test.null, test.noise
+    if judged.verdict == "unknown":
+        leading = searched.leading_out_of_vocabulary()
+        fit = (searched.best(leading, noise) if leading else searched.beside(noise)) or null
+        return judged, Best.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
+    on_noise = searched.prepared.on_noise
+    if judged.verdict in ("named", "noise", "clean"):
+        stated = tuple(name for name in judged.combination if name in on_noise)
+        noise = searched.posterior.noise(stated)
+    on_mean = tuple(name for name in judged.combination if name not in on_noise)
+    best = Best.of(searched, test, searched.best(on_mean, noise) or null, noise, rng=rng)
+    if judged.verdict == "named" and ruins(best.improvement):  # what explains these readings alone is no repair
+        return judged.withdraw(), Best.of(searched, test, null, noise, rng=rng)
+    return judged, best

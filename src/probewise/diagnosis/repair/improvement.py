@@ -1,0 +1,59 @@
+"""What a repair gains over the null."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.diagnosis.evidence.held_out import held_out_gain
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.residuals.locate import global_p_value
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.weighed_fit import WeighedFit
+
+__all__ = ["N_DRAWS", "Improvement", "improvement_of"]
+
+Names = tuple[str, ...]
+
+N_DRAWS = 499
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """What the repaired model gains over the null."""
+
+    log_evidence: float
+    heldout_log_density_per_reading: float
+    heldout_sd: float
+    heldout_by_scan: tuple[tuple[str, float], ...]
+    rms_before: float
+    rms_after: float
+    p_value_after: float
+
+
+def improvement_of(
+    searched: Searched, test: GlobalTest, best: WeighedFit, noise: Names, after: Linearised, *, rng: np.random.Generator
+) -> Improvement:
+    """Measure what the best fit gains over the null: in evidence, on held-out parts, in what is left.
+
+    Parameters
+    ----------
+    searched, test
+        What was weighed; the null.
+    best, noise, after
+        The best fit, its noise model, and the two as a linear problem.
+    rng
+        Source of randomness, for the null law of the test of what is left.
+    """
+    null = test.null
+    rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
+    log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
+    if best is null:
+        return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], test.p_value)
+    law, prepared = best.evidence[noise].law, searched.prepared
+    parts = prepared.apparatus.held_out_parts(prepared.recording)
+    held = held_out_gain(null.found, best.found, prepared.recording, law, parts)
+    p_after = global_p_value(after, searched.looks(best.found), after.draws(N_DRAWS, rng=rng))
+    return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)

@@ -1,0 +1,61 @@
+"""Where the effects of a repair are, and where else the residual stands out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.judgement.global_test import N_DRAWS, GlobalTest
+from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.residuals.locate import Place, places, places_of_effect
+from probewise.diagnosis.search.searched import Searched
+
+__all__ = ["locate"]
+
+
+def locate(
+    searched: Searched,
+    test: GlobalTest,
+    judged: Judged,
+    best: Best,
+    sizes: Mapping[str, float],
+    *,
+    rng: np.random.Generator,
+) -> tuple[Place, ...]:
+    """Say where the effects of the repair are, the largest first; then where else the residual stands out.
+
+    Parameters
+    ----------
+    searched, test, judged, best
+        What was found.
+    sizes
+        Lambda of each effect.
+    rng
+        Source of randomness, for the null law of a second look at what only readings far out show.
+    """
+    prepared, problem, law = searched.prepared, test.problem, test.problem.law
+    covariates, residuals = searched.screening.covariates, test.null.found.residuals
+    plan, found = prepared.recording.plan.take(prepared.usable), best.fit.found
+    scans = next((c for c in covariates if c.name == "scan"), None)
+    named: list[Place] = []
+    for effect in sorted(found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
+        change = found.change_by(effect.name, prepared.usable)
+        shows_in = prepared.apparatus.covariate_of(effect, change, found.predicted - change, plan, covariates)
+        if shows_in is not None:
+            size = sizes.get(effect.name, 0.0)
+            named += places_of_effect(
+                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size, sd=problem.sd
+            )
+    scan_names = prepared.recording.plan.scan_names
+    scanned = places(problem, covariates, scan_names, residuals, test.draws)
+    if judged.verdict == "unknown" and not (named or scanned) and law.share:
+        # What only readings far out show is noise to a tail.
+        white = Linearised.of(test.null.found, law.plain())
+        scanned = places(white, covariates, scan_names, residuals, white.draws(N_DRAWS, rng=rng))
+    first: dict[str, Place] = {}
+    for place in [*named, *scanned]:
+        first.setdefault(place.witness, place)
+    return tuple(first.values())

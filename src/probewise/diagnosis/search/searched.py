@@ -1,0 +1,238 @@
+"""What a search comes to: the evidence of every hypothesis, and what to believe of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.search.constants import ALIASED_NATS
+from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, in_vocabulary, out_of_vocabulary
+from probewise.sensor import Stage
+
+__all__ = ["Evidences", "Posterior", "Screening", "Searched", "posterior_of"]
+
+Names = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidences:
+    """Log evidence of what was weighed.
+
+    Hypotheses are pairs (mean, noise) of names; the mean ("unknown",) is what has no name, alone or beside others.
+
+    Parameters
+    ----------
+    fits
+        Combinations of effects on the mean that were refitted, by (SSF order, mean).
+    screened
+        The rest, by templates: (mean, noise) -> log evidence.
+    unknown
+        Something unknown beside fits: (SSF order, mean, noise) -> log evidence.
+    unknown_shares
+        How much of that each family of bases has.
+    """
+
+    fits: Mapping[tuple[int, Names], WeighedFit]
+    screened: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
+    unknown: Mapping[tuple[int, Names, Names], float] = field(default_factory=dict)
+    unknown_shares: Mapping[str, float] = field(default_factory=dict)
+
+    def moved(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
+        """Move the evidence of fits, and of what is unknown beside them, under every noise model alike."""
+        fits = {key: fit.moved(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
+        unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in self.unknown.items()}
+        return replace(self, fits=fits, unknown=unknown)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Probabilities of (mean, noise) hypotheses, which sum to one, and of each SSF order of the clean mean."""
+
+    probabilities: Mapping[tuple[Names, Names], float]
+    order_probabilities: Mapping[int, float]
+
+    @property
+    def by_mean(self) -> dict[Names, float]:
+        """Probability of each hypothesis about the mean, under any noise."""
+        out: dict[Names, float] = {}
+        for (mean, _), p in self.probabilities.items():
+            out[mean] = out.get(mean, 0.0) + p
+        return out
+
+    def noise(self, stated: Names | None = None) -> Names:
+        """Find the most probable noise model, of all or of those that hold what is stated of the vocabulary."""
+        marginal: dict[Names, float] = {}
+        for (_, noise), p in self.probabilities.items():
+            if stated is None or in_vocabulary(noise) == stated:
+                marginal[noise] = marginal.get(noise, 0.0) + p
+        return max(marginal, key=lambda noise: marginal[noise])
+
+
+def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
+    """Turn evidences into probabilities, summed over SSF orders.
+
+    Parameters
+    ----------
+    evidences
+        Of what was weighed.
+    prior
+        Prior odds.
+    certain
+        Effects on the noise that the readings show without doubt.
+    n_forms
+        Number of SSF orders that were fitted, each as probable as the others.
+    """
+    log_z: dict[tuple[Names, Names], float] = {}
+    for (_, names), fit in evidences.fits.items():
+        for noise, evidence in fit.evidence.items():
+            log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
+    log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
+    for (_, names, noise), value in evidences.unknown.items():
+        key = ("unknown",), noise
+        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
+    for (names, noise), value in evidences.screened.items():
+        log_p[names, noise] = value + prior.log_mean(names)
+    for names, noise in log_p:
+        uncertain = tuple(n for n in noise if n not in certain)
+        log_p[names, noise] += -math.log(n_forms) + prior.log_noise(uncertain)
+    total = float(logsumexp(list(log_p.values())))
+    nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
+    clean_by_order = {n: float(logsumexp([e.log_z for e in fit.evidence.values()])) for n, fit in nulls.items()}
+    norm = float(logsumexp(list(clean_by_order.values())))
+    return Posterior(
+        {key: math.exp(value - total) for key, value in log_p.items()},
+        {n: math.exp(v - norm) for n, v in clean_by_order.items()},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """What the tests look with: templates of effects, all about one fit, and bases of the unknown.
+
+    About one fit, since those of one recording predict much the same, and which templates a test looks with is its own
+    choice.
+    """
+
+    templates: TemplateMemory
+    about: Fit
+    unknown_bases: Bank
+    covariates: tuple[Covariate, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """Everything weighed, and what it comes to.
+
+    Parameters
+    ----------
+    prepared
+        What was searched.
+    prior
+        Prior odds.
+    noise_models, certain
+        The models of the noise, by names; and the effects on it that the readings show without doubt.
+    nulls
+        The null by SSF order.
+    screening
+        What the tests look with.
+    evidences, posterior
+        Of all hypotheses.
+    """
+
+    prepared: Prepared
+    prior: PriorOdds
+    noise_models: Mapping[Names, NoiseModel]
+    certain: Names
+    nulls: Mapping[int, Null]
+    screening: Screening
+    evidences: Evidences
+    posterior: Posterior
+
+    def with_evidences(self, evidences: Evidences) -> Searched:
+        """Take other evidences, and what they come to."""
+        posterior = posterior_of(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
+        return replace(self, evidences=evidences, posterior=posterior)
+
+    def by_prior_alone(self) -> Searched:
+        """Believe what was believed before, where the readings say nothing, whatever the evidence makes of them."""
+        effects = self.prepared.effects
+        on_mean = [name for name in effects if name not in self.prepared.on_noise and not out_of_vocabulary((name,))]
+        probabilities = self.prior.alone(on_mean, self.certain)
+        return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
+
+    def best(self, names: Names, noise: Names) -> WeighedFit | None:
+        """Return the refitted combination of these effects with the most evidence over SSF orders."""
+        options = [fit for (_, key), fit in self.evidences.fits.items() if key == names]
+        return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
+
+    def aliased_with(self, names: Names) -> frozenset[Names]:
+        """Give the other combinations that these readings cannot tell from this one, at any SSF order; () has none."""
+        fits = self.evidences.fits
+        return frozenset(
+            key
+            for (n, key), other in fits.items()
+            if names and key and key != names and (n, names) in fits
+            if expected_nats(fits[n, names], other) < ALIASED_NATS
+        )
+
+    def beside(self, noise: Names) -> WeighedFit | None:
+        """Give the fit beside which something unknown most probably is; None where nothing unknown was weighed."""
+        scores = {
+            (n, names): value + self.prior.log_unknown(names)
+            for (n, names, own), value in self.evidences.unknown.items()
+            if own == noise
+        }
+        return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
+
+    def looks(self, found: Fit) -> list[Bank]:
+        """List every template that a test looks at about a fit: of the effects that it lacks, and the unknown."""
+        on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
+        missing = [effect for effect in on_mean if effect.name not in found.model.names]
+        return [self.screening.templates.bank(self.screening.about, missing), self.screening.unknown_bases]
+
+    @property
+    def order(self) -> int:
+        """SSF order of the most probable explanation, named or not: that at which the null is tested."""
+        by_order: dict[int, float] = {}
+        terms = [(n, fit.log_z + self.prior.log_mean(names)) for (n, names), fit in self.evidences.fits.items()]
+        for (n, names, _), value in self.evidences.unknown.items():
+            terms.append((n, value + self.prior.log_unknown(names)))
+        for n, value in terms:
+            by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
+        return max(by_order, key=lambda n: by_order[n])
+
+    @property
+    def null(self) -> WeighedFit:
+        """The null at that order."""
+        return self.evidences.fits[self.order, ()]
+
+    def leading_out_of_vocabulary(self) -> Names:
+        """Name the leading refitted combination with something out of vocabulary, if it leads what is unknown."""
+        by_mean = self.posterior.by_mean
+        own = {names: p for names, p in by_mean.items() if out_of_vocabulary(names)}
+        refitted = {names for _, names in self.evidences.fits}
+        leader = max(own, key=lambda names: own[names], default=())
+        return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
+
+    def shares_of_the_unknown(self) -> dict[str, float]:
+        """Share what is unknown out over effects out of vocabulary, and over covariates for what has no formula."""
+        by_mean = self.posterior.by_mean
+        unknown = by_mean.get(("unknown",), 0.0)
+        shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}
+        for names, p in by_mean.items():
+            for name in out_of_vocabulary(names):
+                shares[name] = shares.get(name, 0.0) + p
+        total = sum(shares.values()) or 1.0
+        return {name: p / total for name, p in shares.items()}

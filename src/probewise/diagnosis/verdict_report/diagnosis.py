@@ -1,0 +1,165 @@
+"""The Diagnosis value: what is missing, where, how sure, what it gains, what to measure next."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING, Any
+
+from probewise._display import ShowsItself
+from probewise.diagnosis.advice.next_scans import NextMeasurement
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
+from probewise.diagnosis.repair.improvement import Improvement
+from probewise.diagnosis.repair.repair import Repair
+from probewise.diagnosis.repair.samples import ModelSamples
+from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound
+from probewise.diagnosis.verdict_report.words import p_in_words
+from probewise.recordings.plan import Recording
+
+__all__ = ["Diagnosis", "VerdictReport"]
+
+_MOVED = {
+    "unknown_probability": "judged.unknown_probability",
+    "clean_probability": "judged.clean_probability",
+    "credible": "judged.credible",
+    "aliases": "judged.aliases",
+    "order_probabilities": "judged.order_probabilities",
+    "unknown_shares": "judged.unknown_shares",
+    "unknown_candidates": "judged.unknown_candidates",
+    "few": "judged.too_little",
+    "noise": "report.noise",
+    "weighings": "report.weighings",
+    "residuals_before": "repair.before.residuals",
+    "residuals_after": "repair.after.residuals",
+    "predicted_before": "repair.before.readings",
+    "predicted_after": "repair.after.readings",
+    "corrected": "repair.by_rows",
+    "is_repaired": "repair.changes_predictions",
+    "left_open": "repair.left_open",
+}
+"""Names of 0.1, and where what they stood for is now."""
+
+
+@dataclass(frozen=True)
+class VerdictReport:
+    """What is said of a verdict: one sentence, each effect's and the noise's numbers, what was weighed twice."""
+
+    reason: str
+    effects: tuple[EffectFound, ...]
+    noise: NoiseFound
+    weighings: tuple[Weighing, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis(ShowsItself):
+    """Hold everything of diagnosis.json, and the arrays that its figures show.
+
+    Attributes
+    ----------
+    recording
+        What was diagnosed, recordings joined.
+    judged
+        Verdict, probabilities, aliases.
+    repair
+        The calibrated model and the repaired one, and what is gained.
+    where
+        Where something is missing, strongest first.
+    next_measurement
+        What to read next; None where nothing would tell more.
+    report
+        The verdict in words, and the numbers of effects and noise.
+    """
+
+    recording: Recording
+    judged: Judged
+    repair: Repair
+    where: tuple[Place, ...]
+    next_measurement: NextMeasurement | None
+    report: VerdictReport
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether something is missing, and of what kind."""
+        return self.judged.verdict
+
+    @property
+    def reason(self) -> str:
+        """The verdict in one sentence."""
+        return self.report.reason
+
+    @property
+    def p_value(self) -> float:
+        """That nothing is missing from the mean."""
+        return self.judged.p_value
+
+    @property
+    def combination(self) -> tuple[str, ...]:
+        """Most probable set of effects; () when clean, ("unknown",) when unknown."""
+        return self.judged.combination
+
+    @property
+    def hypotheses(self) -> tuple[Hypothesis, ...]:
+        """All, most probable first."""
+        return self.judged.hypotheses
+
+    @property
+    def effects(self) -> tuple[EffectFound, ...]:
+        """Every effect that matters, most probable first."""
+        return self.report.effects
+
+    @property
+    def improvement(self) -> Improvement:
+        """What the repaired model gains."""
+        return self.repair.improvement
+
+    @property
+    def null(self) -> ModelSamples:
+        """The calibrated model."""
+        return self.repair.null
+
+    @property
+    def repaired(self) -> ModelSamples:
+        """The repaired model."""
+        return self.repair.model
+
+    @property
+    def carried(self) -> tuple[tuple[str, float, str], ...]:
+        """What the repaired model carries and no hypothesis with a name has: name, share of the samples, sentence."""
+        return self.repair.carried_beside({effect.name for effect in self.effects})
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Give what had another name in the last release, with a warning."""
+            if name not in _MOVED:
+                raise AttributeError(name)
+            warnings.warn(f"Diagnosis.{name} is Diagnosis.{_MOVED[name]} now", DeprecationWarning, stacklevel=2)
+            return reduce(getattr, _MOVED[name].split("."), self)
+
+    def summary(self) -> str:
+        """Describe the diagnosis in plain text."""
+        lines = [f"{self.verdict}: {self.reason}", f"{p_in_words(self.p_value)} that nothing is missing from the mean"]
+        lines += [f"  {h.probability:.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
+        lines += [f"{e.name} ({e.probability:.3f}): {e.sentence}" for e in self.effects if e.probability > 0.05]
+        gain = self.improvement
+        if self.repair.changes_predictions:
+            held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats each"
+            kept_back = f"readings kept back {held}" if gain.heldout_by_scan else "no reading could be kept back"
+            lines.append(
+                f"repaired: log evidence {gain.log_evidence:+.1f}, {kept_back}, "
+                f"rms {gain.rms_before:.4g} -> {gain.rms_after:.4g}"
+            )
+        elif self.verdict == "noise":
+            lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f}")
+        if self.repair.by_rows:
+            lines.append("what has no name is put right in these readings alone: sensor.json does not carry it")
+        lines += [f"in {share:.0%} of its samples: {sentence}" for _, share, sentence in self.carried]
+        if self.repair.left_open:
+            shares = ", ".join(
+                f"{' with '.join(n) or 'no effect'} in {p:.0%}" for n, p in self.repair.left_open.items()
+            )
+            lines.append(f"left open in its samples: {shares}")
+        return "\n".join(lines)

@@ -1,0 +1,123 @@
+"""The verdict in one sentence."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.residuals.locate import ALARM
+from probewise.diagnosis.residuals.outlying import FAR_OUT
+from probewise.diagnosis.verdict_report.words import p_in_words
+
+__all__ = ["Grounds", "reason_of"]
+
+
+@dataclass(frozen=True)
+class Grounds:
+    """What a sentence is made of, besides what was judged.
+
+    Parameters
+    ----------
+    words
+        How to speak of the apparatus.
+    n_readings, least_readings
+        Usable readings, and the fewest that a verdict is given on.
+    form
+        What the SSF of a clean sensor is, "" where there is none.
+    sentences
+        What each effect does, by name.
+    like
+        What is unknown may be this: sentences.
+    family
+        The family of bases that explains most of what is unknown.
+    beside
+        Effects that something unknown is beside.
+    shows_in
+        The covariate in which it shows most, None where in none.
+    p_value_after
+        That nothing is missing from the repaired model.
+    settles
+        The readings to take next, in words.
+    """
+
+    words: Words
+    n_readings: int
+    least_readings: int
+    form: str = ""
+    sentences: Mapping[str, str] = field(default_factory=dict)
+    like: tuple[str, ...] = ()
+    family: str = ""
+    beside: tuple[str, ...] = ()
+    shows_in: str | None = None
+    p_value_after: float = 1.0
+    settles: str | None = None
+
+
+def reason_of(judged: Judged, grounds: Grounds) -> str:
+    """Say in one sentence what the verdict is and why."""
+    if judged.too_little:
+        return _too_little(grounds)
+    if judged.withdrawn:
+        return _withdrawn(judged, grounds)
+    say = {"clean": _clean, "unknown": _unknown, "cannot_tell": _cannot_tell, "noise": _noise, "named": _named}
+    return say[judged.verdict](judged, grounds)
+
+
+def _withdrawn(judged: Judged, grounds: Grounds) -> str:
+    leader, p = judged.hypotheses[0].label, p_in_words(judged.p_value)
+    worse = f"predicts those kept back far worse than {grounds.words.null} without it"
+    return f"Something is missing ({p}); {leader} explains these readings best, and {worse}."
+
+
+def _too_little(grounds: Grounds) -> str:
+    n = grounds.n_readings
+    if n >= grounds.least_readings:
+        return f"All {n} usable readings are equal: there is no signal to diagnose; {grounds.words.find_signal}."
+    has = "1 usable reading is" if n == 1 else f"{n} usable readings are"
+    return f"{has} too few to tell; {grounds.least_readings} or more are needed."
+
+
+def _clean(judged: Judged, grounds: Grounds) -> str:
+    form = f", {grounds.form}," if grounds.form else ""
+    rare = ", which is rare; nothing that was tried explains them better" if judged.p_value < ALARM else ""
+    p = p_in_words(judged.p_value)
+    return f"The model{form} explains all {grounds.n_readings} readings to within their noise ({p}{rare})."
+
+
+def _unknown(judged: Judged, grounds: Grounds) -> str:
+    p = p_in_words(judged.p_value)
+    if grounds.like:
+        return f"Something is missing ({p}) that has no name; it is most like this: {'; '.join(grounds.like)}."
+    if grounds.family.endswith(FAR_OUT):
+        covariate = grounds.family.removesuffix(FAR_OUT).replace("_", " ")
+        tail = f"to a test of the mean they are noise with a heavy tail, {p}"
+        together = f"The readings that are far out lie together in {covariate}"
+        return f"{together}: something is missing there, not noise ({tail})."
+    place = "" if grounds.shows_in is None else f" It shows most in {grounds.shows_in}."
+    known = " and ".join(name.replace("_", " ") for name in grounds.beside)
+    beside = f", beside {known}" if known else ""
+    return f"Something is missing ({p}) that no named effect explains{beside}.{place}"
+
+
+def _cannot_tell(judged: Judged, grounds: Grounds) -> str:
+    leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(judged.hypotheses, 3))
+    cure = "" if grounds.settles is None else f"; to tell: {grounds.settles}"
+    return f"These {grounds.n_readings} readings do not tell apart {leading}{cure}."
+
+
+def _noise(judged: Judged, grounds: Grounds) -> str:
+    return f"{_stated(judged, grounds)}; nothing is missing from the mean ({p_in_words(judged.p_value)})."
+
+
+def _named(judged: Judged, grounds: Grounds) -> str:
+    after = grounds.p_value_after
+    more = f" Something more is missing: after the repair {p_in_words(after)}." if after < ALARM else ""
+    return f"{_stated(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
+
+
+def _stated(judged: Judged, grounds: Grounds) -> str:
+    said = "; ".join(grounds.sentences[name] for name in judged.combination if name in grounds.sentences)
+    return f"{said[0].upper()}{said[1:]}"

@@ -57,23 +57,23 @@ class Null(Protocol):
 
     @property
     def n_gaussians(self) -> int:
-        """Number of Gaussians of its SSF; 0 where it has none."""
-        ...
+        """Number of Gaussians of its SSF; by default 0, there is none."""
+        return 0
 
     @property
     def degrees_of_freedom(self) -> int:
-        """How many Gaussians its SSF is as free as."""
-        ...
+        """Effective degrees of freedom of its SSF, counted in Gaussians; by default none."""
+        return 0
 
     @property
     def form(self) -> str:
-        """What its SSF is, in words; empty where it has none."""
-        ...
+        """What its SSF is, in words; by default nothing."""
+        return ""
 
     @property
     def exchangeable(self) -> bool:
-        """Whether the Gaussians of its SSF can trade names."""
-        ...
+        """Whether the Gaussians of its SSF can trade names; by default there are none."""
+        return False
 
     @property
     def starts(self) -> FloatArray:
@@ -82,8 +82,11 @@ class Null(Protocol):
 
     @property
     def nuisance(self) -> tuple[str, ...]:
-        """Names of parameters that belong to this recording alone, such as a shape's: no sensor model keeps them."""
-        ...
+        """Names of parameters that belong to this recording alone, such as a shape's; by default none.
+
+        No sensor model keeps them.
+        """
+        return ()
 
     @property
     def least_readings(self) -> int:

@@ -12,6 +12,7 @@ from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
+from probewise.diagnosis.fitting.null import Null
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Prior
@@ -31,7 +32,7 @@ _ON_READINGS = (Stage.OFFSET, Stage.LAG, Stage.SATURATION, Stage.NOISE)
 
 
 @dataclass(frozen=True)
-class OwnModel:
+class OwnModel(Null):
     """A simulator and what is believed of its parameters: a null model like any other.
 
     Effects from the stage OFFSET on act on its readings, so half of the vocabulary applies as it is. An effect
@@ -53,31 +54,6 @@ class OwnModel:
     def n_params(self) -> int:
         """Number of parameters."""
         return len(self.prior.names)
-
-    @property
-    def n_gaussians(self) -> int:
-        """None: it has no SSF."""
-        return 0
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """None."""
-        return 0
-
-    @property
-    def form(self) -> str:
-        """Nothing."""
-        return ""
-
-    @property
-    def exchangeable(self) -> bool:
-        """There are none."""
-        return False
-
-    @property
-    def nuisance(self) -> tuple[str, ...]:
-        """Nothing: its parameters are what is asked for."""
-        return ()
 
     @cached_property
     def starts(self) -> FloatArray:

@@ -10,7 +10,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Words
-from probewise.diagnosis.evidence.held_out import Parts
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.ssf_forms import SsfForms
@@ -67,24 +66,12 @@ class LightSensor:
         slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return covariates_of(recording.plan, usable, found.predicted, slope), slope
 
-    def covariate_of(
-        self,
-        effect: NamedEffect[Any],
-        change: FloatArray,
-        without: FloatArray,
-        plan: Plan,
-        known: Sequence[Covariate],
-    ) -> Covariate | None:
-        """Choose the first of an effect's covariates that varies; see `light_sensor.covariates.covariate_of`."""
-        return covariate_of(effect, change, without, plan, known)
+    covariate_of = staticmethod(covariate_of)
+    held_out_parts = staticmethod(held_out_parts)
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
         """Differentiate by what is finer in an SSF than any form that is fitted to it."""
         return fine_structure(found.model, found.z, usable)
-
-    def held_out_parts(self, recording: Recording) -> Parts:
-        """Hold out scans, or all over one pattern in one orientation."""
-        return held_out_parts(recording)
 
     def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
         """List what the arm can do, and what a hand can: swap the target, or turn it."""

@@ -1,0 +1,65 @@
+"""Verdicts on hand-made probabilities: no reading, no fit."""
+
+import pytest
+
+from probewise.diagnosis.advice.aliases import Alias
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged, hypotheses_of, verdict_on
+
+NOISE = frozenset({"outliers"})
+
+
+def verdict(probabilities, *, p_value=1e-6, aliases=(), same=()):
+    found = hypotheses_of(probabilities)
+    return verdict_on(found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same))
+
+
+def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_noise():
+    found = hypotheses_of(
+        {
+            (("lag",), ()): 0.3,
+            (("lag",), ("outliers",)): 0.1,
+            (("lag",), ("drifting_noise",)): 0.2,
+            (("unknown",), ()): 0.1,
+            (("unknown",), ("outliers",)): 0.1,
+            (("arm_knock",), ()): 0.2,
+        }
+    )
+    held = {h.effects: h.probability for h in found}
+    assert held == {("lag",): pytest.approx(0.5), ("unknown",): pytest.approx(0.4), ("lag", "outliers"): 0.1}
+    assert [h.probability for h in found] == sorted(held.values(), reverse=True)
+
+
+def test_physics_is_named_on_an_alarm_only():
+    sure = {(("lag",), ()): 0.9, ((), ()): 0.1}
+    assert verdict(sure) == ("named", ("lag",))
+    assert verdict(sure, p_value=0.2) == ("cannot_tell", ())
+
+
+def test_noise_is_named_without_an_alarm_of_the_mean():
+    assert verdict({((), ("outliers",)): 0.8, ((), ()): 0.2}, p_value=0.6) == ("noise", ("outliers",))
+
+
+def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_being_named():
+    two = {(("lag",), ()): 0.6, (("backlash",), ()): 0.4}
+    assert verdict(two) == ("named", ("lag",))
+    assert verdict(two, same=[("backlash",)]) == ("cannot_tell", ("lag",))
+
+
+def test_a_class_of_aliases_that_holds_half_is_not_told_apart():
+    two = {(("lag",), ()): 0.4, (("backlash",), ()): 0.3, ((), ()): 0.3}
+    pair = Alias(("backlash", "lag"), 1.0, "scan faster", 26)
+    assert verdict(two) == ("named", ("lag",))
+    assert verdict(two, aliases=(pair,)) == ("cannot_tell", ("lag",))
+
+
+def test_what_fails_on_held_out_readings_is_withdrawn():
+    judged = Judged("named", ("lag",), 1e-6, (Hypothesis(("lag",), 1.0),)).withdraw()
+    assert (judged.verdict, judged.combination, judged.withdrawn) == ("cannot_tell", (), True)
+
+
+def test_the_unknown_is_shared_out_over_what_it_may_be():
+    hypotheses = (Hypothesis(("unknown",), 0.8), Hypothesis((), 0.2))
+    judged = Judged("unknown", ("unknown",), 1e-6, hypotheses, unknown_shares={"time": 0.25, "level": 0.75})
+    assert judged.unknown_candidates == (("level", pytest.approx(0.6)), ("time", pytest.approx(0.2)))
+    assert (judged.unknown_probability, judged.clean_probability) == (0.8, 0.2)
+    assert judged.credible == ("unknown", "clean")

@@ -1,0 +1,69 @@
+"""Probabilities from hand-made evidences."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.search.searched import Evidences, posterior_of
+
+PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
+
+
+class Fit(SimpleNamespace):
+    """As much of a weighed fit as its evidence."""
+
+    def moved(self, by):
+        return Fit(evidence={k: SimpleNamespace(log_z=e.log_z + by) for k, e in self.evidence.items()})
+
+
+def fit(log_z):
+    return Fit(evidence={(): SimpleNamespace(log_z=log_z)})
+
+
+EVIDENCES = Evidences(
+    fits={(1, ()): fit(0.0), (2, ()): fit(math.log(3.0)), (1, ("lag",)): fit(5.0)},
+    screened={(("backlash",), ()): 2.0},
+    unknown={(1, (), ()): 1.0},
+)
+
+
+def posterior(evidences=EVIDENCES):
+    return posterior_of(evidences, PRIOR, certain=(), n_forms=2)
+
+
+def test_probabilities_are_prior_times_evidence_summed_over_orders():
+    by_mean = posterior().by_mean
+    assert sum(by_mean.values()) == pytest.approx(1.0)
+    share = PRIOR.by_size[0] / 2
+    assert by_mean["lag",] / by_mean[()] == pytest.approx(share * math.exp(5.0) / (PRIOR.clean_mean * 4.0))
+    assert by_mean["lag",] / by_mean["backlash",] == pytest.approx(math.exp(3.0))
+    assert by_mean["unknown",] / by_mean[()] == pytest.approx(PRIOR.unknown * math.e / (PRIOR.clean_mean * 4.0))
+
+
+def test_orders_are_those_of_the_clean_mean_alone():
+    assert posterior().order_probabilities == {1: pytest.approx(0.25), 2: pytest.approx(0.75)}
+
+
+def test_evidence_that_is_moved_moves_what_is_unknown_beside_it():
+    moved = EVIDENCES.moved({(1, ()): 2.0})
+    assert moved.unknown[1, (), ()] == 3.0
+    assert [moved.fits[key].evidence[()].log_z for key in ((1, ()), (1, ("lag",)))] == [2.0, 5.0]
+    assert EVIDENCES.unknown[1, (), ()] == 1.0
+
+
+def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_stated():
+    found = replace(
+        posterior(),
+        probabilities={
+            ((), ()): 0.4,
+            ((), ("outliers",)): 0.3,
+            (("lag",), ("outliers",)): 0.25,
+            ((), ("drifting_noise",)): 0.05,
+        },
+    )
+    assert found.noise() == ("outliers",)
+    assert found.noise(()) == ()  # a noise that has no name counts as none
+    assert found.noise(("outliers",)) == ("outliers",)

@@ -1,0 +1,80 @@
+"""Sentences from hand-made judgements, of a light sensor and of something that is none."""
+
+from dataclasses import replace
+
+import pytest
+
+from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged
+from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
+
+OVEN = Words(null="the oven's law", find_signal="switch the heater on", settles_nothing="no reading tells them apart")
+GROUNDS = Grounds(OVEN, 100, 24, sentences={"lag": "the probe follows with 8 s", "step": "it jumps by 2 at 40 s"})
+LAG, CLEAN, UNKNOWN = Hypothesis(("lag",), 0.7), Hypothesis((), 0.2), Hypothesis(("unknown",), 0.1)
+
+
+def judged(verdict, combination=(), **more):
+    return Judged(verdict, combination, 1e-4, (LAG, CLEAN, UNKNOWN), **more)
+
+
+SAID = [
+    (judged("named", ("lag",)), {}, "The probe follows with 8 s (p = 0.0001)."),
+    (
+        judged("named", ("lag", "step")),
+        {"p_value_after": 0.002},
+        "The probe follows with 8 s; it jumps by 2 at 40 s (p = 0.0001). "
+        "Something more is missing: after the repair p = 0.002.",
+    ),
+    (judged("noise", ("lag",)), {}, "The probe follows with 8 s; nothing is missing from the mean (p = 0.0001)."),
+    (
+        judged("clean"),
+        {},
+        "The model explains all 100 readings to within their noise "
+        "(p = 0.0001, which is rare; nothing that was tried explains them better).",
+    ),
+    (
+        replace(judged("clean"), p_value=0.4),
+        {"form": "an SSF of one Gaussian"},
+        "The model, an SSF of one Gaussian, explains all 100 readings to within their noise (p = 0.4).",
+    ),
+    (
+        judged("cannot_tell"),
+        {"settles": "repeat run 2"},
+        "These 100 readings do not tell apart lag 0.70, clean 0.20, unknown 0.10; to tell: repeat run 2.",
+    ),
+    (
+        judged("unknown", ("unknown",)),
+        {"beside": ("lag",), "shows_in": "time"},
+        "Something is missing (p = 0.0001) that no named effect explains, beside lag. It shows most in time.",
+    ),
+    (
+        judged("unknown", ("unknown",)),
+        {"like": ("the arm was knocked",), "shows_in": "time"},
+        "Something is missing (p = 0.0001) that has no name; it is most like this: the arm was knocked.",
+    ),
+    (
+        judged("unknown", ("unknown",)),
+        {"family": "edge_distance, far out"},
+        "The readings that are far out lie together in edge distance: something is missing there, not noise "
+        "(to a test of the mean they are noise with a heavy tail, p = 0.0001).",
+    ),
+    (
+        judged("named", ("lag",)).withdraw(),
+        {},
+        "Something is missing (p = 0.0001); lag explains these readings best, and predicts those kept back far worse "
+        "than the oven's law without it.",
+    ),
+    (judged("cannot_tell", too_little=True), {"n_readings": 1}, "1 usable reading is too few to tell; 24 or more are"),
+    (
+        judged("cannot_tell", too_little=True),
+        {},
+        "All 100 usable readings are equal: there is no signal to diagnose; switch the heater on.",
+    ),
+]
+
+
+@pytest.mark.parametrize(("judgement", "grounds", "sentence"), SAID)
+def test_a_judgement_is_said_in_one_sentence_of_the_apparatus_own_words(judgement, grounds, sentence):
+    said = reason_of(judgement, replace(GROUNDS, **grounds))
+    assert said.startswith(sentence)
+    assert "sensor" not in said

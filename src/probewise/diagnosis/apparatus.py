@@ -14,16 +14,14 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.held_out import Parts
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.fitting.ssf_forms import SsfForms
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.scheduling import Command
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["Apparatus", "NullForms", "Start", "Words"]
-
-Start = tuple[Null, FloatArray]
-"""A null and coordinates to fit it from, (n_starts, n_params)."""
+__all__ = ["Apparatus", "Words"]
 
 
 @dataclass(frozen=True)
@@ -36,22 +34,6 @@ class Words:
     null: str
     find_signal: str
     settles_nothing: str
-
-
-class NullForms(Protocol):
-    """The forms that a null may take where no null is given, each fitted from another."""
-
-    def simplest(self) -> Start:
-        """Begin with the fewest parameters."""
-        ...
-
-    def free(self, found: Fit) -> Start:
-        """Bend the simplest, as it was fitted, into any form."""
-        ...
-
-    def one_more(self, found: Fit, order: int) -> Start:
-        """Go on from the fit of the order before."""
-        ...
 
 
 class Apparatus(Protocol):
@@ -70,8 +52,8 @@ class Apparatus(Protocol):
         """Give the prior odds of these effects, of something unknown, and of their absence."""
         ...
 
-    def null_forms(self, recording: Recording) -> NullForms:
-        """List the forms of the null that are calibrated from the recording itself."""
+    def null_forms(self, recording: Recording) -> SsfForms:
+        """Give the forms of the null that are calibrated from the recording, where no null is given."""
         ...
 
     def covariates(self, found: Fit, recording: Recording) -> tuple[Sequence[Covariate], FloatArray]:

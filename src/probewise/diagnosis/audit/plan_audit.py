@@ -8,6 +8,7 @@ the cosine between two survivors, how well they are told apart: by lambda^2 (1 -
 from __future__ import annotations
 
 import textwrap
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
@@ -74,6 +75,12 @@ class EffectAudit:
     alike: tuple[tuple[str, float], ...] = ()
     smallest: tuple[Smallest, ...] = ()
     reason: str = ""
+
+    @property
+    def sight(self) -> Detectability:
+        """`detectability`, by its name of the last release."""
+        warnings.warn("EffectAudit.sight is EffectAudit.detectability now", DeprecationWarning, stacklevel=2)
+        return self.detectability
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, default_sensor
+from probewise.diagnosis.fitting.coordinates import SensorCoordinates, default_sensor
 from probewise.diagnosis.fitting.fit import Fit, start_with_more_gaussians, starts_of_one_gaussian
 from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.null import Null
 from probewise.effects import Extent
 
-__all__ = ["SsfForms"]
+__all__ = ["SsfForms", "Start"]
 
-_Start = tuple[CalibratedSensor, FloatArray]
+Start = tuple[Null, FloatArray]
+"""A null and coordinates to fit it from, (n_starts, n_params)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,19 +23,19 @@ class SsfForms:
 
     extent: Extent
 
-    def simplest(self) -> _Start:
+    def simplest(self) -> Start:
         """One Gaussian: typical, narrow and wide."""
         one = default_sensor(self.extent, 1)
         return one, starts_of_one_gaussian(one)
 
-    def free(self, found: Fit) -> _Start:
+    def free(self, found: Fit) -> Start:
         """Any form, unbent from the fit of one Gaussian."""
         one = found.model.sensor
         assert isinstance(one, SensorCoordinates)
         free = FreeForm.about(one)
         return free, free.start_from(found.z)
 
-    def one_more(self, found: Fit, order: int) -> _Start:
+    def one_more(self, found: Fit, order: int) -> Start:
         """So many Gaussians, the heaviest of the fit split in several ways."""
         wanted = default_sensor(self.extent, order)
         return wanted, start_with_more_gaussians(found.model.sensor, found.z, wanted)

@@ -52,10 +52,6 @@ class LightSensor:
             if (null.admits(effect) if null is not None else not effect.is_of_the_ssf(plan))
         }
 
-    def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Share the odds out over these effects."""
-        return PriorOdds.over(effects)
-
     def null_forms(self, recording: Recording) -> SsfForms:
         """Give the forms of its SSF."""
         return SsfForms(Extent.of(recording))
@@ -66,6 +62,7 @@ class LightSensor:
         slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return covariates_of(recording.plan, usable, found.predicted, slope), slope
 
+    prior_odds = staticmethod(PriorOdds.over)
     covariate_of = staticmethod(covariate_of)
     held_out_parts = staticmethod(held_out_parts)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from probewise.diagnosis.apparatus import Start
 from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.fitting.ssf_forms import Start
 from probewise.diagnosis.noise.law import NoiseLaw, white
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.constants import STEERING

@@ -2,7 +2,7 @@
 
 The paper, section "Efficacy of Sensor Model", shows that a better likelihood makes better inferences; this is
 how a poor likelihood is found out: its residuals are tested, located, explained by named effects, repaired, and
-the gain is shown on readings kept back.
+the gain is shown on held-out readings.
 """
 
 from probewise.diagnosis.advice.aliases import Alias

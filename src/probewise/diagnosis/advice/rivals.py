@@ -17,8 +17,8 @@ __all__ = ["next_readings"]
 
 _LEAST_PROBABILITY = 0.01
 _MOST_RIVALS = 5
-_TRIED = 3  # effects that are not felt, as a rival, until some reading tells of one
-_UNFELT = 3.0  # lambda of such an effect
+_TRIED = 3  # effects that are not significant, as a rival, until some reading tells of one
+_UNDETECTED = 3.0  # lambda of such an effect
 _LEFT = 2.0  # times that it may change the readings taken, all told: what takes it up need not be a straight line
 _SIZES = 4  # tried until it does not, each a quarter of the one before
 
@@ -58,16 +58,16 @@ def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> 
 
 
 def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
-    """Make a rival of an effect that is not felt: such that lambda 3 of it would survive here. None where none can."""
+    """Make a rival of an effect that is not significant, of a size that leaves lambda 3 here; None where none does."""
     effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
     templates = searched.screening.templates.of(found, effect)
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
-    at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNFELT))))
+    at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNDETECTED))))
     setting = templates.settings[at][0].copy()
     amplitudes = list(effect.amplitudes)
-    setting[amplitudes] *= min(_UNFELT / max(sizes[at], 1e-9), 50.0)
+    setting[amplitudes] *= min(_UNDETECTED / max(sizes[at], 1e-9), 50.0)
     model = found.model.with_effect(templates.variant(at))
 
     def change(z: FloatArray) -> FloatArray:
@@ -76,7 +76,7 @@ def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
     for _ in range(_SIZES if amplitudes else 1):
         z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
         z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor as it would then have been fitted
-        if np.linalg.norm(change(z)) <= _LEFT * _UNFELT * null.sd:
+        if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.sd:
             root = np.zeros((len(z), len(z)))  # of that size, and no other
             root[: len(found.z), : len(found.z)] = _root_of(null)
             return Rival(f"{name.replace('_', ' ')} too weak to be felt so far", model, z, root, 0.0)

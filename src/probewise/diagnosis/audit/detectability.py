@@ -188,8 +188,8 @@ class ProjectedTemplates:
         lengths = np.linalg.norm(self.left[:, columns], axis=0)
         out: list[float | None] = []
         for k in effect.amplitudes:
-            felt = (settings[:, k] != 0) & (lengths > 1e-3)
-            sizes = np.abs(settings[felt, k]) * LAMBDA / lengths[felt]
+            significant = (settings[:, k] != 0) & (lengths > 1e-3)
+            sizes = np.abs(settings[significant, k]) * LAMBDA / lengths[significant]
             out.append(float(np.median(sizes)) if sizes.size else None)
         return tuple(out)
 

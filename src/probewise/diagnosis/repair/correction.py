@@ -31,7 +31,7 @@ _MOST_BASES = 6
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What the bases add: `change` of the readings (n_points,), and its gain on scans kept back."""
+    """What the bases add: `change` of the readings (n_points,), and its gain on held-out parts."""
 
     change: FloatArray
     columns: FloatArray
@@ -39,7 +39,7 @@ class Correction:
 
     @property
     def gains_nothing(self) -> bool:
-        """Whether readings kept back, where there are any, speak against it."""
+        """Whether held-out readings, where there are any, are predicted no better."""
         return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
 
 

@@ -27,7 +27,7 @@ ALARM = 0.01
 """p-value below which something is missing."""
 
 _LEAST_ROWS = 3
-_FELT = 0.05  # share of its greatest strength
+_SIGNIFICANT = 0.05  # share of its greatest strength
 _PLAIN = 0.25  # a share of the first draws from which more of them would change nothing
 
 
@@ -236,22 +236,25 @@ def places_of_effect(
     name = covariate.name
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
         curve = _curve(scans, residuals, sd)
-        return [Place("scan", scan, None, None, p_value, size, *curve) for scan in _felt_in(effect.scans, change, plan)]
+        return [
+            Place("scan", scan, None, None, p_value, size, *curve)
+            for scan in _significant_scans(effect.scans, change, plan)
+        ]
     strength = np.abs(change[covariate.rows])
     # What sets in at a level is there from where it is first significant.
-    felt = strength >= (_FELT if name == "level" else 0.5) * strength.max()
-    values = covariate.values[felt]
+    significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
+    values = covariate.values[significant]
     level = covariate.values if name == "level" else None
     curve = _curve(covariate, residuals, sd)
     return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve, level=level)]
 
 
-def _felt_in(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
+def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
     """Keep the scans in which something is significant, the strongest first: a plain sheet looks the same turned."""
     rows = {scan: plan.scan == plan.scan_names.index(scan) for scan in scans}
     strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
-    felt = [scan for scan in scans if strength[scan] >= _FELT * max(strength.values())]
-    return sorted(felt, key=lambda scan: -strength[scan])
+    significant = [scan for scan in scans if strength[scan] >= _SIGNIFICANT * max(strength.values())]
+    return sorted(significant, key=lambda scan: -strength[scan])
 
 
 def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Take leading combinations apart, and select_forward them again from what is left."""
+"""Backward elimination: drop each effect of the leading combinations in turn, and select forward from there."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ Names = tuple[str, ...]
 
 
 def eliminate_backward(state: SearchState) -> None:
-    """Refit the leading combinations less one effect, and select_forward them again from there.
+    """Refit the leading combinations less one effect, and select forward from there.
 
     What screening put first may be superfluous, or have stood for another effect while there was but one. And the
     scans that an effect is bound to, or the place it is at, were chosen while it stood for both.
     """
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.odds(c))
-    named, rest = (
-        [c for c in several if not out_of_vocabulary(c.names)],
-        [c for c in several if out_of_vocabulary(c.names)],
-    )
+    named = [c for c in several if not out_of_vocabulary(c.names)]
+    rest = [c for c in several if out_of_vocabulary(c.names)]
     for candidate in [*named[:ELIMINATED], *rest[:1]]:
         for left_out in candidate.names:
             others = tuple(name for name in candidate.names if name != left_out)

@@ -1,4 +1,4 @@
-"""Grow combinations of effects: screen what could be added to a fit, refit the best of each size."""
+"""Forward beam selection: screen what could be added to a fit, refit the best combinations of each size."""
 
 from __future__ import annotations
 
@@ -41,27 +41,24 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
     null = state.null
     if depth > 1:
         _screen_pairs(state, null)
-    extended = [
-        c
-        for c in state.nulls
-        if c.log_z > null.log_z - (ORDERS_WITHIN if c.degrees_of_freedom <= null.degrees_of_freedom else STEERING)
-    ]
+    freedom = null.degrees_of_freedom
+    within = {c: ORDERS_WITHIN if c.degrees_of_freedom <= freedom else STEERING for c in state.nulls}
+    parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
         proposals: dict[Names, Proposal] = {}
-        for parent in extended:
+        for parent in parents:
             proposals = proposals_for(state, parent, proposals)
         if size == 2:
             proposals = _together(state, proposals)
-        chosen = (
-            promising(state, proposals, width=beam, behind=STEERING) if size > 1 else _alone(state, null, proposals)
-        )
+        if size == 1:
+            chosen = _alone(state, null, proposals)
+        else:
+            chosen = promising(state, proposals, width=beam, behind=STEERING)
         refitted = [state.refit(proposals[names].parent, proposals[names].added) for names in chosen]
-        extended = [c for c in refitted if c is not None]
-        if not extended:
+        kept = [c for c in refitted if c is not None]
+        if not kept:
             break
-        extended = [
-            c for c in extended if c.log_z > max(r.log_z for r in rivals_of(c.names, extended)) - EXTENDED_WITHIN
-        ]
+        parents = [c for c in kept if c.log_z > max(r.log_z for r in rivals_of(c.names, kept)) - EXTENDED_WITHIN]
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:

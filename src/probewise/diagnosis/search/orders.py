@@ -47,7 +47,7 @@ def _rival_orders(state: SearchState, source: WeighedFit) -> list[int]:
 
 
 def _carry_over(state: SearchState, source: WeighedFit, n: int) -> None:
-    """Refit a candidate's effects at another SSF order; keep it where they are felt."""
+    """Refit a candidate's effects at another SSF order; keep it where they are significant."""
     null, sensor = state.candidates[n, ()], state.sensors[n]
     own = source.found.z[source.found.model.sensor.n_params :]
     candidate = state.refits.weighed(

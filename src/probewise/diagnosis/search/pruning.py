@@ -1,4 +1,4 @@
-"""What has a formula and no name in the vocabulary gives way to a name where the readings do not tell the two."""
+"""Prune what is out of vocabulary where the readings do not tell it from a name."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class Refits:
 
 
 def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
-    """Tell whether an added effect is felt: the fit improves by more than a parameter's fair share."""
+    """Tell whether an added effect is significant: the fit improves by more than a parameter's fair share."""
     law = candidate.law
 
     def misfit(found: Fit) -> float:

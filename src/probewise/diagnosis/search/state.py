@@ -106,7 +106,7 @@ class SearchState:
         return candidate
 
     def refit(self, parent: WeighedFit, added: str) -> WeighedFit | None:
-        """Refit a candidate with one more effect and keep the best of its kind, or note that the effect is not felt.
+        """Refit a candidate with one more effect and keep the best of its kind, or note that it is not significant.
 
         Returns
         -------
@@ -120,7 +120,7 @@ class SearchState:
             return self.keep(max(known, candidate, key=lambda c: c.log_z))
         if known is not candidate:
             return known
-        # Laplace fails where an effect is too small to be felt and the closed form does not; but the
+        # Laplace fails where an effect is too small to be significant and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
         names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():

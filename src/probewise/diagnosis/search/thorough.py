@@ -49,7 +49,7 @@ def weigh_thoroughly(
     Where the two disagree by more than a nat, and no run has doubts, nested sampling wins: the evidence of what
     was weighed is moved, and what is unknown beside it, and all probabilities are made anew. What Laplace misses
     of the null it misses of every hypothesis that was not weighed again, so the null is what others are moved
-    against. What has given way to a name by Laplace's evidence does not come back.
+    against. What was pruned by Laplace's evidence does not come back.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Something unknown beside refitted candidates: how much it explains, and where it gives way to a name."""
+"""Something unknown beside refitted candidates: how much it explains, and where it is pruned for a name."""
 
 from __future__ import annotations
 

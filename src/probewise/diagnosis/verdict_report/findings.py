@@ -127,7 +127,7 @@ def _holder(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
 def _too_small(
     searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
 ) -> tuple[NamedEffect[Any], FloatArray, float]:
-    """Bound an effect that is not felt: amplitudes by the linearised null, the rest as the prior has it.
+    """Bound an effect that is not significant: amplitudes by the linearised null, the rest as the prior has it.
 
     Of its variants the one is taken that stands in the middle.
     """

@@ -88,7 +88,7 @@ class PlanTemplates:
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
         model = Model(expected.null, (), plan)
         predicted, slopes = model.jacobian(expected.z)
-        found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, expected.sd, 0.0)
+        found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, sd=expected.sd, objective=0.0)
         extent = Extent(*expected.levels, plan)
         maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
         built = {name: effect for name, effect in maybe.items() if effect is not None}
@@ -108,9 +108,9 @@ class PlanTemplates:
             np.concatenate(columns, axis=1) / expected.sd,
             entry,
             np.array(owner, dtype=np.int64),
-            tuple(built),
-            built,
-            tuple(settings),
+            names=tuple(built),
+            built=built,
+            settings=tuple(settings),
         )
 
     def norms(self, columns: FloatArray) -> FloatArray:

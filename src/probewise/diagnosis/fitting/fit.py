@@ -155,7 +155,7 @@ def fit(
     predicted, slopes = (part[usable] for part in model.jacobian(z))
     best = float(objective(predicted[None, :], z[None, :])[0])
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # nothing to go down from
-        return Fit(model, z, predicted, readings - predicted, slopes, np.inf, np.inf)
+        return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
     for _ in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
         sigma = law.scale(whitened)
@@ -176,7 +176,7 @@ def fit(
         if gained < tolerance:
             break
     sd = float(law.scale(law(readings - predicted)[:, None])[0])
-    return Fit(model, z, predicted, readings - predicted, slopes, sd, best)
+    return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best)
 
 
 def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:

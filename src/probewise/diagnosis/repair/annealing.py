@@ -118,11 +118,11 @@ def anneal(
         kept = resampled(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
         for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
-            z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
+            z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
     harvest = [z]
     while len(harvest) * n_walkers < n_wanted:
         for _ in range(n_moves):
-            z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng)
+            z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
         harvest.append(z)
     return np.asarray(rng.permutation(np.concatenate(harvest))[:n_wanted])
 
@@ -146,6 +146,7 @@ def _moved(
     scale: float,
     log_q: Density,
     log_p: Density,
+    *,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
     """Move one half by differences of the other, then the other by the first's; adapt the step's length."""

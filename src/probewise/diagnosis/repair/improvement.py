@@ -51,9 +51,9 @@ def improvement_of(
     rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
     log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
     if best is null:
-        return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], test.p_value)
+        return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value_after=test.p_value)
     law, prepared = best.evidence[noise].law, searched.prepared
     parts = prepared.apparatus.held_out_parts(prepared.recording)
     held = held_out_gain(null.found, best.found, prepared.recording, law, parts)
     p_after = global_p_value(after, searched.looks(best.found), after.draws(N_DRAWS, rng=rng))
-    return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
+    return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_value_after=p_after)

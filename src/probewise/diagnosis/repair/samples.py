@@ -158,7 +158,9 @@ def sample_model(
         noise_sd = np.array(each)[nodes]
     else:
         noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
-    return ModelSamples(chain, theta, noise_sd, names, null.n_gaussians, null.nuisance, null.exchangeable)
+    return ModelSamples(
+        chain, theta, noise_sd, names, null.n_gaussians, nuisance=null.nuisance, exchangeable=null.exchangeable
+    )
 
 
 def _posterior_draws(

@@ -195,8 +195,8 @@ def places(
         scan = covariate.scan
         if covariate.name == "scan":
             scan, start, end = scan_names[int(kept[best][0])], None, None
-        at, mean, sd = _curve(covariate, residuals, problem.sd)
-        out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), at, mean, sd))
+        curve = _curve(covariate, residuals, problem.sd)
+        out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
 
 
@@ -237,7 +237,7 @@ def places_of_effect(
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
         curve = _curve(scans, residuals, sd)
         return [
-            Place("scan", scan, None, None, p_value, size, *curve)
+            Place("scan", scan, None, None, p_value, size, **curve)
             for scan in _significant_scans(effect.scans, change, plan)
         ]
     strength = np.abs(change[covariate.rows])
@@ -246,7 +246,7 @@ def places_of_effect(
     values = covariate.values[significant]
     level = covariate.values if name == "level" else None
     curve = _curve(covariate, residuals, sd)
-    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, *curve, level=level)]
+    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, **curve, level=level)]
 
 
 def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
@@ -257,14 +257,14 @@ def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> 
     return sorted(significant, key=lambda scan: -strength[scan])
 
 
-def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, FloatArray]:
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:
         parts = [np.flatnonzero(values == value) for value in np.unique(values)]
     else:
         parts = np.array_split(np.argsort(values, kind="stable"), min(30, max(len(values) // 4, 1)))
-    return (
-        np.array([values[p].mean() for p in parts]),
-        np.array([mine[p].mean() for p in parts]),
-        np.array([sd / math.sqrt(len(p)) for p in parts]),
-    )
+    return {
+        "curve_at": np.array([values[p].mean() for p in parts]),
+        "curve_mean": np.array([mine[p].mean() for p in parts]),
+        "curve_sd": np.array([sd / math.sqrt(len(p)) for p in parts]),
+    }

@@ -99,7 +99,16 @@ def search(
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
     unknown.prune(state.candidates.values())
-    return Searched(prepared, prior, noises.models, noises.certain, state.sensors, screening, evidences(), posterior())
+    return Searched(
+        prepared,
+        prior,
+        noise_models=noises.models,
+        certain=noises.certain,
+        nulls=state.sensors,
+        screening=screening,
+        evidences=evidences(),
+        posterior=posterior(),
+    )
 
 
 def _unknown(state: SearchState, prepared: Prepared) -> Unknown:

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import IntArray
 from probewise.diagnosis import Diagnosis
-from probewise.diagnosis.evidence.gain import parts_kept_back
+from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 
 __all__ = ["most_gained"]
 
@@ -20,6 +20,6 @@ def most_gained(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
     if not diagnosis.repair.changes_predictions or not gains:
         return None
     name, gain = max(gains, key=lambda pair: pair[1])
-    part, names = parts_kept_back(diagnosis.recording)
+    part, names = held_out_parts(diagnosis.recording)
     rows = np.flatnonzero(diagnosis.recording.usable)[part == names.index(name)]
     return name, gain, rows

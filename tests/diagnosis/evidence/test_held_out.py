@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise.diagnosis.evidence.held_out import compare_parts, held_out_parts
+from probewise.diagnosis.evidence.held_out import compare_parts
+from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 from probewise.recordings import Recording, paper_plan
 
 PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))

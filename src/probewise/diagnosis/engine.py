@@ -140,7 +140,7 @@ def _grounds(
         like=tuple(e.sentence(own.mean(axis=0), own.std(axis=0)) for e, own in zip(formulas, columns, strict=True)),
         family=max(shares, key=lambda family: shares[family], default=""),
         beside=beside.names if beside else (),
-        shows_in=where[0].covariate if where else None,
+        shows_in=tuple(place.covariate for place in where),
         p_value_after=best.improvement.p_value_after,
         settles=None if asked is None else asked.description,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from probewise.diagnosis import PlanAudit
-from probewise.diagnosis.audit.sights import ALIAS, LAMBDA, LEAST_NATS
+from probewise.diagnosis.audit.detectability import ALIAS, LAMBDA, LEAST_NATS
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import audit_matrix, png

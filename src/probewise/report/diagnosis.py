@@ -55,7 +55,10 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
     return [
         Section("What it could be", _explanations(diagnosis)),
         Section("Where it shows", _places(diagnosis, drawn)),
-        Section("Before and after the repair" if diagnosis.repair.changes_predictions else "The model", _fits(diagnosis, drawn)),
+        Section(
+            "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
+            _fits(diagnosis, drawn),
+        ),
         Section("Does the repaired model predict held-out readings?", _gain(diagnosis, drawn)),
         Section("Aliased effects, and what would separate them", _aliases(diagnosis)),
         Section("Noise", _noise(diagnosis, drawn)),
@@ -316,7 +319,11 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
         definition_list(
             (
                 *((("gain on held-out readings", held),) if gain.heldout_by_scan else ()),
-                *(repaired if diagnosis.repair.changes_predictions else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)),
+                *(
+                    repaired
+                    if diagnosis.repair.changes_predictions
+                    else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)
+                ),
                 ("test that nothing more is missing", readable(p_in_words(gain.p_value_after))),
             )
         ),

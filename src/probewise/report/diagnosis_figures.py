@@ -149,7 +149,11 @@ def _residuals(diagnosis: Diagnosis) -> bytes:
     unit = plan.instrumentation.unit
     models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
     covariates = (("time (s)", plan.time_s), (covariate_label("level", unit), diagnosis.repair.before.readings))
-    return svg(residual_clouds(covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_name(unit)))
+    return svg(
+        residual_clouds(
+            covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_name(unit)
+        )
+    )
 
 
 def _noise(diagnosis: Diagnosis, chance: Chance) -> bytes:

@@ -159,7 +159,9 @@ def _folded(diagnosis: Diagnosis) -> list[Witness]:
 
 def _by_change(diagnosis: Diagnosis) -> Witness:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
-    return Witness(diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})")
+    return Witness(
+        diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})"
+    )
 
 
 def _window(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:

@@ -44,13 +44,18 @@ SAID = [
     ),
     (
         judged("unknown", ("unknown",)),
-        {"beside": ("lag",), "shows_in": "time"},
+        {"beside": ("lag",), "shows_in": ("time", "level")},
         "Something is missing (p = 0.0001) that no named effect explains, beside lag. It shows most in time.",
     ),
     (
         judged("unknown", ("unknown",)),
-        {"like": ("the arm was knocked",), "shows_in": "time"},
+        {"like": ("the arm was knocked",), "shows_in": ("time",)},
         "Something is missing (p = 0.0001) that has no name; it is most like this: the arm was knocked.",
+    ),
+    (
+        judged("unknown", ("unknown",)),
+        {"family": "edge_distance, locally", "shows_in": ("time", "edge_distance")},
+        "Something is missing (p = 0.0001) that no named effect explains. It shows most in edge distance.",
     ),
     (
         judged("unknown", ("unknown",)),

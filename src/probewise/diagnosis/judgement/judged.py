@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from probewise.diagnosis.advice.aliases import Alias, aliased_pairs
@@ -65,8 +65,8 @@ class Judged:
     p_value: float
     hypotheses: tuple[Hypothesis, ...]
     aliases: tuple[Alias, ...] = ()
-    order_probabilities: Mapping[int, float] | None = None
-    unknown_shares: Mapping[str, float] | None = None
+    order_probabilities: Mapping[int, float] = field(default_factory=dict)
+    unknown_shares: Mapping[str, float] = field(default_factory=dict)
     too_little: bool = False
     withdrawn: bool = False
 
@@ -94,7 +94,7 @@ class Judged:
         """What is out of vocabulary, by the covariate in which it shows, with its share of the unknown."""
         if self.unknown_probability < 1e-3:
             return ()
-        shares = sorted((self.unknown_shares or {}).items(), key=lambda item: -item[1])
+        shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
 

@@ -36,7 +36,7 @@ class Grounds:
     beside
         Effects that something unknown is beside.
     shows_in
-        The covariate in which it shows most, None where in none.
+        Covariates in which something shows, strongest first.
     p_value_after
         That nothing is missing from the repaired model.
     settles
@@ -51,7 +51,7 @@ class Grounds:
     like: tuple[str, ...] = ()
     family: str = ""
     beside: tuple[str, ...] = ()
-    shows_in: str | None = None
+    shows_in: tuple[str, ...] = ()
     p_value_after: float = 1.0
     settles: str | None = None
 
@@ -96,7 +96,9 @@ def _unknown(judged: Judged, grounds: Grounds) -> str:
         tail = f"to a test of the mean they are noise with a heavy tail, {p}"
         together = f"The readings that are far out lie together in {covariate}"
         return f"{together}: something is missing there, not noise ({tail})."
-    place = "" if grounds.shows_in is None else f" It shows most in {grounds.shows_in}."
+    likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
+    most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
+    place = f" It shows most in {most.replace('_', ' ')}." if most else ""
     known = " and ".join(name.replace("_", " ") for name in grounds.beside)
     beside = f", beside {known}" if known else ""
     return f"Something is missing ({p}) that no named effect explains{beside}.{place}"

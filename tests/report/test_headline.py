@@ -25,8 +25,7 @@ def found(verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares
         improvement=SimpleNamespace(p_value_after=after),
         effects=tuple(named) if combination != ("unknown",) else (),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
-        unknown_shares=shares or {},
-        few=few,
+        judged=SimpleNamespace(unknown_shares=shares or {}, too_little=few),
     )
 
 

@@ -1,16 +1,112 @@
 """Model a sensor, let it choose its own measurements, find the physics its model leaves out.
 
-One folder an idea of the paper, imported as you use it: `from probewise import calibration, nested`.
-In the order of one reading's path: `arm` (where readings come from), `recordings`, `scene`
-(what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence and
-posterior), `inquiry` (where to measure next), `experiment` (the loop), `calibration`, `diagnosis`
-(what the model leaves out), `effects`, `report`; `world` is the simulated world apart.
+One call each for what the command line does:
+
+- `calibrate(recording, rng=rng)`: the sensor model of a recording
+- `predict(sensor, plan)`: what it expects to read
+- `explore(sensor, rng=rng)`: the robot finds a shape, choosing its own measurements
+- `audit(plan)`: before any data, what a plan cannot tell
+- `diagnose(recordings, rng=rng)`: the physics that the model leaves out
+
+`Recording.from_arrays` and `Recording.from_table` make recordings, `read_recording`, `read_plan` and `read_sensor` read
+files. Results show themselves in notebooks.
+
+The parts are packages, loaded as they are used. In the order of one reading's path: `arm` (where readings come from),
+`recordings`, `scene` (what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence
+and posterior: `nested.run`), `inquiry` (where to measure next), `experiment` (the loop), `calibration`, `effects` and
+`diagnosis` (what the model leaves out), `study`, `challenge`, `report`; `world` is the simulated world apart,
+`emulator` a LEGO brick in software.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
 
 from probewise._display import before_first_display
 from probewise._version import __version__
+from probewise.verbs import audit, calibrate, diagnose, explore, predict
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from probewise import (
+        arm,
+        calibration,
+        campaign,
+        challenge,
+        diagnosis,
+        effects,
+        emulator,
+        errors,
+        experiment,
+        inference,
+        inquiry,
+        nested,
+        priors,
+        recordings,
+        report,
+        scene,
+        sensor,
+        study,
+        world,
+    )
+    from probewise.calibration import read_sensor
+    from probewise.recordings import Plan, Recording, read_plan, read_recording
+
+__all__ = [
+    "Plan",
+    "Recording",
+    "__version__",
+    "arm",
+    "audit",
+    "calibrate",
+    "calibration",
+    "campaign",
+    "challenge",
+    "diagnose",
+    "diagnosis",
+    "effects",
+    "emulator",
+    "errors",
+    "experiment",
+    "explore",
+    "inference",
+    "inquiry",
+    "nested",
+    "predict",
+    "priors",
+    "read_plan",
+    "read_recording",
+    "read_sensor",
+    "recordings",
+    "report",
+    "scene",
+    "sensor",
+    "study",
+    "world",
+]
+
+# Where the names come from that are not packages; all are loaded when first used.
+_HOME = {
+    "Plan": "recordings",
+    "Recording": "recordings",
+    "read_plan": "recordings",
+    "read_recording": "recordings",
+    "read_sensor": "calibration",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a package, or a value of one, when it is first asked for (PEP 562)."""
+    if name not in __all__:
+        raise AttributeError(f"module 'probewise' has no attribute {name!r}")
+    home = importlib.import_module(f"probewise.{_HOME.get(name, name)}")
+    found = getattr(home, name) if name in _HOME else home
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def _load_renderers() -> None:

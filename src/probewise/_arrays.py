@@ -1,4 +1,4 @@
-"""Array types and the two checks every value makes of its arrays."""
+"""Array types and the checks every value makes of its arrays."""
 
 from __future__ import annotations
 
@@ -14,9 +14,36 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 
-def frozen(values: ArrayLike) -> FloatArray:
+def floats(values: ArrayLike, name: str = "values") -> FloatArray:
+    """Take numbers as an array of floats: an array, a list, a column of a table.
+
+    None becomes NaN, and so does what a masked array hides.
+
+    Raises
+    ------
+    ParameterError
+        If there is a text, a date, a complex number, a set or a list of unequal lists.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
+    allowed = "numbers, in an array or a list"
+    try:
+        array = np.asarray(values)
+        texts = array.dtype == np.object_ and any(isinstance(v, str | bytes) for v in array.ravel())
+        if texts or array.dtype.kind not in "biufO":
+            raise ParameterError(name, values, allowed)
+        return array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise ParameterError(name, values, allowed) from error
+
+
+def frozen(values: ArrayLike, name: str = "values") -> FloatArray:
     """Copy to a read-only array of floats, so that an immutable value really is one."""
-    array = np.array(values, dtype=np.float64)
+    array = np.array(floats(values, name))
     array.flags.writeable = False
     return array
 

@@ -17,6 +17,8 @@ __all__ = [
     "ShapeError",
 ]
 
+_LONGEST = 160  # characters of a value in a message
+
 
 class ProbewiseError(Exception):
     """Stand above every error that this package raises on purpose."""
@@ -27,7 +29,7 @@ class ParameterError(ProbewiseError, ValueError):
 
     def __init__(self, name: str, value: object, allowed: str) -> None:
         self.name, self.value, self.allowed = name, value, allowed
-        super().__init__(f"{name} is {value!r}; allowed: {allowed}")
+        super().__init__(f"{name} is {_in_one_line(value)}; allowed: {allowed}")
 
     def __reduce__(self) -> tuple[object, ...]:
         # Exceptions are pickled as type(*args), which would hand the message back as the name.
@@ -83,3 +85,9 @@ class NotSavedWarning(UserWarning):
 
 class LowBatteryWarning(UserWarning):
     """Warn of a battery that will not drive the instrument much longer, or not as it should."""
+
+
+def _in_one_line(value: object) -> str:
+    """Show a value in one line of bearable length: a table or a long array would hide what is wrong with it."""
+    shown = " ".join(repr(value).split())
+    return shown if len(shown) <= _LONGEST else f"{shown[: _LONGEST - 3]}... ({type(value).__name__})"

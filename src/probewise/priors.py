@@ -13,10 +13,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, floats
+from probewise._kinds import require_kind, require_like, require_number
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["Empty", "Joint", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform"]
+__all__ = ["Empty", "Joint", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform", "require_prior"]
 
 
 @runtime_checkable
@@ -84,6 +85,8 @@ class Uniform:
     high: float
 
     def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            require_number(name, getattr(self, name))
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ParameterError("Uniform(low, high)", (self.low, self.high), "finite, low < high")
 
@@ -112,6 +115,8 @@ class LogUniform:
     high: float
 
     def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            require_number(name, getattr(self, name))
         if not (0 < self.low < self.high < math.inf):
             raise ParameterError("LogUniform(low, high)", (self.low, self.high), "0 < low < high, finite")
 
@@ -142,6 +147,8 @@ class Normal:
     sd: float
 
     def __post_init__(self) -> None:
+        for name in ("mean", "sd"):
+            require_number(name, getattr(self, name))
         if not (math.isfinite(self.mean) and 0 < self.sd < math.inf):
             raise ParameterError("Normal(mean, sd)", (self.mean, self.sd), "finite, sd > 0")
 
@@ -168,6 +175,14 @@ class Product:
 
     marginals: Mapping[str, Marginal]
 
+    def __post_init__(self) -> None:
+        allowed = "distributions by name: Product({'x_mm': Uniform(0.0, 1.0), 'sd': LogUniform(0.1, 10.0)})"
+        require_kind("marginals", self.marginals, Mapping, allowed)
+        for name, marginal in self.marginals.items():
+            require_kind("name of a marginal", name, str, "a text")
+            one = "a distribution of one parameter, such as Uniform(low, high), LogUniform(low, high), Normal(mean, sd)"
+            require_like(f"marginals[{name!r}]", marginal, ("from_unit", "to_unit", "log_prob"), one)
+
     @property
     def names(self) -> tuple[str, ...]:
         """The marginals' names, in order."""
@@ -175,17 +190,17 @@ class Product:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each coordinate by its own marginal, (n_samples, n_params) both ways."""
-        _require_columns(u, self.names)
+        u = _columns(u, self.names)
         return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each parameter by its own marginal, (n_samples, n_params) both ways."""
-        _require_columns(theta, self.names)
+        theta = _columns(theta, self.names)
         return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Sum of the marginals, (n_samples, n_params) -> (n_samples,)."""
-        _require_columns(theta, self.names)
+        theta = _columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
             total = total + marginal.log_prob(theta[:, i])
@@ -198,6 +213,13 @@ class Joint:
 
     parts: tuple[Prior, ...]
 
+    def __post_init__(self) -> None:
+        allowed = "priors: Joint((Product({...}), Product({...})))"
+        require_kind("parts", self.parts, (tuple, list), allowed)
+        for k, part in enumerate(self.parts):
+            require_prior(f"parts[{k}]", part)
+        object.__setattr__(self, "parts", tuple(self.parts))
+
     @property
     def names(self) -> tuple[str, ...]:
         """The parts' names, in order."""
@@ -205,17 +227,17 @@ class Joint:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each part's coordinates by that part, (n_samples, n_params) both ways."""
-        _require_columns(u, self.names)
+        u = _columns(u, self.names)
         return np.concatenate([p.from_unit_cube(c) for p, c in self._split(u)], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each part's parameters by that part, (n_samples, n_params) both ways."""
-        _require_columns(theta, self.names)
+        theta = _columns(theta, self.names)
         return np.concatenate([p.to_unit_cube(c) for p, c in self._split(theta)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Sum of the parts, (n_samples, n_params) -> (n_samples,)."""
-        _require_columns(theta, self.names)
+        theta = _columns(theta, self.names)
         total = np.zeros(len(theta))
         for part, columns in self._split(theta):
             total = total + part.log_prob(columns)
@@ -248,6 +270,14 @@ class Empty:
         return np.zeros(len(theta))
 
 
-def _require_columns(values: FloatArray, names: tuple[str, ...]) -> None:
-    if values.ndim != 2 or values.shape[1] != len(names):
-        raise ShapeError(f"parameters have shape {values.shape}; allowed: (n_samples, {len(names)}) for {names}")
+def require_prior(name: str, prior: object) -> None:
+    """Raise ParameterError unless `prior` has named parameters and a unit cube; a marginal has neither."""
+    allowed = "a prior of named parameters, such as Product({'x_mm': Uniform(0.0, 1.0)})"
+    require_like(name, prior, ("names", "from_unit_cube"), allowed)
+
+
+def _columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
+    array = floats(values, "parameters")
+    if array.ndim != 2 or array.shape[1] != len(names):
+        raise ShapeError(f"parameters have shape {array.shape}; allowed: (n_samples, {len(names)}) for {names}")
+    return array

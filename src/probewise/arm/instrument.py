@@ -8,8 +8,9 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise._kinds import require_kind, require_like, require_number
 
-__all__ = ["Instrument", "Pose", "Reading"]
+__all__ = ["Instrument", "Pose", "Reading", "require_instrument", "require_pose"]
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,12 @@ class Pose:
     orientation_rad: float = 0.0
     height_mm: float | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("x_mm", "y_mm", "orientation_rad"):
+            object.__setattr__(self, name, require_number(name, getattr(self, name)))
+        if self.height_mm is not None:
+            object.__setattr__(self, "height_mm", require_number("height_mm", self.height_mm, "a number or None"))
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -30,6 +37,18 @@ class Reading:
     pose: Pose
     time_s: float
     covariates: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        order = "in the order Reading(value, pose, time_s)"
+        object.__setattr__(self, "value", require_number("value", self.value, f"a number, {order}"))
+        require_pose(self.pose, order)
+        object.__setattr__(self, "time_s", require_number("time_s", self.time_s, f"a number, {order}"))
+        require_kind("covariates", self.covariates, Mapping, "numbers by name")
+
+
+def require_pose(pose: object, more: str = "") -> None:
+    """Raise ParameterError unless `pose` is a Pose; a pair of numbers is the usual mistake."""
+    require_kind("pose", pose, Pose, f"a Pose: Pose(x_mm, y_mm){', ' if more else ''}{more}")
 
 
 class Instrument(Protocol):
@@ -67,3 +86,9 @@ class Instrument(Protocol):
             If the instrument does not answer.
         """
         ...
+
+
+def require_instrument(instrument: object, name: str = "instrument") -> None:
+    """Raise ParameterError unless `instrument` can be asked and moved."""
+    allowed = "an Instrument such as SimulatedArm(light) or LegoArm, of probewise.arm"
+    require_like(name, instrument, ("measure", "reachable", "travel_s", "orientation_rad"), allowed)

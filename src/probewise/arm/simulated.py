@@ -10,8 +10,9 @@ from typing import Self, TypeAlias
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
-from probewise.arm.instrument import Pose, Reading
+from probewise._arrays import BoolArray, FloatArray, floats
+from probewise._kinds import require_callable, require_like, require_number
+from probewise.arm.instrument import Pose, Reading, require_pose
 from probewise.arm.reach import Reach, Workspace
 from probewise.arm.scale import LegoScale
 from probewise.errors import ParameterError, ReachError, ShapeError
@@ -69,8 +70,11 @@ class SimulatedArm:
         height_mm: float = 14.0,
         last: Reading | None = None,
     ) -> None:
-        if not height_mm > 0:
+        require_callable("light", light, "a function light(pose, time_s, height_mm) that returns the reading there")
+        if not require_number("height_mm", height_mm) > 0:
             raise ParameterError("height_mm", height_mm, "greater than 0")
+        if reach is not None:
+            require_like("reach", reach, ("rest_mm", "holds", "orientation_rad"), "a Reach, or the Geometry of an arm")
         self._light, self._scale, self._height_mm = light, scale, height_mm
         self.reach: Workspace = Reach() if reach is None else reach
         self.speed = Speed() if speed is None else speed
@@ -136,6 +140,7 @@ class SimulatedArm:
         ReachError
             If the arm cannot take the pose; it stays where it is.
         """
+        require_pose(pose)
         place = np.array([[pose.x_mm, pose.y_mm]])
         if not (math.isfinite(pose.orientation_rad) and self.reach.holds(place)[0]):
             raise ReachError("pose", pose, f"{self.reach.sentence()}, at a finite orientation")
@@ -144,13 +149,13 @@ class SimulatedArm:
             raise ReachError("height_mm", height_mm, "above the surface: finite, greater than 0")
         self._time_s += float(self.travel_s(self._pose, place)[0])
         self._pose = pose
-        value = self._light(pose, self._time_s, height_mm)
+        value = require_number("what light returned", self._light(pose, self._time_s, height_mm))
         value = value if self._scale is None else self._scale.convert(value)
         return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": height_mm})
 
 
 def _pairs(places_mm: FloatArray) -> FloatArray:
-    places = np.asarray(places_mm, dtype=np.float64)
+    places = floats(places_mm, "places_mm")
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"places_mm has shape {places.shape}; allowed: (n_places, 2)")
     return places

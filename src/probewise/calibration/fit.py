@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Integral
 from pathlib import PurePath
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
+from probewise._kinds import require_rng, require_whole
 from probewise.calibration.distinct import DistinctRows
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field, mixture_moments
 from probewise.calibration.noise import noise_by_scan, pooled_sd
@@ -23,6 +25,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor, student_t
 from probewise.nested import NestedResult, State, Weighted, refine, run
 from probewise.recordings import Recording, fingerprint
+from probewise.recordings.plan import require_described, require_recording
 from probewise.scene import KnownScene
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture, SSFField
 
@@ -182,9 +185,11 @@ def calibrate(
     DoubtfulResultWarning
         If there are fewer usable readings than parameters, or the sampler doubts its run.
     """
-    wanted = tuple(dict.fromkeys(int(n) for n in orders))
-    if not wanted or min(wanted) < 1:
-        raise ParameterError("orders", tuple(orders), "one or more whole numbers from 1")
+    require_recording(recording)
+    require_described(recording.plan)
+    require_rng(rng)
+    require_whole("n_live", n_live)
+    wanted = _orders(orders)
     one = partial(
         _fit_order,
         recording,
@@ -210,6 +215,17 @@ def calibrate(
             replace(fit, sensor=replace(fit.sensor, orders=table, notes=(*fit.sensor.notes, *close))) for fit in fits
         ),
     )
+
+
+def _orders(orders: object) -> tuple[int, ...]:
+    """Take the numbers of Gaussians, each once."""
+    allowed = "one or more whole numbers from 1, such as (1, 2)"
+    if isinstance(orders, str) or not isinstance(orders, Iterable):
+        raise ParameterError("orders", orders, allowed)
+    asked = tuple(orders)
+    if not asked or not all(isinstance(n, Integral) and int(n) >= 1 for n in asked):
+        raise ParameterError("orders", asked, allowed)
+    return tuple(dict.fromkeys(int(n) for n in asked))
 
 
 def _fit_order(

@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, floats
 from probewise.calibration.distinct import DistinctRows
-from probewise.calibration.sensor_file import FittedSensor
+from probewise.calibration.sensor_file import FittedSensor, require_sensor
 from probewise.effects import log_density, variance
-from probewise.errors import DoubtfulResultWarning, ShapeError
+from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.recordings import Plan, Prediction, Recording
+from probewise.recordings.plan import require_described, require_plan
 from probewise.scene import KnownScene
 from probewise.sensor import NoiseLevel
 
@@ -24,7 +25,9 @@ __all__ = ["predict"]
 _BLOCK = 4_000_000
 
 
-def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[float] | None = None) -> Prediction:
+def predict(
+    sensor: FittedSensor, plan: Plan | Recording, readings: FloatArray | Sequence[float] | None = None
+) -> Prediction:
     """Predict every row of a plan, and score its readings where there are any.
 
     Mean and sd are those of one new reading that is not lost, parameter uncertainty and noise together.
@@ -40,9 +43,9 @@ def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[fl
     sensor
         The fitted sensor.
     plan
-        Where, when and over what to read, n_points rows.
+        Where, when and over what to read, n_points rows; or a recording, whose readings are then scored.
     readings
-        What was read, shape (n_points,), NaN where missing; `None` for a plan.
+        What was read, shape (n_points,), NaN where missing; `None` for a plan, and where a recording is given.
 
     Returns
     -------
@@ -59,7 +62,14 @@ def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[fl
     DoubtfulResultWarning
         If the plan declares another unit than the sensor was calibrated in, or lacks a column that an effect reads.
     """
-    recorded = np.full(len(plan), np.nan) if readings is None else np.asarray(readings, dtype=np.float64)
+    require_sensor(sensor, "in the order predict(sensor, plan)")
+    if isinstance(plan, Recording):
+        if readings is not None:
+            raise ParameterError("readings", readings, "none beside a recording, which has its own")
+        readings, plan = plan.readings, plan.plan
+    require_plan(plan)
+    require_described(plan)
+    recorded = np.full(len(plan), np.nan) if readings is None else floats(readings, "readings")
     if recorded.shape != (len(plan),):
         raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one a row of the plan")
     if plan.instrumentation.unit != sensor.instrumentation.unit:
@@ -106,7 +116,7 @@ def predict(sensor: FittedSensor, plan: Plan, readings: FloatArray | Sequence[fl
     scores = np.full(n_points, np.nan)
     scores[scored] = log_sum - math.log(n_samples)
     base = np.zeros(n_points) if center is None else center
-    return Prediction(plan, base + shift, np.sqrt(spread + of_noise / n_samples), scores)
+    return Prediction(plan, base + shift, np.sqrt(spread + of_noise / n_samples), scores, recorded)
 
 
 def _of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:

@@ -15,6 +15,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
+from probewise._kinds import require_kind
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -38,7 +39,16 @@ from probewise.sensor import (
     mixture_of_field,
 )
 
-__all__ = ["BOUND_TO_SCANS", "FORMAT", "MIN_SAMPLES", "FittedSensor", "OrderEvidence", "read_sensor", "write_sensor"]
+__all__ = [
+    "BOUND_TO_SCANS",
+    "FORMAT",
+    "MIN_SAMPLES",
+    "FittedSensor",
+    "OrderEvidence",
+    "read_sensor",
+    "require_sensor",
+    "write_sensor",
+]
 
 T = TypeVar("T")
 
@@ -390,6 +400,12 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise FileError(path, f"cannot be read ({reason})", "a sensor.json as `probewise calibrate` writes") from error
     return FittedSensor.from_json(text, path)
+
+
+def require_sensor(sensor: object, more: str = "") -> None:
+    """Raise ParameterError unless `sensor` is a FittedSensor, saying how to come by one."""
+    allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
+    require_kind("sensor", sensor, FittedSensor, f"{allowed}{', ' if more else ''}{more}")
 
 
 def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:

@@ -42,8 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = None if arguments.out is None else check_out_directory(arguments.out)
     plan = read_plan(arguments.plan)
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
-    noise_sd = None if sensor is None else float(sensor.noise_sd.mean())
-    audit = audit_plan(plan, sensor=sensor, noise_sd=noise_sd)
+    audit = audit_plan(plan, sensor=sensor)
     say(audit.summary(), quiet=arguments.quiet)
     if out is not None:
         _write(audit, out, arguments.plan, quiet=arguments.quiet)

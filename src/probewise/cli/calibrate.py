@@ -6,6 +6,7 @@ import argparse
 
 from probewise.cli._common import Verb, a_path, add_common, add_out_directory, check_live, positive_int, say
 from probewise.cli._output import check_out_directory, staged
+from probewise.verbs import N_LIVE, ORDERS
 
 __all__ = ["VERB"]
 
@@ -18,12 +19,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--orders",
         type=positive_int,
         nargs="+",
-        default=[1, 2, 3, 4],
+        default=list(ORDERS),
         metavar="N",
-        help="numbers of Gaussians to weigh (default 1 2 3 4)",
+        help=f"numbers of Gaussians to weigh (default {' '.join(map(str, ORDERS))})",
     )
     parser.add_argument(
-        "--live", type=positive_int, default=300, metavar="N", help="live points of nested sampling (default 300)"
+        "--live",
+        type=positive_int,
+        default=N_LIVE,
+        metavar="N",
+        help=f"live points of nested sampling (default {N_LIVE})",
     )
     add_common(parser)
 
@@ -32,8 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate and write sensor.json, report.html and the figures."""
     import numpy as np
 
-    from probewise.calibration import calibrate, predict, write_sensor
-    from probewise.cli._progress import nested_progress
+    from probewise import verbs
+    from probewise.calibration import write_sensor
     from probewise.recordings import read_recording, write_bytes_atomically, write_text_atomically
     from probewise.report import calibration as report
 
@@ -41,15 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
     recording = read_recording(arguments.recording)
     orders = tuple(sorted(set(arguments.orders)))
     n_live = check_live(arguments.live, 6 * max(orders) + 2)
-    with nested_progress(quiet=arguments.quiet) as progress:
-        result = calibrate(
-            recording,
-            orders=orders,
-            n_live=n_live,
-            rng=np.random.default_rng(arguments.seed),
-            progress=progress,
-        )
-    prediction = predict(result.sensor, recording.plan, recording.readings)
+    rng = np.random.default_rng(arguments.seed)
+    result = verbs.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=not arguments.quiet)
+    prediction = verbs.predict(result.sensor, recording)
     drawn = report.figures(result, recording, prediction)
     with staged(out) as stage:
         write_sensor(result.sensor, stage / "sensor.json")

@@ -51,8 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
+    from probewise._progress import nested_progress
     from probewise.calibration import read_sensor
-    from probewise.cli._progress import nested_progress
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
     from probewise.recordings import read_recording, write_text_atomically
     from probewise.report import diagnosis as report
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         shapes.append(shape)
     if len(shapes) > 1:
         raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
-    diagnosis_rng, files_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(3)
+    diagnosis_rng, nested_rng, files_rng = np.random.default_rng(arguments.seed).spawn(3)
     joined = join(recordings)
     null = None
     if sensor is not None and shapes:

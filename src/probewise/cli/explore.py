@@ -13,6 +13,7 @@ from probewise.cli._common import Verb, a_path, add_common, add_out_directory, k
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import require_going_on, saying_what_is_kept
 from probewise.errors import FileError, ParameterError
+from probewise.verbs import MAX_READINGS, MODEL, SHAPE, UTILITY
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Instrument
@@ -28,14 +29,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
     parser.add_argument("--sensor", type=a_path, required=True, metavar="S.json", help="sensor model")
     add_out_directory(parser)
-    parser.add_argument("--model", choices=("ssf", "naive"), default="ssf", help="what the robot takes its sensor for")
+    parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="what the robot takes its sensor for")
     parser.add_argument(
         "--shape",
         nargs="+",
         choices=SHAPE_NAMES,
-        default=["circle"],
+        default=[SHAPE],
         metavar="SHAPE",
-        help=f"what may lie on the field, one or several of {', '.join(SHAPE_NAMES)} (default circle)",
+        help=f"what may lie on the field, one or several of {', '.join(SHAPE_NAMES)} (default {SHAPE})",
     )
     parser.add_argument(
         "--truth",
@@ -53,7 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_geometry(parser)
     parser.add_argument(
-        "--max-readings", type=positive_int, default=100, metavar="N", help="stop here at the latest (default 100)"
+        "--max-readings",
+        type=positive_int,
+        default=MAX_READINGS,
+        metavar="N",
+        help=f"stop here at the latest (default {MAX_READINGS})",
     )
     parser.add_argument(
         "--live", action="store_true", help="show the robot's view in a browser while it works (DIR/live.html)"
@@ -65,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--utility",
-        default="finishing",
+        default=UTILITY,
         metavar="NAME",
         help="what a reading is worth: information and, finishing (default), near the end whether it ends the run; "
         "information alone; the paper's entropy; information per-second of arm time, "
@@ -108,14 +113,13 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.recordings import write_bytes_atomically, write_text_atomically
     from probewise.report import exploration as report
     from probewise.report.animation import gif
-    from probewise.scene import outlines
 
     out = check_out_directory(arguments.out)
     port = parse_arm(arguments.arm)
     geometry = geometry_of(arguments) if port is not None or arguments.geometry is not None else None
     field = _field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
-    run_rng, truth_rng, other_rng = np.random.default_rng(arguments.seed).spawn(3)
+    streams = posing.Streams.of(np.random.default_rng(arguments.seed))
     shape, utility = posing.shape_named(arguments.shape, field), utility_named(arguments.utility)
     orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
     pose_it = partial(
@@ -142,13 +146,10 @@ def run(arguments: argparse.Namespace) -> int:
             raise ParameterError("--truth", arguments.truth, "none with a real arm: what lies there is for it to find")
         arm = open_nxt(port, geometry, start_s=taken[-1].time_s if taken else 0.0)
     else:
-        name, truth = parse_truth(arguments.truth, arguments.shape, field, rng=truth_rng)
-        surface = posing.surface_of(name, truth, field)
+        hidden = parse_truth(arguments.truth, arguments.shape, field, rng=streams.truth)
         world = posing.world_like(sensor)
-        arm = posing.arm_over(world, surface, field, seed=arguments.seed, taken=taken, workspace=geometry)
-        truth_mm = outlines(posing.SHAPES[name](field).region(truth[None, :]))[0]
-        prior_names = posing.SHAPES[name](field).prior.names
-        known = _truth_by_name(name, dict(zip(prior_names, truth.tolist(), strict=True)), experiment.names)
+        arm = posing.arm_over(world, hidden.surface, field, seed=streams.noise, taken=taken, workspace=geometry)
+        truth_mm, known = hidden.outline_mm, hidden.named_as(experiment.names)
     means = sensor.mean()
     levels = (means["I_min"], means["I_max"])
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
@@ -166,13 +167,13 @@ def run(arguments: argparse.Namespace) -> int:
         saying_what_is_kept(kept),
         arm,
         closing(
-            explore(arm, experiment, rng=run_rng, max_readings=arguments.max_readings, journal=before or journal)
+            explore(arm, experiment, rng=streams.run, max_readings=arguments.max_readings, journal=before or journal)
         ) as own,
         tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
     ):
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if other is not None:
-            pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=other_rng)
+            pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=streams.shadow)
         for step, shadow in pairs:
             steps.append(step)
             pose = step.reading.pose
@@ -280,11 +281,6 @@ def _remove_pictures(out: Path) -> None:
     for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png"):
         for path in out.glob(pattern):
             path.unlink()
-
-
-def _truth_by_name(shape: str, truth: dict[str, float], names: tuple[str, ...]) -> dict[str, float]:
-    """Name the truth as the hypothesis does: in a set of shapes "rectangle.width_mm", with the centre shared."""
-    return {n: truth[n.removeprefix(f"{shape}.")] for n in names if n.removeprefix(f"{shape}.") in truth}
 
 
 VERB = Verb("explore", "Let the robot find a shape, choosing each measurement itself.", add_arguments, run)

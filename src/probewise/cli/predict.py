@@ -22,8 +22,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict every row, and say how well the readings were expected where there are any."""
-    import numpy as np
-
     from probewise.calibration import predict, read_sensor
     from probewise.recordings import read_plan_and_readings, write_prediction
 
@@ -33,17 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     prediction = predict(sensor, plan, readings)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_prediction(prediction, out)
-    say(f"{len(plan)} readings predicted: {out}", quiet=arguments.quiet)
-    scored = np.isfinite(prediction.log_density)
-    if readings is not None and scored.any():
-        n_left = len(plan) - int(scored.sum())
-        left_out = f" ({n_left} missing or out of range, left out)" if n_left else ""
-        z = (readings[scored] - prediction.mean[scored]) / prediction.sd[scored]
-        say(
-            f"of {int(scored.sum())} recorded{left_out}: chi-square a reading {float(np.mean(z**2)):.3f}, "
-            f"log density a reading {float(prediction.log_density[scored].mean()):.3f}",
-            quiet=arguments.quiet,
-        )
+    say(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 
 

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from probewise._kinds import require_rng
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.advice.rivals import next_readings
 from probewise.diagnosis.fitting.earlier import SensorPrior
@@ -84,6 +85,7 @@ def diagnose(
     NotConvergedError
         If the fit of the null did not arrive anywhere.
     """
+    require_rng(rng)
     prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(effects))
     searched, weighings = search(prepared), tuple[Weighing, ...]()
     if prepared.too_little:

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plan import Plan, Recording, require_recording
 from probewise.sensor import COMMANDED
 
 __all__ = ["covariates_joined", "join", "join_plans", "last_known"]
@@ -28,8 +28,12 @@ def join(recordings: Sequence[Recording]) -> Recording:
     ParameterError
         If there is none, their readings are in different units, or two of them are the same.
     """
+    if isinstance(recordings, str) or not isinstance(recordings, Sequence):
+        require_recording(recordings)
     if not recordings:
         raise ParameterError("recordings", (), "one or more")
+    for recording in recordings:
+        require_recording(recording)
     first = recordings[0]
     if len(recordings) == 1:
         return first

@@ -12,13 +12,13 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
-from probewise.diagnosis.fitting.earlier import SensorPrior, require_same_unit, sensor_of
+from probewise.diagnosis.fitting.earlier import SensorPrior, require_same_unit, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
-from probewise.recordings.plan import Recording
+from probewise.recordings.plan import Recording, require_described
 from probewise.sensor import Stage
 
 __all__ = ["Prepared", "prepare"]
@@ -95,7 +95,11 @@ def prepare(
     """Join recordings, thin out long ones, build the effects; parameters and errors as in `diagnose`."""
     if sensor is not None and null is not None:
         raise ParameterError("sensor, null", "both", "one of them: a null holds what is known of its sensor")
-    everything = join([recordings] if isinstance(recordings, Recording) else list(recordings))
+    if sensor is not None:
+        require_sensor_prior(sensor)
+    everything = join([recordings] if isinstance(recordings, Recording) else recordings)
+    if null is None:
+        require_described(everything.plan)
     rows = rows_to_diagnose(everything)
     recording = everything if len(rows) == len(everything) else everything.take(rows)
     if sensor is not None:

@@ -3,12 +3,14 @@
 from probewise.experiment.asking import Field
 from probewise.experiment.beside import beside
 from probewise.experiment.digest import value_digest
+from probewise.experiment.hidden import Hidden, Truth, members_of
 from probewise.experiment.journal import (
     Belief,
     Entry,
     Journal,
     JournalWriter,
     read_journal,
+    readings_of,
     recording_of,
     require_same_settings,
 )
@@ -19,9 +21,11 @@ from probewise.experiment.setting import Experiment, OneScan
 from probewise.experiment.simulation import (
     SHAPES,
     Model,
+    Streams,
     arm_over,
     experiment_for,
     shape_named,
+    shape_of,
     surface_of,
     world_like,
 )
@@ -38,25 +42,31 @@ __all__ = [
     "Experiment",
     "Exploration",
     "Field",
+    "Hidden",
     "Journal",
     "JournalWriter",
     "Model",
     "OneScan",
     "State",
     "Step",
+    "Streams",
+    "Truth",
     "arm_over",
     "begin",
     "beside",
     "experiment_for",
     "explore",
     "least_readings",
+    "members_of",
     "read_journal",
+    "readings_of",
     "recording_of",
     "require_same_settings",
     "run",
     "run_from",
     "sensor_prior",
     "shape_named",
+    "shape_of",
     "step",
     "surface_of",
     "value_digest",

@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.arm.instrument import Instrument, Reading
+from probewise._kinds import require_kind, require_rng, require_whole
+from probewise.arm.instrument import Instrument, Reading, require_instrument
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.experiment.asking import Field, inquire, next_poses
+from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import (
     Belief,
     Journal,
@@ -200,8 +202,10 @@ def explore(
     NotConvergedError
         If no hypothesis could have given the readings.
     """
-    if max_readings < 1:
-        raise ParameterError("max_readings", max_readings, "1 or more")
+    require_instrument(instrument)
+    require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
+    require_rng(rng)
+    require_whole("max_readings", max_readings)
     seed = _child(rng)
     path = None if journal is None else Path(journal.path if isinstance(journal, Journal) else journal)
     before = journal if isinstance(journal, Journal) else None
@@ -225,14 +229,18 @@ def run(
     max_readings: int = 100,
     journal: str | Path | Journal | None = None,
     progress: Callable[[Step], None] | None = None,
+    hidden: Hidden | None = None,
 ) -> Exploration:
-    """Run `explore` to its end and collect the steps; `progress` is called with each as it comes."""
+    """Run `explore` to its end and collect the steps; `progress` is called with each as it comes.
+
+    `hidden` says what a simulated field holds, for those who look at the result; the run knows nothing of it.
+    """
     steps = []
     for info in explore(instrument, experiment, rng=rng, max_readings=max_readings, journal=journal):
         if progress is not None:
             progress(info)
         steps.append(info)
-    return Exploration(experiment, tuple(steps))
+    return Exploration(experiment, tuple(steps), hidden)
 
 
 def _steps(

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_callable, require_number
 from probewise._version import __version__
 from probewise.arm.instrument import Reading
 from probewise.errors import ParameterError
 from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import recording_of
 from probewise.experiment.particles import Block
-from probewise.inference.problem import Likelihood, SensorProblem
+from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
 from probewise.inference.student_t import StudentT
 from probewise.inquiry import (
     Designs,
@@ -32,7 +33,7 @@ from probewise.inquiry import (
 )
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
-from probewise.scene.albedo import Shape
+from probewise.scene.albedo import Shape, require_shape
 from probewise.scene.shapes import AnyOf
 from probewise.sensor.stages import SensorModel
 
@@ -132,6 +133,11 @@ class Experiment:
     n_live: int = 200
 
     def __post_init__(self) -> None:
+        require_shape(self.shape)
+        require_model(self.model)
+        require_likelihood(self.likelihood)
+        require_number("noise_sd", self.noise_sd)
+        require_callable("utility", self.utility, "a utility of probewise.inquiry, such as InformationGain()")
         if not 0 < self.stop_sd_mm < math.inf:
             raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
         if not 0 < self.stop_probability < 1:

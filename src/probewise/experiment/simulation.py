@@ -6,13 +6,14 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import LegoScale, Pose, Reach, Reading, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
+from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Known
 from probewise.errors import ParameterError
 from probewise.experiment.learning import AdjustedMixture, sensor_prior
@@ -29,14 +30,27 @@ from probewise.scene import (
     HypothesisScene,
     PolygonRegion,
     Rectangle,
+    Region,
     RegularPolygon,
     Shape,
     outlines,
 )
+from probewise.scene.albedo import require_shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage
 from probewise.world import Oval, Spot, Surface, World
 
-__all__ = ["SHAPES", "Model", "arm_over", "experiment_for", "shape_named", "surface_of", "world_like"]
+__all__ = [
+    "SHAPES",
+    "Model",
+    "Streams",
+    "arm_over",
+    "experiment_for",
+    "shape_named",
+    "shape_of",
+    "surface_of",
+    "surface_under",
+    "world_like",
+]
 
 Model: TypeAlias = Literal["ssf", "naive"]
 
@@ -51,10 +65,55 @@ SHAPES: Mapping[str, Callable[[Field], Shape]] = {
 }
 
 
+class Streams(NamedTuple):
+    """The independent randomness of one simulated run: of the robot, of what is hidden, of a shadow run, of the noise.
+
+    `noise` is a number, from which each reading's generator is made; see `arm_over`.
+    """
+
+    run: np.random.Generator
+    truth: np.random.Generator
+    shadow: np.random.Generator
+    noise: int
+
+    @classmethod
+    def of(cls, rng: np.random.Generator) -> Streams:
+        """Spawn them from one generator, so that one seed gives the whole run."""
+        run, truth, shadow, noise = rng.spawn(4)
+        return cls(run, truth, shadow, int(noise.integers(2**63)))
+
+
 def shape_named(names: Sequence[str], field: Field) -> Shape:
-    """Build the hypothesis: one shape, or a set of shapes."""
+    """Build the hypothesis: one shape, or a set of shapes.
+
+    Raises
+    ------
+    ParameterError
+        If a name is none of `SHAPES`.
+    """
+    for name in names:
+        if name not in SHAPES:
+            raise ParameterError(
+                "shape", name, f"one of {', '.join(SHAPES)}, or several; or a value of probewise.scene"
+            )
     chosen = {name: SHAPES[name](field) for name in dict.fromkeys(names)}
     return AnyOf(chosen) if len(chosen) > 1 else next(iter(chosen.values()))
+
+
+def shape_of(shape: str | Sequence[str] | Shape, field: Field) -> Shape:
+    """Take a shape as it is, or build it from a name or several.
+
+    Raises
+    ------
+    ParameterError
+        If it is neither a shape nor a name of `SHAPES`.
+    """
+    if isinstance(shape, str):
+        return shape_named((shape,), field)
+    if isinstance(shape, Sequence) and shape:
+        return shape_named(shape, field)
+    require_shape(shape)
+    return cast(Shape, shape)
 
 
 def experiment_for(
@@ -98,6 +157,9 @@ def experiment_for(
         How the sensor may be turned, how often it may read on the spot and how high it may stand, for an arm that
         can do so; heights for the SSF model of a sensor whose description says at which it was calibrated.
     """
+    require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
+    if model not in get_args(Model):
+        raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
     sensor = sensor.leading()  # a mean over rivals is true of none of them
     means = sensor.mean()
     levels = FixedLevels(means["I_min"], means["I_max"])
@@ -162,7 +224,17 @@ def world_like(sensor: FittedSensor) -> World:
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
     """Paint the shape for the world: geometry alone crosses over."""
-    region = SHAPES[name](field).region(theta[None, :])
+    return surface_under(SHAPES[name](field).region(theta[None, :]), name)
+
+
+def surface_under(region: Region, name: str) -> Surface:
+    """Paint the region of one hypothesis for the world.
+
+    Raises
+    ------
+    ParameterError
+        If its outline is neither an ellipse nor a polygon.
+    """
     if isinstance(region, EllipseRegion):
         center, axes = region.center_mm[0].tolist(), region.semi_axes_mm[0].tolist()
         if axes[0] == axes[1]:

@@ -11,6 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
 from probewise.arm.instrument import Pose, Reading
+from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import recording_of
 from probewise.experiment.setting import Experiment, widest_mm
 from probewise.inquiry import UtilityMap
@@ -131,10 +132,11 @@ class Step(ShowsItself):
 
 @dataclass(frozen=True, eq=False)
 class Exploration(ShowsItself):
-    """A whole run: its steps, why it ended, what it found."""
+    """A whole run: its steps, why it ended, what it found; `hidden` is what lay there, where that is known."""
 
     experiment: Experiment
     steps: tuple[Step, ...]
+    hidden: Hidden | None = None
 
     @property
     def last(self) -> Step:
@@ -192,6 +194,9 @@ class Exploration(ShowsItself):
             f"log Z        {self.posterior.log_z:.2f} ± {self.posterior.log_z_error:.2f}",
             f"fit          p = {last.p_value:.2g}",
         ]
+        if self.hidden is not None:
+            lay = ", ".join(f"{name} {value:.{_decimals(name)}f}" for name, value in self.hidden.parameters.items())
+            lines.append(f"hidden       {self.hidden.name}: {lay}")
         lines += [f"{label:<12} p = {probability:.3f}" for label, probability in last.shapes.items()]
         width = max(9, *(len(name) for name in (*last.names, *last.sensor)))
         lines += [

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, floats
 from probewise.errors import ShapeError
 
 
 def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Subtract predictions from readings, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+    readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
     if readings.ndim != 1 or predicted.ndim != 2 or predicted.shape[1] != readings.size:
         raise ShapeError(
             f"readings have shape {readings.shape}, predictions {predicted.shape}; "

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, floats, frozen
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference._residuals import residuals
 from probewise.priors import Joint, Marginal, Prior, Product
@@ -34,7 +34,7 @@ class GaussianKnown:
     sd: ArrayLike
 
     def __post_init__(self) -> None:
-        sd = frozen(self.sd)
+        sd = frozen(self.sd, "sd")
         if sd.ndim > 1:
             raise ShapeError(f"sd has shape {sd.shape}; allowed: a number or (n_points,)")
         if not ((sd > 0) & np.isfinite(sd)).all():
@@ -43,6 +43,7 @@ class GaussianKnown:
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,), all constants kept."""
+        readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         sd = np.asarray(self.sd)
         if sd.ndim == 1 and sd.size != readings.size:
             raise ShapeError(f"{readings.size} readings against {sd.size} values of sd; allowed: one each, or a number")

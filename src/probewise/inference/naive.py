@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, floats
+from probewise._kinds import require_number
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
@@ -35,6 +36,8 @@ class Naive:
     sd_white: float
 
     def __post_init__(self) -> None:
+        for name in ("mu_black", "sd_black", "mu_white", "sd_white"):
+            require_number(name, getattr(self, name))
         for name in ("sd_black", "sd_white"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ParameterError(name, getattr(self, name), "greater than 0, finite")
@@ -60,6 +63,7 @@ class Naive:
 
         A prediction says white where it lies nearer `mu_white` than `mu_black`.
         """
+        readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         residuals(readings, predicted)
         middle, sign = 0.5 * (self.mu_black + self.mu_white), 1.0 if self.mu_white > self.mu_black else -1.0
         black = _log_normal(readings, self.mu_black, self.sd_black)

@@ -8,12 +8,13 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_like
 from probewise.errors import ParameterError
-from probewise.priors import Prior
-from probewise.recordings.plan import Recording
+from probewise.priors import Prior, require_prior
+from probewise.recordings.plan import Recording, require_recording
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["Likelihood", "Problem", "SensorProblem"]
+__all__ = ["Likelihood", "Problem", "SensorProblem", "require_likelihood", "require_model"]
 
 _MOST_NUMBERS = 1_000_000  # predicted at once
 
@@ -39,6 +40,18 @@ class Problem(Protocol):
         ...
 
 
+def require_model(model: object) -> None:
+    """Raise ParameterError unless `model` is a sensor model."""
+    allowed = "a sensor model such as Chain(ssf, levels, scene), with names and predict(theta, plan)"
+    require_like("model", model, ("names", "predict"), allowed)
+
+
+def require_likelihood(likelihood: object) -> None:
+    """Raise ParameterError unless `likelihood` scores readings; a noise sd is the usual mistake."""
+    allowed = "a likelihood such as GaussianKnown(sd), with log_prob(readings, predicted)"
+    require_like("likelihood", likelihood, ("log_prob",), allowed)
+
+
 @dataclass(frozen=True, eq=False)
 class SensorProblem:
     """Weigh hypotheses about sensor, scene or both against a recording's usable readings."""
@@ -49,6 +62,10 @@ class SensorProblem:
     recording: Recording
 
     def __post_init__(self) -> None:
+        require_prior("prior", self.prior)
+        require_model(self.model)
+        require_likelihood(self.likelihood)
+        require_recording(self.recording)
         if self.prior.names != self.model.names:
             raise ParameterError("prior.names", self.prior.names, f"the model's names {self.model.names}")
 

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import log_ndtr
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, floats
+from probewise._kinds import require_number
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
@@ -42,6 +43,8 @@ class Rounded:
     high: float = math.inf
 
     def __post_init__(self) -> None:
+        for name in ("sd", "step", "low", "high"):
+            require_number(name, getattr(self, name))
         for name in ("sd", "step"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ParameterError(name, getattr(self, name), "greater than 0, finite")
@@ -50,6 +53,7 @@ class Rounded:
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Natural log of the readings' probability, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = (readings >= self.high) | (readings <= self.low)
         if at_end.any():

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, floats
+from probewise._kinds import require_rng
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evaluate import Evaluator, Samplable
 
@@ -65,7 +66,8 @@ def diversify(
     ParameterError
         If a sample is impossible to begin with.
     """
-    start = np.array(theta, dtype=np.float64)
+    require_rng(rng)
+    start = np.array(floats(theta, "theta"))
     evaluate = Evaluator(problem)
     if start.ndim != 2 or start.shape[1] != len(evaluate.names) or len(start) == 0:
         raise ShapeError(f"theta has shape {start.shape}; allowed: (n_samples, {len(evaluate.names)})")

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._kinds import require_like
 from probewise.errors import NotConvergedError
 from probewise.nested.space import Space, space_of
-
-if TYPE_CHECKING:
-    from probewise.priors import Prior
+from probewise.priors import Prior, require_prior
 
 __all__ = ["Bound", "Evaluator", "Points", "Samplable"]
 
@@ -122,6 +121,9 @@ class Evaluator:
     space: Space = field(init=False)
 
     def __post_init__(self) -> None:
+        allowed = "a value with a prior and a log_likelihood(theta), such as inference.SensorProblem"
+        require_like("problem", self.problem, ("prior", "log_likelihood"), allowed)
+        require_prior("problem.prior", self.problem.prior)
         self.names = self.problem.prior.names
         self.space = space_of(self.problem.prior)
 
@@ -193,7 +195,8 @@ class Evaluator:
         if values.shape != (len(theta),):
             raise NotConvergedError(
                 f"the likelihood returned shape {values.shape}; "
-                f"allowed: ({len(theta)},), one number a hypothesis; {self._first(theta)}"
+                f"allowed: ({len(theta)},), one number per hypothesis: theta is a batch of shape {theta.shape}, "
+                f"one hypothesis per row; {self._first(theta)}"
             )
         return values
 
@@ -209,7 +212,8 @@ class Evaluator:
         culprit = None if isinstance(error, BrokenExecutor) else self._culprit(theta)
         if culprit is not None:
             return f"the likelihood raised {said}; at {self._show(culprit)}"
-        return f"the likelihood raised {said}; {self._first(theta)}"
+        batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
+        return f"the likelihood raised {said}; {batch}; {self._first(theta)}"
 
     def _culprit(self, theta: FloatArray) -> FloatArray | None:
         """Ask again, half by half, for a hypothesis that fails by itself; None where it is the batch that fails."""

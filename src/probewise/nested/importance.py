@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._kinds import require_rng, require_whole
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.proposal import Proposal, find_parts, fit_proposals, joined
@@ -113,8 +114,8 @@ class Weighted:
 
     def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
         """Rows of `n` equally weighted samples by systematic resampling, (n,), in random order."""
-        if n < 1:
-            raise ParameterError("n", n, "1 or more")
+        require_rng(rng)
+        n = require_whole("n", n)
         return np.asarray(rng.permutation(resampled(self.weight, n, rng)))
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -250,6 +251,7 @@ def update(
     Weighted
         With the fallback's samples and `run` where it took over.
     """
+    require_rng(rng)
     if not 0 <= prior_share < 1:
         raise ParameterError("prior_share", prior_share, "0 or more, below 1")
     evaluate = Evaluator(problem)

@@ -17,6 +17,7 @@ import scipy
 
 from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
 from probewise._display import ShowsItself
+from probewise._kinds import require_rng, require_whole
 from probewise._version import __version__
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.nested import conversions
@@ -190,8 +191,8 @@ class NestedResult(ShowsItself):
 
     def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
         """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
-        if n < 1:
-            raise ParameterError("n", n, "1 or more")
+        require_rng(rng)
+        n = require_whole("n", n)
         ladder = np.cumsum(self.weight)
         rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
         return np.asarray(rng.permutation(np.minimum(rows, len(ladder) - 1)))

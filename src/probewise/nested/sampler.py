@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import logsumexp
 
+from probewise._kinds import require_rng, require_whole
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
 from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
@@ -147,9 +148,11 @@ def run(
         If the checkpoint is damaged, or of a run with another problem, other settings or another seed, or
         cannot be written: before anything is evaluated. Where a later saving fails, the run goes on and warns.
     """
+    require_rng(rng)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
     least = least_live(n_params)
+    n_live = require_whole("n_live", n_live, least=None)
     if n_live < least:
         raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
     if n_replaced is None:

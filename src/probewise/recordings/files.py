@@ -16,7 +16,7 @@ from probewise.recordings.atomic import write_bytes_atomically, write_text_atomi
 from probewise.recordings.description import Description, degrees_of, description_text, read_description
 from probewise.recordings.images import image_bytes
 from probewise.recordings.patterns import Image
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plan import Plan, Recording, range_in_words
 from probewise.recordings.table import LARGEST, Table, csv_text, is_number, number_text, read_table
 
 __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recording", "write_plan", "write_recording"]
@@ -43,17 +43,12 @@ def read_recording(path: PathLike) -> Recording:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
     recording = Recording(plan, readings, str(path))
-    n_missing = int(np.isnan(readings).sum())
-    n_outside = len(recording) - n_missing - int(recording.usable.sum())
-    inst = plan.instrumentation
-    if n_missing:
-        notes.append(f"{_count(n_missing)} missing, left out")
-    if n_outside:
-        notes.append(f"{_count(n_outside)} outside {_range(inst.min, inst.max)}, left out")
     if not recording.usable.any():
-        found = "there is no reading at all" if not n_outside else "no reading is within the declared range"
-        raise FileError(path, found, f"at least one number in {_range(inst.min, inst.max)}", column="reading")
-    return replace(recording, notes=tuple(notes))
+        inst = plan.instrumentation
+        nothing = np.isnan(readings).all()
+        found = "there is no reading at all" if nothing else "no reading is within the declared range"
+        raise FileError(path, found, f"at least one number in {range_in_words(inst.min, inst.max)}", column="reading")
+    return replace(recording, notes=(*notes, *recording.notes_on_what_is_left_out()))
 
 
 def read_plan(path: PathLike) -> Plan:
@@ -273,15 +268,3 @@ def _covariates(table: Table, notes: list[str]) -> dict[str, FloatArray]:
         else:
             out[name] = table.numbers(name, missing=True)
     return out
-
-
-def _count(n: int) -> str:
-    return "1 reading" if n == 1 else f"{n} readings"
-
-
-def _range(low: float | None, high: float | None) -> str:
-    if low is None and high is None:
-        return "any range"
-    if low is None:
-        return f"the range up to {high:g}"
-    return f"{low:g} to {high:g}" if high is not None else f"the range from {low:g}"

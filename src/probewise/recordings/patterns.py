@@ -6,23 +6,46 @@ the independent `world` paints pixels from them, so the two share numbers and no
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from probewise._arrays import FloatArray
+import numpy as np
 
-__all__ = ["Disc", "HalfPlane", "Image", "Pattern", "Polygon", "Quadrant", "Ramp", "Stripes", "Uniform"]
+from probewise._arrays import FloatArray, floats
+from probewise._kinds import require_finite_number, require_pair
+from probewise.errors import ParameterError
+
+__all__ = ["PATTERNS", "Disc", "HalfPlane", "Image", "Pattern", "Polygon", "Quadrant", "Ramp", "Stripes", "Uniform"]
+
+
+class _Checked:
+    """Take numbers as floats and pairs as tuples, whatever they came as, and refuse everything else."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every pattern is a dataclass
+            value: object = getattr(self, field.name)
+            if field.type == "float":
+                value = require_finite_number(field.name, value)
+            elif field.type == "tuple[float, float]":
+                value = require_pair(field.name, value)
+            object.__setattr__(self, field.name, value)
+
+    def _require_positive(self, name: str) -> None:
+        if not getattr(self, name) > 0:
+            raise ParameterError(name, getattr(self, name), "a number greater than 0")
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(_Checked):
     """The same albedo everywhere."""
 
     albedo: float
 
 
 @dataclass(frozen=True)
-class HalfPlane:
+class HalfPlane(_Checked):
     """Inside where x cos(normal) + y sin(normal) > offset."""
 
     normal_rad: float
@@ -32,7 +55,7 @@ class HalfPlane:
 
 
 @dataclass(frozen=True)
-class Quadrant:
+class Quadrant(_Checked):
     """Inside where both (x - cx) dx > 0 and (y - cy) dy > 0; direction holds dx, dy = +1 or -1."""
 
     corner_mm: tuple[float, float]
@@ -40,9 +63,17 @@ class Quadrant:
     inside: float = 1.0
     outside: float = 0.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        allowed = "(1, 1), (1, -1), (-1, 1) or (-1, -1)"
+        dx, dy = require_pair("direction", self.direction, allowed)
+        if not abs(dx) == abs(dy) == 1:
+            raise ParameterError("direction", self.direction, allowed)
+        object.__setattr__(self, "direction", (int(dx), int(dy)))
+
 
 @dataclass(frozen=True)
-class Disc:
+class Disc(_Checked):
     """Inside a circle."""
 
     center_mm: tuple[float, float]
@@ -50,18 +81,31 @@ class Disc:
     inside: float = 1.0
     outside: float = 0.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_positive("radius_mm")
+
 
 @dataclass(frozen=True)
-class Polygon:
+class Polygon(_Checked):
     """Inside a polygon by the even-odd rule."""
 
     vertices_mm: tuple[tuple[float, float], ...]
     inside: float = 1.0
     outside: float = 0.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        allowed = "three corners (x, y) or more"
+        vertices: object = self.vertices_mm
+        if not isinstance(vertices, Sequence | np.ndarray) or isinstance(vertices, str) or len(vertices) < 3:
+            raise ParameterError("vertices_mm", vertices, allowed)
+        pairs = tuple(require_pair(f"vertices_mm[{k}]", corner) for k, corner in enumerate(vertices))
+        object.__setattr__(self, "vertices_mm", pairs)
+
 
 @dataclass(frozen=True)
-class Stripes:
+class Stripes(_Checked):
     """Inside where frac((x . n - phase) / period) < duty."""
 
     normal_rad: float
@@ -71,9 +115,15 @@ class Stripes:
     inside: float = 1.0
     outside: float = 0.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_positive("period_mm")
+        if not 0 <= self.duty <= 1:
+            raise ParameterError("duty", self.duty, "a number from 0 to 1")
+
 
 @dataclass(frozen=True)
-class Ramp:
+class Ramp(_Checked):
     """Albedo per_mm (x . n), not bounded: an encoder reading a scale is a sensor reading a ramp."""
 
     normal_rad: float
@@ -81,7 +131,7 @@ class Ramp:
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class Image(_Checked):
     """Pixels, first row on top, albedo 0 to 1, 0 outside; `origin_mm` is the lower left corner."""
 
     albedo: FloatArray
@@ -89,5 +139,16 @@ class Image:
     origin_mm: tuple[float, float]
     file: str
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_positive("pixel_mm")
+        albedo = floats(self.albedo, "albedo")
+        if albedo.ndim != 2:
+            raise ParameterError("albedo", f"an array of shape {albedo.shape}", "(n_rows, n_columns), numbers 0 to 1")
+        object.__setattr__(self, "albedo", albedo)
+
 
 Pattern: TypeAlias = Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes | Ramp | Image
+
+PATTERNS: tuple[type, ...] = (Uniform, HalfPlane, Quadrant, Disc, Polygon, Stripes, Ramp, Image)
+"""The kinds of pattern."""

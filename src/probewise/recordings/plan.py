@@ -2,18 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen, frozen_int, require_finite
 from probewise._display import ShowsItself
+from probewise._kinds import require_finite_number, require_kind
 from probewise.errors import ParameterError, ShapeError
+from probewise.recordings.columns import (
+    Table,
+    column,
+    columns_of,
+    covariates_of,
+    named_patterns,
+    pattern_codes,
+    require_patterns,
+    scan_codes,
+    undescribed,
+)
 from probewise.recordings.patterns import Pattern
 
-__all__ = ["Instrumentation", "Plan", "Recording"]
+__all__ = [
+    "Instrumentation",
+    "Plan",
+    "Recording",
+    "range_in_words",
+    "require_described",
+    "require_plan",
+    "require_recording",
+]
 
 
 @dataclass(frozen=True)
@@ -28,6 +50,21 @@ class Instrumentation:
     height_mm: float | None = None
     controls: tuple[str, ...] = ()
     description: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("unit", "sensor", "description"):
+            require_kind(name, getattr(self, name), str, "a text")
+        for name in ("min", "max", "step", "height_mm"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, require_finite_number(name, getattr(self, name), "a number or None"))
+        if self.min is not None and self.max is not None and self.min >= self.max:
+            raise ParameterError("max", self.max, f"greater than min, {self.min:g}")
+        for name in ("step", "height_mm"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "a number greater than 0")
+        if isinstance(self.controls, str) or not all(isinstance(name, str) for name in self.controls):
+            raise ParameterError("controls", self.controls, "a tuple of texts")
+        object.__setattr__(self, "controls", tuple(self.controls))
 
     @property
     def ends(self) -> tuple[float, ...]:
@@ -57,9 +94,16 @@ class Plan:
     instrumentation: Instrumentation = field(default_factory=Instrumentation)
 
     def __post_init__(self) -> None:
+        for name in ("scan_names", "pattern_names"):
+            names: object = getattr(self, name)
+            if isinstance(names, str) or not all(isinstance(n, str) for n in getattr(self, name)):
+                raise ParameterError(name, names, "a tuple of texts")
+        require_kind("patterns", self.patterns, Mapping, "patterns by name: {'edge': HalfPlane(...)}")
+        require_patterns(self.patterns)
+        require_kind("instrumentation", self.instrumentation, Instrumentation, "an Instrumentation(unit=...)")
         n_points = np.size(self.x_mm)
         for name in ("x_mm", "y_mm", "orientation_rad", "time_s"):
-            values = frozen(getattr(self, name))
+            values = frozen(getattr(self, name), name)
             if values.shape != (n_points,):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n_points},), as x_mm")
             require_finite(name, values)
@@ -71,11 +115,92 @@ class Plan:
             if n_points and (codes.min() < 0 or codes.max() >= n_names):
                 raise ParameterError(name, (int(codes.min()), int(codes.max())), f"0 to {n_names - 1}")
             object.__setattr__(self, name, codes)
-        covariates = {name: frozen(values) for name, values in self.covariates.items()}
+        covariates = {name: frozen(values, f"covariate {name}") for name, values in self.covariates.items()}
         for name, values in covariates.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"covariate {name} has shape {values.shape}; allowed: ({n_points},)")
         object.__setattr__(self, "covariates", covariates)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        x_mm: ArrayLike,
+        y_mm: ArrayLike,
+        patterns: Mapping[str, Pattern] | Pattern,
+        unit: str,
+        pattern: str | Sequence[str] | None = None,
+        orientation_rad: ArrayLike = 0.0,
+        time_s: ArrayLike | None = None,
+        scan: str | Sequence[object] | None = None,
+        covariates: Mapping[str, ArrayLike] | None = None,
+        min: float | None = None,
+        max: float | None = None,
+        step: float | None = None,
+        sensor: str = "",
+        height_mm: float | None = None,
+        controls: Sequence[str] = (),
+    ) -> Self:
+        """Lay out a plan from arrays, lists or columns of a table, one entry a reading in the order of taking.
+
+        Parameters
+        ----------
+        x_mm, y_mm
+            Where the sensor is commanded to be, shape (n_points,); a single number stands for all readings.
+        patterns
+            What lies under the sensor: patterns by name, or one pattern under every reading.
+        unit
+            Unit of a reading, such as "V" or "LEGO".
+        pattern
+            Name of the pattern under each reading, or of the one under all; needed where there are several.
+        orientation_rad
+            Turn of the sensor about its vertical axis, anticlockwise from above, (n_points,) or one for all.
+        time_s
+            When, shape (n_points,); by default a second apart.
+        scan
+            Name or number of the scan of each reading; where it changes a new scan begins. By default all are one scan.
+        covariates
+            Other numbers by name, one a reading each, such as `battery_mv`.
+        min, max, step
+            Range and quantisation of a reading, where they are known.
+        sensor, height_mm, controls
+            Name of the sensor, its height above the surface, and what else can be commanded, such as "orientation_deg".
+
+        Raises
+        ------
+        ParameterError
+            If a pattern is named but not described, or something is not of its kind.
+        ShapeError
+            If there is not one entry a reading.
+
+        Examples
+        --------
+        >>> from probewise.recordings import HalfPlane, Plan
+        >>> edge = HalfPlane(normal_rad=0.0, offset_mm=0.0)
+        >>> plan = Plan.from_arrays(x_mm=[-10, 0, 10], y_mm=0, patterns=edge, unit="V")
+        >>> len(plan), plan.pattern_names
+        (3, ('pattern',))
+        """
+        sizes = [np.size(values) for values in (x_mm, y_mm) if np.ndim(values) > 0]
+        x = column("x_mm", x_mm, sizes[0] if sizes else 1)
+        n_points = len(x)
+        described = named_patterns(patterns)
+        code, scan_names = scan_codes(scan, n_points)
+        return cls(
+            x_mm=x,
+            y_mm=column("y_mm", y_mm, n_points),
+            orientation_rad=column("orientation_rad", orientation_rad, n_points),
+            time_s=np.arange(n_points, dtype=np.float64) if time_s is None else column("time_s", time_s, n_points),
+            scan=code,
+            scan_names=scan_names,
+            pattern=pattern_codes(pattern, described, n_points),
+            pattern_names=tuple(described),
+            patterns=described,
+            covariates={name: column(name, values, n_points) for name, values in (covariates or {}).items()},
+            instrumentation=Instrumentation(
+                unit=unit, min=min, max=max, step=step, sensor=sensor, height_mm=height_mm, controls=tuple(controls)
+            ),
+        )
 
     def __len__(self) -> int:
         return len(self.x_mm)
@@ -144,10 +269,163 @@ class Recording(ShowsItself):
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        readings = frozen(self.readings)
+        require_plan(self.plan)
+        readings = frozen(self.readings, "readings")
         if readings.shape != (len(self.plan),):
             raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), as the plan")
         object.__setattr__(self, "readings", readings)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        x_mm: ArrayLike,
+        y_mm: ArrayLike,
+        readings: ArrayLike,
+        patterns: Mapping[str, Pattern] | Pattern,
+        unit: str,
+        pattern: str | Sequence[str] | None = None,
+        orientation_rad: ArrayLike = 0.0,
+        time_s: ArrayLike | None = None,
+        scan: str | Sequence[object] | None = None,
+        covariates: Mapping[str, ArrayLike] | None = None,
+        min: float | None = None,
+        max: float | None = None,
+        step: float | None = None,
+        sensor: str = "",
+        height_mm: float | None = None,
+        controls: Sequence[str] = (),
+        source: str = "",
+    ) -> Self:
+        """Make a recording from arrays, lists or columns of a table, one entry a reading in the order of taking.
+
+        Parameters
+        ----------
+        x_mm, y_mm
+            Where the sensor was commanded to be, shape (n_points,); a single number stands for all readings.
+        readings
+            What was read, in `unit`, shape (n_points,); NaN or None where a reading is missing.
+        patterns
+            What lay under the sensor: patterns by name, or one pattern under every reading.
+        unit
+            Unit of a reading, such as "V" or "LEGO".
+        pattern, orientation_rad, time_s, scan, covariates, min, max, step, sensor, height_mm, controls
+            As in `Plan.from_arrays`.
+        source
+            Where the readings come from, for reports.
+
+        Raises
+        ------
+        ParameterError
+            If a pattern is named but not described, something is not of its kind, or no reading is usable.
+        ShapeError
+            If there is not one entry a reading.
+
+        Examples
+        --------
+        >>> from probewise.recordings import HalfPlane, Recording
+        >>> edge = HalfPlane(normal_rad=0.0, offset_mm=0.0)
+        >>> recording = Recording.from_arrays(
+        ...     x_mm=[-10, 0, 10], y_mm=0, readings=[0.4, 1.6, 2.9], patterns={"edge": edge}, unit="V", min=0, max=5
+        ... )
+        >>> recording.plan.pattern_names, int(recording.usable.sum())
+        (('edge',), 3)
+        """
+        values = column("readings", readings)
+        plan = Plan.from_arrays(
+            x_mm=column("x_mm", x_mm, len(values)),
+            y_mm=y_mm,
+            patterns=patterns,
+            unit=unit,
+            pattern=pattern,
+            orientation_rad=orientation_rad,
+            time_s=time_s,
+            scan=scan,
+            covariates=covariates,
+            min=min,
+            max=max,
+            step=step,
+            sensor=sensor,
+            height_mm=height_mm,
+            controls=controls,
+        )
+        recording = cls(plan, values, source)
+        if not recording.usable.any():
+            raise ParameterError("readings", values.tolist(), "at least one number within the declared range")
+        return replace(recording, notes=recording.notes_on_what_is_left_out())
+
+    @classmethod
+    def from_table(
+        cls,
+        table: Table,
+        *,
+        patterns: Mapping[str, Pattern] | Pattern,
+        unit: str,
+        min: float | None = None,
+        max: float | None = None,
+        step: float | None = None,
+        sensor: str = "",
+        height_mm: float | None = None,
+        controls: Sequence[str] = (),
+        source: str = "",
+    ) -> Self:
+        """Make a recording from a data frame or a dict of columns that are named as in a recording's CSV file.
+
+        Parameters
+        ----------
+        table
+            Columns `reading`, `x_mm` and `y_mm`; as far as they are there `orientation_deg` (or `orientation_rad`),
+            `scan`, `pattern` and `time_s`. Every other column of numbers is a covariate; others are left out.
+        patterns, unit, min, max, step, sensor, height_mm, controls, source
+            As in `Recording.from_arrays`.
+
+        Raises
+        ------
+        ParameterError
+            If a column is missing, a pattern is named but not described, or something is not of its kind.
+        ShapeError
+            If the columns differ in length.
+
+        Examples
+        --------
+        >>> from probewise.recordings import HalfPlane, Recording
+        >>> table = {"x_mm": [-10, 0, 10], "y_mm": [0, 0, 0], "reading": [0.4, 1.6, 2.9], "battery_mv": [80, 79, 79]}
+        >>> recording = Recording.from_table(table, patterns=HalfPlane(0.0, 0.0), unit="V")
+        >>> list(recording.plan.covariates)
+        ['battery_mv']
+        """
+        columns = columns_of(table)
+        missing = [name for name in ("reading", "x_mm", "y_mm") if name not in columns]
+        if missing:
+            raise ParameterError(
+                "columns", tuple(columns), f"also {', '.join(missing)}; rename what the table calls it"
+            )
+        turn_deg, turn_rad = columns.get("orientation_deg"), columns.get("orientation_rad", 0.0)
+        if turn_deg is not None:
+            if "orientation_rad" in columns:
+                raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
+            turn_rad = np.radians(column("orientation_deg", turn_deg))
+        covariates, notes = covariates_of(columns)
+        recording = cls.from_arrays(
+            x_mm=columns["x_mm"],
+            y_mm=columns["y_mm"],
+            readings=columns["reading"],
+            patterns=patterns,
+            unit=unit,
+            pattern=columns.get("pattern"),
+            orientation_rad=turn_rad,
+            time_s=columns.get("time_s"),
+            scan=columns.get("scan"),
+            covariates=covariates,
+            min=min,
+            max=max,
+            step=step,
+            sensor=sensor,
+            height_mm=height_mm,
+            controls=controls,
+            source=source,
+        )
+        return replace(recording, notes=(*notes, *recording.notes))
 
     def __len__(self) -> int:
         return len(self.plan)
@@ -164,6 +442,14 @@ class Recording(ShowsItself):
                 ok &= self.readings <= inst.max
         return ok
 
+    def notes_on_what_is_left_out(self) -> tuple[str, ...]:
+        """Say how many readings are missing, and how many outside the declared range: neither is usable."""
+        inst = self.plan.instrumentation
+        n_missing = int(np.isnan(self.readings).sum())
+        n_outside = len(self) - n_missing - int(self.usable.sum())
+        why = {"missing": n_missing, f"outside {range_in_words(inst.min, inst.max)}": n_outside}
+        return tuple(f"{n} reading{'s' if n > 1 else ''} {reason}, left out" for reason, n in why.items() if n)
+
     def unlimited(self) -> Recording:
         """Declare no range: what was calculated without noise may lie beyond it by a little, and counts too."""
         instrumentation = replace(self.plan.instrumentation, min=None, max=None)
@@ -172,3 +458,31 @@ class Recording(ShowsItself):
     def take(self, rows: IntArray | BoolArray) -> Recording:
         """Keep these rows, in their order."""
         return Recording(self.plan.take(rows), self.readings[rows], self.source, self.notes)
+
+
+def require_plan(plan: object) -> None:
+    """Raise ParameterError unless `plan` is a Plan, saying how to come by one."""
+    allowed = "a Plan: read_plan('NAME.csv') or Plan.from_arrays(...), of probewise.recordings; a Recording has a .plan"
+    require_kind("plan", plan, Plan, allowed)
+
+
+def require_recording(recording: object) -> None:
+    """Raise ParameterError unless `recording` is a Recording, saying how to come by one."""
+    allowed = "a Recording: read_recording('NAME.csv'), Recording.from_arrays(...) or Recording.from_table(table, ...)"
+    require_kind("recording", recording, Recording, f"{allowed}, of probewise.recordings")
+
+
+def require_described(plan: Plan) -> None:
+    """Raise ParameterError where a pattern that occurs in the plan is not described."""
+    for name, _ in plan.rows_by_pattern():
+        if name not in plan.patterns:
+            raise ParameterError("pattern", name, undescribed(name, list(plan.patterns)))
+
+
+def range_in_words(low: float | None, high: float | None) -> str:
+    """Say a declared range."""
+    if low is None and high is None:
+        return "any range"
+    if low is None:
+        return f"the range up to {high:g}"
+    return f"{low:g} to {high:g}" if high is not None else f"the range from {low:g}"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._display import ShowsItself
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.files import plan_columns
@@ -19,20 +20,26 @@ __all__ = ["Prediction", "read_prediction", "write_prediction"]
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(ShowsItself):
     """What each row's reading is expected to be; all arrays have shape (n_points,).
 
     `sd` is that of one new reading, noise and parameter uncertainty included. `log_density` is the
     natural logarithm of the predictive density of that row's reading alone, per unit of the reading;
-    NaN where the reading is missing or out of range, and everywhere for a plan.
+    NaN where the reading is missing or out of range, and everywhere for a plan. `readings` are those that
+    were scored, NaN where there is none.
     """
 
     plan: Plan
     mean: FloatArray
     sd: FloatArray
     log_density: FloatArray
+    readings: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
+        readings = frozen(self.readings) if np.size(self.readings) else frozen(np.full(len(self.plan), np.nan))
+        if readings.shape != (len(self.plan),):
+            raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), as the plan")
+        object.__setattr__(self, "readings", readings)
         for name in ("mean", "sd", "log_density"):
             values = frozen(getattr(self, name))
             if values.shape != (len(self.plan),):
@@ -49,6 +56,20 @@ class Prediction:
 
     def __len__(self) -> int:
         return len(self.plan)
+
+    def summary(self) -> str:
+        """Say how many readings were predicted and, of those that were recorded, how well they were expected."""
+        lines = [f"{len(self)} readings predicted"]
+        scored = np.isfinite(self.log_density) & np.isfinite(self.readings)
+        if scored.any():
+            n_left = int(len(self) - scored.sum())
+            left_out = f" ({n_left} missing or out of range, left out)" if n_left else ""
+            z = (self.readings[scored] - self.mean[scored]) / self.sd[scored]
+            lines.append(
+                f"of {int(scored.sum())} recorded{left_out}: chi-square per reading {float(np.mean(z**2)):.3f}, "
+                f"log density per reading {float(self.log_density[scored].mean()):.3f}"
+            )
+        return "\n".join(lines)
 
 
 def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:

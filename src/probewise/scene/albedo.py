@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_like
 from probewise.priors import Prior
 
-__all__ = ["Region", "Scene", "Shape"]
+__all__ = ["Region", "Scene", "Shape", "require_shape"]
 
 
 class Region(Protocol):
@@ -57,3 +58,8 @@ class Scene(Protocol):
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Region by pattern name, theta (n_samples, n_params)."""
         ...
+
+
+def require_shape(shape: object, name: str = "shape") -> None:
+    """Raise ParameterError unless `shape` has a prior and a region."""
+    require_like(name, shape, ("prior", "region"), "a shape such as Circle() or Rectangle(), of probewise.scene")

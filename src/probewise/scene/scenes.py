@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_kind
 from probewise.errors import ParameterError
 from probewise.priors import Empty, Prior
+from probewise.recordings.columns import require_patterns, undescribed
 from probewise.recordings.patterns import Pattern
-from probewise.scene.albedo import Region, Shape
+from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.patterns import region_of
 
 __all__ = ["HypothesisScene", "KnownScene"]
@@ -21,6 +23,10 @@ class KnownScene:
     """Patterns that are known, by name: no free parameters."""
 
     patterns: Mapping[str, Pattern]
+
+    def __post_init__(self) -> None:
+        require_kind("patterns", self.patterns, Mapping, "patterns by name: {'edge': HalfPlane(...)}")
+        require_patterns(self.patterns)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -38,7 +44,14 @@ class KnownScene:
 
     @cached_property
     def _built(self) -> Mapping[str, Region]:
-        return {name: region_of(pattern) for name, pattern in self.patterns.items()}
+        return _Described({name: region_of(pattern) for name, pattern in self.patterns.items()})
+
+
+class _Described(dict[str, Region]):
+    """Regions by pattern name, which say what to do about a name that they lack."""
+
+    def __missing__(self, name: str) -> Region:
+        raise ParameterError("pattern", name, undescribed(name, list(self)))
 
 
 @dataclass(frozen=True)
@@ -46,6 +59,9 @@ class HypothesisScene:
     """One shape of unknown parameters under every reading, whatever its pattern's name."""
 
     shape: Shape
+
+    def __post_init__(self) -> None:
+        require_shape(self.shape)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -13,9 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_kind, require_number, require_pair, require_whole
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Prior, Product, Uniform
-from probewise.scene.albedo import Region, Shape
+from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.regions import EllipseRegion, MixtureOfRegions, PolygonRegion, UniformRegion, disc_region
 
 __all__ = ["AnyOf", "Circle", "Ellipse", "Field", "Placed", "Rectangle", "RegularPolygon"]
@@ -32,7 +33,7 @@ class Field:
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm"):
-            value = getattr(self, name)
+            value = require_number(name, getattr(self, name))
             if not 0 < value < math.inf:
                 raise ParameterError(name, value, "greater than 0, finite")
 
@@ -83,8 +84,9 @@ class Placed:
         return margin, size - margin
 
 
-def _require_bounds(name: str, bounds: Bounds) -> None:
-    low, high = bounds
+def _require_bounds(name: str, bounds: Bounds, field: Field) -> None:
+    require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
+    low, high = require_pair(name, bounds, "(low, high): its prior is even between them")
     if not 0 < low < high < math.inf:
         raise ParameterError(name, bounds, "0 < low < high, finite")
 
@@ -114,7 +116,7 @@ class Circle:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        _require_bounds("radius_mm", self.radius_mm)
+        _require_bounds("radius_mm", self.radius_mm, self.field)
         if self.inside:
             _require_room("Circle", self.radius_mm[1], self.field)
 
@@ -174,7 +176,7 @@ class Ellipse:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        _require_bounds("semi_axes_mm", self.semi_axes_mm)
+        _require_bounds("semi_axes_mm", self.semi_axes_mm, self.field)
         if self.inside:
             _require_room("Ellipse", self.semi_axes_mm[1], self.field)
 
@@ -206,7 +208,7 @@ class Rectangle:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        _require_bounds("sides_mm", self.sides_mm)
+        _require_bounds("sides_mm", self.sides_mm, self.field)
         if self.inside:
             _require_room("Rectangle", self.sides_mm[1] / math.sqrt(2), self.field)
 
@@ -233,9 +235,8 @@ class RegularPolygon:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        if self.n_sides < 3:
-            raise ParameterError("n_sides", self.n_sides, "3 or more")
-        _require_bounds("radius_mm", self.radius_mm)
+        require_whole("n_sides", self.n_sides, least=3)
+        _require_bounds("radius_mm", self.radius_mm, self.field)
         if self.inside:
             _require_room("RegularPolygon", self.radius_mm[1], self.field)
 
@@ -352,6 +353,9 @@ class AnyOf:
     weights: tuple[float, ...] = field(default=())
 
     def __post_init__(self) -> None:
+        require_kind("shapes", self.shapes, Mapping, "shapes by name: {'circle': Circle(), 'rectangle': Rectangle()}")
+        for name, shape in self.shapes.items():
+            require_shape(shape, f"shapes[{name!r}]")
         if not self.shapes:
             raise ParameterError("shapes", dict(self.shapes), "one shape or more, by name")
         weights = self.weights or (1.0,) * len(self.shapes)

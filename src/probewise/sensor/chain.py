@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_like, require_number
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
@@ -30,7 +31,7 @@ from probewise.sensor.stages import (
 )
 from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 
-__all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "response"]
+__all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "require_levels", "require_scene", "response"]
 
 _MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
 _MOST_NUMBERS = 2_000_000  # held at once of footprints that differ from reading to reading
@@ -73,6 +74,8 @@ class FixedLevels:
     i_max: float
 
     def __post_init__(self) -> None:
+        for name in ("i_min", "i_max"):
+            require_number(name, getattr(self, name))
         if not (np.isfinite(self.i_min) and np.isfinite(self.i_max)):
             raise ParameterError("FixedLevels(i_min, i_max)", (self.i_min, self.i_max), "finite numbers")
 
@@ -84,6 +87,17 @@ class FixedLevels:
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give the two numbers, each (1, 1)."""
         return np.array([[self.i_min]]), np.array([[self.i_max]])
+
+
+def require_levels(levels: object, order: str) -> None:
+    """Raise ParameterError unless `levels` has values."""
+    require_like("levels", levels, ("names", "values"), f"FreeLevels() or FixedLevels(i_min, i_max), {order}")
+
+
+def require_scene(scene: object, order: str) -> None:
+    """Raise ParameterError unless `scene` has regions; a bare shape is the usual mistake."""
+    allowed = f"a scene such as HypothesisScene(Circle()) or KnownScene(plan.patterns), {order}"
+    require_like("scene", scene, ("names", "regions"), allowed)
 
 
 @dataclass(frozen=True)
@@ -106,6 +120,10 @@ class Chain:
     n_nodes: int = field(default=ACCURATE_NODES, kw_only=True)
 
     def __post_init__(self) -> None:
+        order = "in the order Chain(ssf, levels, scene)"
+        require_like("ssf", self.ssf, ("names", "footprint"), f"an SSF such as FreeMixture(1) or FixedMixture, {order}")
+        require_levels(self.levels, order)
+        require_scene(self.scene, order)
         if isinstance(self.ssf, FieldSSF) and any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             names = [effect.name for effect in self.effects if effect.stage == Stage.FOOTPRINT]
             raise ParameterError("effects", names, "none at the footprint with a FieldSSF; use mixture_of_field")

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Scene
-from probewise.sensor.chain import Levels
+from probewise.sensor.chain import Levels, require_levels, require_scene
 from probewise.sensor.stages import require_columns
 
 __all__ = ["NaiveSensor"]
@@ -24,6 +24,11 @@ class NaiveSensor:
 
     levels: Levels
     scene: Scene
+
+    def __post_init__(self) -> None:
+        order = "in the order NaiveSensor(levels, scene)"
+        require_levels(self.levels, order)
+        require_scene(self.scene, order)
 
     @property
     def names(self) -> tuple[str, ...]:

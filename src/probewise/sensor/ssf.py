@@ -11,6 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
+from probewise._kinds import require_whole
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor.stages import Footprint
 
@@ -91,6 +92,9 @@ class FreeMixture:
 
     n_gaussians: int
 
+    def __post_init__(self) -> None:
+        require_whole("n_gaussians", self.n_gaussians)
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The paper's a_1 to C_N."""
@@ -112,7 +116,7 @@ class FixedMixture:
     def __post_init__(self) -> None:
         n = np.size(self.weights)
         for name, shape in (("weights", (n,)), ("means_mm", (n, 2)), ("covs_mm2", (n, 2, 2))):
-            values = frozen(getattr(self, name))
+            values = frozen(getattr(self, name), name)
             if values.shape != shape or n == 0:
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: {shape}, one Gaussian or more")
             require_finite(name, values)

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.concealed.stages import (
@@ -120,6 +121,8 @@ class World:
         height_mm
             How high the sensor stands; None: where the spot and the levels belong.
         """
+        if rng is not None:
+            require_rng(rng)
         rows = Rows(
             place_mm=np.array([[x_mm, y_mm]]),
             direction=np.array([direction]),

@@ -17,17 +17,18 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
+from probewise.calibration import FittedSensor
 from probewise.diagnosis.audit.cures import cures_of
 from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected, PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
-from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.fitting.earlier import SensorPrior, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.scheduling import behind
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
-from probewise.recordings.plan import Plan
+from probewise.recordings.plan import Plan, Recording, require_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
 __all__ = ["Cure", "Detectability", "EffectAudit", "PlanAudit", "Smallest", "audit_plan", "audit_recorded"]
@@ -183,7 +184,7 @@ def _listed(label: str, names: Sequence[str], width: int = 100) -> list[str]:
 
 
 def audit_plan(
-    plan: Plan,
+    plan: Plan | Recording,
     *,
     sensor: SensorPrior | None = None,
     noise_sd: float | None = None,
@@ -194,11 +195,12 @@ def audit_plan(
     Parameters
     ----------
     plan
-        What is to be measured.
+        What is to be measured; of a recording its plan.
     sensor
         A calibrated sensor, whose posterior becomes the prior; None: a typical one.
     noise_sd
-        Noise of one reading, in its unit; None: a hundredth of the span between black and white.
+        Noise of one reading, in its unit; None: the calibrated sensor's, or a hundredth of the span between black and
+        white.
     effects
         The vocabulary, by name.
 
@@ -207,11 +209,16 @@ def audit_plan(
     ParameterError
         If the plan has no row, or a pattern that its description lacks.
     """
+    if isinstance(plan, Recording):
+        plan = plan.plan
+    require_plan(plan)
+    if sensor is not None:
+        require_sensor_prior(sensor)
     if len(plan) == 0:
         raise ParameterError("plan", "no row", "at least one")
-    lacking = sorted({name for name, _ in plan.rows_by_pattern()} - set(plan.patterns))
-    if lacking:
-        raise ParameterError("pattern", lacking[0], f"one that is described: {', '.join(plan.patterns) or 'none'}")
+    require_described(plan)
+    if noise_sd is None and isinstance(sensor, FittedSensor):
+        noise_sd = float(sensor.noise_sd.mean())
     expected, said = _expected(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     before, cosines = _judged(PlanTemplates.of(expected, plan, effects), effects, unit)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_like
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, theta_to_natural
 from probewise.diagnosis.fitting.free_form import FreeForm, free_form_to_natural
@@ -16,7 +17,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor import is_free_form
 
-__all__ = ["SensorPrior", "require_same_unit", "sensor_from_posterior", "sensor_of"]
+__all__ = ["SensorPrior", "require_same_unit", "require_sensor_prior", "sensor_from_posterior", "sensor_of"]
 
 
 def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
@@ -63,6 +64,12 @@ class SensorPrior(Protocol):
     def samples(self) -> FloatArray:
         """Posterior samples, (n_samples, n_params)."""
         ...
+
+
+def require_sensor_prior(sensor: object) -> None:
+    """Raise ParameterError unless `sensor` has names and samples."""
+    allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
+    require_like("sensor", sensor, ("names", "samples"), allowed)
 
 
 def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:

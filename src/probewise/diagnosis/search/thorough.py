@@ -16,6 +16,7 @@ import numpy as np
 
 from probewise import nested
 from probewise._arrays import FloatArray
+from probewise._kinds import require_rng
 from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
@@ -68,6 +69,7 @@ def weigh_thoroughly(
     The search, with other probabilities where nested sampling wins, and each hypothesis as weighed twice,
     the most probable first.
     """
+    require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
     for (candidate, noise), own in zip(leaders := _leaders(searched), rng.spawn(len(leaders)), strict=True):
         key = candidate.n_gaussians, candidate.names

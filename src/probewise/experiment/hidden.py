@@ -1,0 +1,118 @@
+"""What lies on a simulated field: a shape that the arm does not know, given or drawn from its prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, floats, frozen
+from probewise._kinds import require_rng
+from probewise.errors import ParameterError
+from probewise.experiment.simulation import SHAPES, surface_under
+from probewise.priors import Prior
+from probewise.scene import AnyOf, Field, Shape, outlines
+from probewise.world import Surface
+
+__all__ = ["Hidden", "Truth", "members_of"]
+
+Truth = Sequence[float] | Mapping[str, Sequence[float]]
+"""Parameters of the first shape, or of one by its name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """One shape with its parameters, theta (n_params,), by the name that it has among those that may lie there."""
+
+    name: str
+    shape: Shape
+    theta: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", frozen(self.theta))
+
+    @classmethod
+    def given(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> Hidden:
+        """Take parameters that the shape's prior allows; `called` is what messages call them.
+
+        Raises
+        ------
+        ParameterError
+            If there are not as many numbers as parameters, or one that the prior excludes.
+        """
+        prior = shape.prior
+        values = floats(theta, called)
+        if values.shape != (len(prior.names),):
+            raise ParameterError(called, theta, f"{len(prior.names)} numbers, {', '.join(prior.names)}")
+        for parameter, value, low, high in zip(prior.names, values.tolist(), *_bounds(prior, values), strict=True):
+            if not low <= value <= high:
+                option = called.partition(" ")[0]
+                raise ParameterError(
+                    f"{parameter} of {called}",
+                    value,
+                    f"{low:g} to {high:g}, as the {name}'s prior has it; without {option} the seed draws one",
+                )
+        return cls(name, shape, values)
+
+    @classmethod
+    def drawn(cls, members: Mapping[str, Shape], *, rng: np.random.Generator) -> Hidden:
+        """Draw one of several shapes, and its parameters from its prior."""
+        require_rng(rng)
+        name = list(members)[int(rng.integers(len(members)))]
+        prior = members[name].prior
+        return cls(name, members[name], prior.from_unit_cube(rng.random((1, len(prior.names))))[0])
+
+    @classmethod
+    def of(cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator) -> Hidden:
+        """Take the truth that is given: of the first member, or of a shape by name; without one draw it.
+
+        Raises
+        ------
+        ParameterError
+            If it names no shape, or holds numbers that the shape's prior excludes.
+        """
+        if truth is None:
+            return cls.drawn(members, rng=rng)
+        if not isinstance(truth, Mapping):
+            name = next(iter(members))
+            return cls.given(name, members[name], floats(truth, "truth"))
+        known = {**{name: make(field) for name, make in SHAPES.items()}, **members}
+        if len(truth) != 1 or not set(truth) <= set(known):
+            raise ParameterError("truth", truth, f"one shape of {', '.join(known)} with its parameters")
+        ((name, values),) = truth.items()
+        return cls.given(name, known[name], floats(values, "truth"))
+
+    @property
+    def surface(self) -> Surface:
+        """What the world paints: geometry alone crosses over."""
+        return surface_under(self.shape.region(self.theta[None, :]), self.name)
+
+    @property
+    def outline_mm(self) -> FloatArray:
+        """Its outline, closed, (n_points, 2)."""
+        return outlines(self.shape.region(self.theta[None, :]))[0]
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Its parameters by name."""
+        return dict(zip(self.shape.prior.names, self.theta.tolist(), strict=True))
+
+    def named_as(self, names: Sequence[str]) -> dict[str, float]:
+        """Name them as a hypothesis does: in a set of shapes "rectangle.width_mm", with the centre shared."""
+        known, prefix = self.parameters, f"{self.name}."
+        return {name: known[name.removeprefix(prefix)] for name in names if name.removeprefix(prefix) in known}
+
+
+def members_of(shape: Shape) -> dict[str, Shape]:
+    """List the shapes that may lie there by name: those of a set, or the one."""
+    return dict(shape.shapes) if isinstance(shape, AnyOf) else {type(shape).__name__.lower(): shape}
+
+
+def _bounds(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Find the least and the greatest of each parameter where the others are those of theta, all (n_params,)."""
+    own = np.eye(len(theta), dtype=np.bool_)
+    with np.errstate(invalid="ignore"):  # of a ratio of infinities
+        given = prior.to_unit_cube(theta[None])
+    low, high = (np.diagonal(prior.from_unit_cube(np.where(own, end, given))) for end in (0.0, 1.0))
+    return low, high

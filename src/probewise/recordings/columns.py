@@ -1,0 +1,167 @@
+"""Columns as people hold them, arrays, lists, tables, turned into what a plan holds: codes, names, numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from probewise._arrays import FloatArray, IntArray, floats
+from probewise.errors import ParameterError, ShapeError
+from probewise.recordings.patterns import PATTERNS, Pattern
+
+__all__ = [
+    "Table",
+    "column",
+    "columns_of",
+    "covariates_of",
+    "named_patterns",
+    "pattern_codes",
+    "require_patterns",
+    "scan_codes",
+    "undescribed",
+]
+
+_A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
+_THE_ONLY = "pattern"  # its name, where none was given
+_KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
+
+
+class Table(Protocol):
+    """Columns by name: a dict of lists or arrays, or a data frame."""
+
+    def keys(self) -> Iterable[Any]:
+        """Names of the columns."""
+        ...
+
+    def __getitem__(self, name: Any, /) -> Any:
+        """Values of a column."""
+        ...
+
+
+def columns_of(table: Table) -> dict[str, Any]:
+    """Take a table's columns by name.
+
+    Raises
+    ------
+    ParameterError
+        If it has no columns by name.
+    """
+    names: Any = getattr(table, "columns", None)  # of a data frame, pandas or polars
+    if isinstance(table, Mapping) or names is None:
+        names = table.keys() if hasattr(table, "keys") else getattr(getattr(table, "dtype", None), "names", None)
+    if names is None:
+        raise ParameterError("table", table, "columns by name: a dict of arrays, or a data frame")
+    return {str(name).strip(): table[name] for name in names}
+
+
+def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
+    """Take one number a reading, shape (n_points,); a single number stands for all where `n_points` is known.
+
+    Raises
+    ------
+    ParameterError
+        If there is anything but numbers.
+    ShapeError
+        If there is not one a reading.
+    """
+    out = floats(values, name)
+    if out.ndim == 0 and n_points is not None:
+        return np.full(n_points, float(out))
+    if out.ndim != 1 or (n_points is not None and len(out) != n_points):
+        allowed = "one number a reading" if n_points is None else f"({n_points},), as x_mm"
+        raise ShapeError(f"{name} has shape {out.shape}; allowed: {allowed}")
+    return out
+
+
+def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Keep the columns of numbers that a plan has no place for; also notes on those that are left out."""
+    out, notes = {}, []
+    for name, values in columns.items():
+        if name in _KNOWN:
+            continue
+        try:
+            out[name] = column(name, values)
+        except ParameterError:
+            notes.append(f"column {name} holds no numbers, ignored")
+    return out, tuple(notes)
+
+
+def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
+    """Count scans up at every change of name, as files do: one that returns later is a new scan.
+
+    Returns
+    -------
+    The number of each reading's scan, (n_points,), and the scans' names.
+    """
+    if names is None or isinstance(names, str):
+        return np.zeros(n_points, dtype=np.int64), (names or "scan",)
+    cells = _texts("scan", names, n_points)
+    starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
+    begins = np.zeros(n_points, dtype=np.int64)
+    begins[starts[1:]] = 1
+    return np.cumsum(begins), tuple(cells[k] for k in starts)
+
+
+def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
+    """Take patterns by name, or one that lies under every reading.
+
+    Raises
+    ------
+    ParameterError
+        If there is none, or something else than a pattern.
+    """
+    by_name = patterns if isinstance(patterns, Mapping) else {_THE_ONLY: patterns}
+    if not by_name:
+        allowed = f"what lay under the sensor, by name: {{'edge': HalfPlane(...), ...}}, or {_A_PATTERN}"
+        raise ParameterError("patterns", patterns, allowed)
+    require_patterns(by_name)
+    return dict(by_name)
+
+
+def require_patterns(patterns: Mapping[str, Pattern]) -> None:
+    """Raise ParameterError where something is no pattern, such as the fields of one in a dict."""
+    for name, pattern in patterns.items():
+        if not isinstance(pattern, PATTERNS):
+            raise ParameterError(f"patterns[{name!r}]", pattern, _A_PATTERN)
+
+
+def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:
+    """Give each reading the number of its pattern, (n_points,): its place in `patterns`.
+
+    Raises
+    ------
+    ParameterError
+        If a name is not described, or there are several patterns and nobody says which lay where.
+    """
+    known = list(patterns)
+    if names is None:
+        if len(known) > 1:
+            listed = ", ".join(map(repr, known))
+            raise ParameterError(
+                "pattern", None, f"the name of each reading's pattern, for there are several: {listed}"
+            )
+        return np.zeros(n_points, dtype=np.int64)
+    cells = [names] * n_points if isinstance(names, str) else _texts("pattern", names, n_points)
+    code = {name: k for k, name in enumerate(known)}
+    for cell in cells:
+        if cell not in code:
+            raise ParameterError("pattern", cell, undescribed(cell, known))
+    return np.array([code[cell] for cell in cells], dtype=np.int64)
+
+
+def undescribed(name: str, known: Sequence[str]) -> str:
+    """Say what to do about a pattern that is named but not described."""
+    listed = ", ".join(map(repr, known)) or "none"
+    return f"one that is described ({listed}); {name!r} is named but not described: pass patterns={{{name!r}: ...}}"
+
+
+def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
+    if not isinstance(values, Iterable):
+        raise ParameterError(name, values, "a text, or one a reading")
+    cells = [str(value) for value in values]
+    if len(cells) != n_points:
+        raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one a reading, or a single text")
+    return cells

@@ -1,0 +1,369 @@
+"""What people do with the package, one call each, as the command line does it: same names, same defaults.
+
+The packages below hold the parts, with every option. Nothing heavy is imported before a verb is called, so
+that `import probewise` and `probewise --help` are quick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+    from probewise.arm import Instrument
+    from probewise.calibration import Calibration, FittedSensor
+    from probewise.diagnosis import Diagnosis, PlanAudit
+    from probewise.experiment import Exploration, Model, Step, Truth
+    from probewise.inquiry import Utility
+    from probewise.recordings import Plan, Prediction, Recording
+    from probewise.scene import Field, Shape
+
+__all__ = [
+    "MAX_READINGS",
+    "MODEL",
+    "N_LIVE",
+    "ORDERS",
+    "SHAPE",
+    "UTILITY",
+    "audit",
+    "calibrate",
+    "diagnose",
+    "explore",
+    "predict",
+]
+
+# What the command line and the functions below do where nobody says otherwise.
+ORDERS = (1, 2, 3, 4)
+N_LIVE = 300
+SHAPE = "circle"
+MODEL: Model = "ssf"
+UTILITY = "finishing"
+MAX_READINGS = 100
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    orders: Sequence[int] = ORDERS,
+    n_live: int = N_LIVE,
+    rng: np.random.Generator,
+    progress: bool = True,
+) -> Calibration:
+    """Fit the sensor model of a recording; weigh numbers of Gaussians by their evidence.
+
+    Parameters
+    ----------
+    recording
+        Readings over known patterns.
+    orders
+        Numbers of Gaussians to weigh.
+    n_live
+        Live points of nested sampling: fewer are faster, and their evidences less certain.
+    rng
+        Source of randomness; with `np.random.default_rng(seed)` the result of `probewise calibrate --seed`.
+    progress
+        Whether to show a progress bar, in a terminal or a notebook.
+
+    Returns
+    -------
+    Calibration
+        Its `sensor` is the fitted sensor of the most probable order.
+
+    Raises
+    ------
+    ParameterError
+        If the recording, an order or the number of live points cannot be used.
+
+    See Also
+    --------
+    probewise.calibration.calibrate : The same with priors, data sets and an executor of one's own.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import probewise
+    >>> from probewise.recordings import shipped
+    >>> recording = probewise.read_recording(shipped("paper"))
+    >>> calibration = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1))
+    >>> calibration.sensor.n_gaussians
+    1
+    """
+    from probewise import calibration
+    from probewise._progress import nested_progress
+
+    with nested_progress(quiet=not progress) as show:
+        return calibration.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=show)
+
+
+def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
+    """Predict the readings of a plan, each with its sd; score those of a recording.
+
+    Parameters
+    ----------
+    sensor
+        The fitted sensor.
+    plan
+        Where, when and over what to read; or a recording, whose readings are then scored.
+
+    Returns
+    -------
+    Prediction
+        Mean and sd of one new reading for each row, and the log density of what was recorded.
+
+    Raises
+    ------
+    ParameterError
+        If something is not of its kind, or a pattern is not described.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import probewise
+    >>> from probewise.recordings import shipped
+    >>> recording = probewise.read_recording(shipped("paper"))
+    >>> found = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1))
+    >>> len(probewise.predict(found.sensor, recording))
+    408
+    """
+    from probewise import calibration
+
+    return calibration.predict(sensor, plan)
+
+
+def explore(
+    sensor: FittedSensor,
+    *,
+    shape: str | Sequence[str] | Shape = SHAPE,
+    truth: Truth | None = None,
+    arm: Instrument | None = None,
+    field: Field | None = None,
+    model: Model = MODEL,
+    utility: str | Utility = UTILITY,
+    learn_sensor: bool = False,
+    batch: int = 1,
+    orientations_rad: Sequence[float] = (0.0,),
+    heights_mm: Sequence[float] = (),
+    repeats: Sequence[int] = (1,),
+    max_readings: int = MAX_READINGS,
+    journal: str | Path | None = None,
+    rng: np.random.Generator,
+    progress: bool = True,
+) -> Exploration:
+    """Let the robot find a shape, choosing each measurement itself.
+
+    Without an `arm` a simulated one stands over a field that hides a shape; what its sensor really sees comes from
+    the sensor too, painted pixel by pixel by `probewise.world`.
+
+    Parameters
+    ----------
+    sensor
+        A fitted sensor, of `calibrate` or `read_sensor`.
+    shape
+        What may lie on the field: "circle", "ellipse", "rectangle", "triangle", "hexagon", several of them, or a shape
+        of `probewise.scene`.
+    truth
+        What the simulated field hides: the parameters of the (first) shape, for a circle x_mm, y_mm, radius_mm; or
+        {"rectangle": ...}, by name. By default drawn from the shape's prior.
+    arm
+        Where the readings come from; entered and left here (`with arm:`). By default the simulated arm.
+    field
+        Width and height of the field; by default those of the paper.
+    model
+        "ssf", or "naive": what the robot takes its sensor for.
+    utility
+        What a reading is worth, by the names of `inquiry.UTILITY_NAMES`, or a utility.
+    learn_sensor
+        Infer the size and place of the footprint and both levels along with the shape.
+    batch
+        Readings that are chosen at a time.
+    orientations_rad, heights_mm, repeats
+        What else may be chosen, of an arm that can: see `probewise.experiment.experiment_for`.
+    max_readings
+        Stop here if the shape is not known by then.
+    journal
+        File that gets one JSON line a measurement; where it exists already the run goes on from it, given an `rng` of
+        the same seed.
+    rng
+        Source of randomness; with `np.random.default_rng(seed)` the run of `probewise explore --seed`.
+    progress
+        Whether to show a progress bar, in a terminal or a notebook.
+
+    Returns
+    -------
+    Exploration
+        Its steps; `last.mean` and `last.sd` are what is known in the end, `hidden` what the simulated
+        field held.
+
+    Raises
+    ------
+    ParameterError
+        If something is not of its kind, or a truth is given with an arm that measures one.
+    NotConvergedError
+        If no hypothesis could have given the readings.
+
+    See Also
+    --------
+    probewise.experiment.run : The same for any experiment and any arm.
+    probewise.experiment.explore : One step at a time.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import probewise
+    >>> from probewise.recordings import shipped
+    >>> recording = probewise.read_recording(shipped("paper"))
+    >>> found = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1))
+    >>> run = probewise.explore(found.sensor, truth=(500, 250, 90), max_readings=2, rng=np.random.default_rng(1))
+    >>> len(run.readings)
+    2
+    """
+    from tqdm import tqdm
+
+    from probewise import experiment as posing
+    from probewise._kinds import require_kind, require_rng
+    from probewise._progress import disabled
+    from probewise.arm.instrument import require_instrument
+    from probewise.errors import ParameterError
+    from probewise.inquiry import utility_named
+    from probewise.scene import Field
+
+    require_rng(rng)
+    field = Field() if field is None else field
+    require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
+    asked = posing.experiment_for(
+        sensor,
+        posing.shape_of(shape, field),
+        field,
+        model=model,
+        utility=utility_named(utility) if isinstance(utility, str) else utility,
+        learn_sensor=learn_sensor,
+        batch=batch,
+        orientations_rad=tuple(orientations_rad),
+        heights_mm=tuple(heights_mm),
+        repeats=tuple(repeats),
+    )
+    streams, hidden = posing.Streams.of(rng), None
+    if arm is None:
+        hidden = posing.Hidden.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
+        taken = posing.readings_of(journal)
+        arm = posing.arm_over(posing.world_like(sensor), hidden.surface, field, seed=streams.noise, taken=taken)
+    elif truth is not None:
+        raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
+    require_instrument(arm, "arm")
+    with arm, tqdm(desc="readings", unit="", disable=disabled(quiet=not progress)) as bar:
+
+        def show(step: Step) -> None:
+            bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
+            bar.update()
+
+        return posing.run(
+            arm,
+            asked,
+            rng=streams.run,
+            max_readings=max_readings,
+            journal=journal,
+            progress=show,
+            hidden=hidden,
+        )
+
+
+def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None) -> PlanAudit:
+    """Say, before any data, which effects a plan cannot see or cannot tell apart, and what readings would cure that.
+
+    Parameters
+    ----------
+    plan
+        What is to be measured; of a recording its plan.
+    sensor
+        The sensor as calibrated; without, a typical one is expected.
+
+    Returns
+    -------
+    PlanAudit
+        How each effect is seen; its `cure_plan` holds the readings to add.
+
+    Raises
+    ------
+    ParameterError
+        If the plan has no row, or a pattern that is not described.
+
+    See Also
+    --------
+    probewise.diagnosis.audit_plan : The same with a vocabulary of one's own.
+
+    Examples
+    --------
+    >>> import probewise
+    >>> from probewise.recordings import Uniform
+    >>> plan = probewise.Plan.from_arrays(x_mm=range(30), y_mm=0, patterns=Uniform(0.5), unit="V", min=0, max=5)
+    >>> len(probewise.audit(plan).seen_as("invisible")) > 0
+    True
+    """
+    from probewise.diagnosis import audit_plan
+
+    return audit_plan(plan, sensor=sensor)
+
+
+def diagnose(
+    recordings: Recording | Sequence[Recording],
+    *,
+    sensor: FittedSensor | None = None,
+    thorough: bool = False,
+    rng: np.random.Generator,
+    progress: bool = True,
+) -> Diagnosis:
+    """Find which physics the sensor model leaves out of recordings.
+
+    Parameters
+    ----------
+    recordings
+        One, or several of one apparatus that are diagnosed together.
+    sensor
+        An earlier calibration, whose posterior becomes the prior.
+    thorough
+        Weigh the leading hypotheses again by nested sampling, which wins where it disagrees (a minute or two).
+    rng
+        Source of randomness; with `np.random.default_rng(seed)` the result of `probewise diagnose --seed`.
+    progress
+        Whether to show a progress bar of the nested sampling, in a terminal or a notebook.
+
+    Returns
+    -------
+    Diagnosis
+        Verdict, probabilities, where the mismatch shows, the repaired model and what to measure next.
+
+    Raises
+    ------
+    ParameterError
+        If there is no usable reading, units differ, or two recordings are the same.
+    NotConvergedError
+        If the fit of the sensor model did not arrive anywhere.
+
+    See Also
+    --------
+    probewise.diagnosis.diagnose : The same with a vocabulary or a model of one's own.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import probewise
+    >>> from probewise.recordings import shipped
+    >>> few = probewise.read_recording(shipped("paper")).take(np.arange(20))
+    >>> probewise.diagnose(few, rng=np.random.default_rng(1)).verdict
+    'cannot_tell'
+    """
+    from functools import partial
+
+    from probewise import diagnosis
+    from probewise._kinds import require_rng
+    from probewise._progress import nested_progress
+
+    require_rng(rng)
+    own, of_nested = rng.spawn(2)
+    with nested_progress(quiet=not progress) as show:
+        again = partial(diagnosis.weigh_thoroughly, rng=of_nested, progress=show) if thorough else None
+        return diagnosis.diagnose(recordings, sensor=sensor, thorough=again, rng=own)

@@ -166,9 +166,9 @@ def test_a_truth_that_cannot_lie_there_is_named_with_its_bounds_and_the_way_out(
 
 @pytest.mark.parametrize("truth", ["0,0,20", "1048,520,150", "ellipse:500,250,90,90,0", "hexagon:500,250,30,0"])
 def test_a_truth_on_its_bounds_is_taken(truth):
-    name, theta = parse_truth(truth, ["circle"], Field(), rng=np.random.default_rng(0))
-    assert name == (truth.partition(":")[0] if ":" in truth else "circle")
-    assert theta.tolist() == [float(cell) for cell in truth.rpartition(":")[2].split(",")]
+    hidden = parse_truth(truth, ["circle"], Field(), rng=np.random.default_rng(0))
+    assert hidden.name == (truth.partition(":")[0] if ":" in truth else "circle")
+    assert hidden.theta.tolist() == [float(cell) for cell in truth.rpartition(":")[2].split(",")]
 
 
 @pytest.mark.parametrize("verb", [v.name for v in VERBS])

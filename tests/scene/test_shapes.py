@@ -178,7 +178,7 @@ def test_scenes_name_their_parameters_and_give_their_regions():
     [
         (lambda: Circle(radius_mm=(0.0, 5.0)), "radius_mm"),
         (lambda: Circle(radius_mm=(20.0, 300.0), inside=True), "less than the field's 1048 x 520 mm"),
-        (lambda: RegularPolygon(2), "n_sides is 2; allowed: 3 or more"),
+        (lambda: RegularPolygon(2), "n_sides is 2; allowed: a whole number, 3 or more"),
         (lambda: Field(width_mm=-1.0), "width_mm is -1.0"),
         (lambda: AnyOf({}), "one shape or more"),
         (lambda: AnyOf({"circle": Circle()}, (0.0,)), "1 numbers greater than 0"),

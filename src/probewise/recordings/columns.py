@@ -71,7 +71,7 @@ def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatAr
     if out.ndim == 0 and n_points is not None:
         return np.full(n_points, float(out))
     if out.ndim != 1 or (n_points is not None and len(out) != n_points):
-        allowed = "one number a reading" if n_points is None else f"({n_points},), as x_mm"
+        allowed = "one number per reading" if n_points is None else f"({n_points},), as x_mm"
         raise ShapeError(f"{name} has shape {out.shape}; allowed: {allowed}")
     return out
 

@@ -139,7 +139,7 @@ class Plan:
         step: float | None = None,
         sensor: str = "",
         height_mm: float | None = None,
-        controls: Sequence[str] = (),
+        controls: tuple[str, ...] = (),
     ) -> Self:
         """Lay out a plan from arrays, lists or columns of a table, one entry a reading in the order of taking.
 
@@ -198,7 +198,7 @@ class Plan:
             patterns=described,
             covariates={name: column(name, values, n_points) for name, values in (covariates or {}).items()},
             instrumentation=Instrumentation(
-                unit=unit, min=min, max=max, step=step, sensor=sensor, height_mm=height_mm, controls=tuple(controls)
+                unit=unit, min=min, max=max, step=step, sensor=sensor, height_mm=height_mm, controls=controls
             ),
         )
 
@@ -294,7 +294,7 @@ class Recording(ShowsItself):
         step: float | None = None,
         sensor: str = "",
         height_mm: float | None = None,
-        controls: Sequence[str] = (),
+        controls: tuple[str, ...] = (),
         source: str = "",
     ) -> Self:
         """Make a recording from arrays, lists or columns of a table, one entry a reading in the order of taking.
@@ -366,7 +366,7 @@ class Recording(ShowsItself):
         step: float | None = None,
         sensor: str = "",
         height_mm: float | None = None,
-        controls: Sequence[str] = (),
+        controls: tuple[str, ...] = (),
         source: str = "",
     ) -> Self:
         """Make a recording from a data frame or a dict of columns that are named as in a recording's CSV file.
@@ -398,7 +398,7 @@ class Recording(ShowsItself):
         missing = [name for name in ("reading", "x_mm", "y_mm") if name not in columns]
         if missing:
             raise ParameterError(
-                "columns", tuple(columns), f"also {', '.join(missing)}; rename what the table calls it"
+                "columns", tuple(columns), f"also {', '.join(missing)}; rename the table's columns"
             )
         turn_deg, turn_rad = columns.get("orientation_deg"), columns.get("orientation_rad", 0.0)
         if turn_deg is not None:

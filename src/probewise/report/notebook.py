@@ -8,10 +8,11 @@ import numpy as np
 
 from probewise._display import render_html
 from probewise.calibration import Calibration, FittedSensor
-from probewise.diagnosis import Diagnosis
+from probewise.diagnosis import Diagnosis, PlanAudit
 from probewise.experiment import Exploration, Step
 from probewise.nested import NestedResult
-from probewise.recordings import Recording
+from probewise.recordings import Prediction, Recording
+from probewise.report import audit as audit_report
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
@@ -22,6 +23,7 @@ from probewise.report.plots import (
     hypothesis_probabilities,
     png,
     posterior_widths,
+    predicted_against_recorded,
     readings_by_orientation,
     spatial_sensitivity,
     ssf_by_order,
@@ -93,7 +95,10 @@ def _(value: Step) -> str:
 def _(value: Exploration) -> str:
     readings = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in value.readings]
     seen = [r.value for r in value.readings]
-    picture = exploration_report.frame(value.last, value.experiment, readings, levels=(min(seen), max(seen)))
+    truth_mm = None if value.hidden is None else value.hidden.outline_mm
+    picture = exploration_report.frame(
+        value.last, value.experiment, readings, levels=(min(seen), max(seen)), truth_mm=truth_mm
+    )
     widths = posterior_widths(
         {"run": np.array([s.widest_mm for s in value.steps])}, target_mm=value.experiment.stop_sd_mm
     )
@@ -102,6 +107,20 @@ def _(value: Exploration) -> str:
         figure(picture, "The robot's view at the end"),
         figure(png(widths, dpi=DPI), "Widest posterior sd after each reading"),
     )
+
+
+@render_html.register
+def _(value: Prediction) -> str:
+    recording = Recording(value.plan, value.readings)
+    drawn = predicted_against_recorded(recording, value.mean, value.sd)
+    return _card(paragraph(value.summary()), figure(png(drawn, dpi=DPI), "Predicted readings, each with its 95 % band"))
+
+
+@render_html.register
+def _(value: PlanAudit) -> str:
+    (drawn,) = audit_report.figures(value).values()
+    cures = Markup(f"<pre>{html.escape(value.summary())}</pre>")
+    return _card(paragraph(audit_report.answer(value)), figure(drawn, "What the plan sees and tells apart"), cures)
 
 
 @render_html.register

@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise.errors import ParameterError
 from probewise.priors import Empty, Prior
-from probewise.recordings.columns import require_patterns, undescribed
+from probewise.recordings.columns import require_patterns
 from probewise.recordings.patterns import Pattern
 from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.patterns import region_of
@@ -44,14 +44,7 @@ class KnownScene:
 
     @cached_property
     def _built(self) -> Mapping[str, Region]:
-        return _Described({name: region_of(pattern) for name, pattern in self.patterns.items()})
-
-
-class _Described(dict[str, Region]):
-    """Regions by pattern name, which say what to do about a name that they lack."""
-
-    def __missing__(self, name: str) -> Region:
-        raise ParameterError("pattern", name, undescribed(name, list(self)))
+        return {name: region_of(pattern) for name, pattern in self.patterns.items()}
 
 
 @dataclass(frozen=True)

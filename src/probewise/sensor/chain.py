@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_like, require_number
 from probewise.errors import ParameterError
+from probewise.recordings.columns import undescribed
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
@@ -31,7 +32,16 @@ from probewise.sensor.stages import (
 )
 from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 
-__all__ = ["Chain", "FixedLevels", "FreeLevels", "Levels", "require_levels", "require_scene", "response"]
+__all__ = [
+    "Chain",
+    "FixedLevels",
+    "FreeLevels",
+    "Levels",
+    "region_named",
+    "require_levels",
+    "require_scene",
+    "response",
+]
 
 _MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
 _MOST_NUMBERS = 2_000_000  # held at once of footprints that differ from reading to reading
@@ -332,7 +342,7 @@ class Layout:
     @cached_property
     def parts(self) -> list[tuple[IntArray, Region]]:
         """Readings and the region under them."""
-        return [(rows, _region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
+        return [(rows, region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
 
     @cached_property
     def straight(self) -> tuple[StraightEdges | StraightCorners, ...]:
@@ -443,11 +453,12 @@ def _discrete_response(layout: Layout, ssf: FieldSSF) -> FloatArray:
     return out
 
 
-def _region_named(regions: Mapping[str, Region], name: str) -> Region:
+def region_named(regions: Mapping[str, Region], name: str) -> Region:
+    """Find a pattern's region, or raise ParameterError with what to do about one that is not described."""
     try:
         return regions[name]
     except KeyError:
-        raise ParameterError("pattern", name, f"a pattern of the scene: {', '.join(regions) or 'none'}") from None
+        raise ParameterError("pattern", name, undescribed(name, list(regions))) from None
 
 
 def _by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:

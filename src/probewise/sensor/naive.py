@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Scene
-from probewise.sensor.chain import Levels, require_levels, require_scene
+from probewise.sensor.chain import Levels, region_named, require_levels, require_scene
 from probewise.sensor.stages import require_columns
 
 __all__ = ["NaiveSensor"]
@@ -44,5 +44,5 @@ class NaiveSensor:
         out = np.empty((len(theta), len(plan)))
         points = np.stack([plan.x_mm, plan.y_mm], axis=-1)
         for name, rows in plan.rows_by_pattern():
-            out[:, rows] = np.where(regions[name].albedo(points[rows]) >= 0.5, i_max, i_min)
+            out[:, rows] = np.where(region_named(regions, name).albedo(points[rows]) >= 0.5, i_max, i_min)
         return out

@@ -1,0 +1,205 @@
+"""What `import probewise` offers: one call for each verb, with the defaults and the results of the command line."""
+
+import argparse
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import probewise
+from probewise import verbs
+from probewise.arm import SimulatedArm
+from probewise.cli import VERBS, main
+from probewise.diagnosis import audit_plan
+from probewise.effects import VOCABULARY
+from probewise.errors import ParameterError
+from probewise.scene import Circle, Field
+
+FEW = dict(list(VOCABULARY.items())[:3])
+
+
+@pytest.fixture
+def sensor(sensor_file):
+    return probewise.read_sensor(sensor_file)
+
+
+@pytest.fixture
+def recording(recording_file):
+    return probewise.read_recording(recording_file)
+
+
+def test_the_import_loads_no_numerical_library():
+    code = (
+        "import sys, probewise\ndir(probewise), probewise.calibrate\n"
+        "sys.exit(' '.join(m for m in ('numpy', 'scipy', 'matplotlib', 'tqdm') if m in sys.modules) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_a_tab_offers_is_there_and_nothing_else_is_offered():
+    offered = dir(probewise)
+    assert {"calibrate", "predict", "explore", "audit", "diagnose", "nested", "Recording"} <= set(offered)
+    assert [name for name in offered if name.startswith("_")] == ["__version__"]
+    for name in offered:
+        assert getattr(probewise, name) is not None
+    assert probewise.nested.run.__module__ == "probewise.nested.sampler"
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        _ = probewise.calibrat
+
+
+def test_every_package_that_is_documented_is_offered():
+    """The API page lists the packages; each of the first level is an attribute."""
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "api.rst").read_text()
+    listed = {line.strip().split(".")[1] for line in page.splitlines() if line.strip().startswith("probewise.")}
+    assert {"nested", "calibration", "diagnosis"} <= listed <= set(dir(probewise))
+
+
+DESTINATIONS = {
+    "calibrate": {"orders": "orders", "n_live": "live"},
+    "explore": {
+        "shape": "shape",
+        "truth": "truth",
+        "model": "model",
+        "utility": "utility",
+        "learn_sensor": "learn_sensor",
+        "batch": "batch",
+        "max_readings": "max_readings",
+    },
+    "audit": {"sensor": "sensor"},
+    "diagnose": {"sensor": "sensor", "thorough": "thorough"},
+}
+
+
+@pytest.mark.parametrize(
+    ("verb", "parameter", "option"), [(v, p, o) for v, names in DESTINATIONS.items() for p, o in names.items()]
+)
+def test_the_command_line_and_python_have_the_same_defaults(verb, parameter, option):
+    parser = argparse.ArgumentParser()
+    next(v for v in VERBS if v.name == verb).add_arguments(parser)
+    theirs = parser.get_default(option)
+    own = inspect.signature(getattr(verbs, verb)).parameters[parameter].default
+    assert own == (tuple(theirs) if parameter == "orders" else theirs[0] if parameter == "shape" else theirs)
+
+
+def test_a_verb_and_the_function_behind_it_have_the_same_defaults():
+    from probewise import calibration, experiment
+
+    for parameter in ("orders", "n_live"):
+        own = inspect.signature(verbs.calibrate).parameters[parameter].default
+        assert inspect.signature(calibration.calibrate).parameters[parameter].default == own
+    for function in (experiment.explore, experiment.run):
+        assert inspect.signature(function).parameters["max_readings"].default == verbs.MAX_READINGS
+    posing = inspect.signature(experiment.experiment_for).parameters
+    for parameter in ("model", "learn_sensor", "batch", "orientations_rad", "heights_mm", "repeats"):
+        assert posing[parameter].default == inspect.signature(verbs.explore).parameters[parameter].default
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+def test_a_seed_calibrates_the_same_sensor_in_python_and_on_the_command_line(
+    recording_file, recording, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("probewise.report.calibration.figures", lambda *_: {})
+    monkeypatch.setattr("probewise.report.calibration.write_page", lambda *_, **__: "")
+    options = ["--orders", "1", "--live", "16", "--seed", "5", "--quiet"]
+    assert main(["calibrate", str(recording_file), "--out", str(tmp_path / "out"), *options]) == 0
+    theirs = probewise.read_sensor(tmp_path / "out" / "sensor.json")
+    own = probewise.calibrate(recording, orders=[1], n_live=16, rng=np.random.default_rng(5), progress=False)
+    assert json.loads(own.sensor.to_json()) == json.loads(theirs.to_json())
+
+
+@pytest.mark.usefixtures("quick_frames")
+def test_a_seed_makes_the_same_run_in_python_and_on_the_command_line(sensor_file, sensor, tmp_path):
+    """What is hidden, where the robot looks and what it reads, noise included."""
+    out = tmp_path / "out"
+    options = ["--max-readings", "2", "--seed", "5", "--quiet"]
+    assert main(["explore", "--sensor", str(sensor_file), "--out", str(out), *options]) == 0
+    journal = tmp_path / "own.jsonl"
+    rng = np.random.default_rng(5)
+    run = probewise.explore(sensor, max_readings=2, rng=rng, progress=False, journal=journal)
+    theirs = [json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()]
+    own = [json.loads(line) for line in journal.read_text().splitlines()]
+    assert [(line["pose"], line["reading"]) for line in own[1:]] == [
+        (line["pose"], line["reading"]) for line in theirs[1:]
+    ]
+    assert run.hidden.name == "circle"
+    assert "hidden       circle: x_mm" in run.summary()
+
+
+def test_a_run_goes_on_from_its_journal_with_the_noise_it_would_have_had(sensor, tmp_path):
+    whole = probewise.explore(sensor, max_readings=3, rng=np.random.default_rng(7), progress=False)
+    journal = tmp_path / "journal.jsonl"
+    probewise.explore(sensor, max_readings=1, rng=np.random.default_rng(7), journal=journal, progress=False)
+    resumed = probewise.explore(sensor, max_readings=3, rng=np.random.default_rng(7), journal=journal, progress=False)
+    assert [r.value for r in resumed.readings] == [r.value for r in whole.readings]
+
+
+def test_an_arm_of_ones_own_is_entered_measured_with_and_left(sensor):
+    said = []
+
+    class Mine(SimulatedArm):
+        def __enter__(self):
+            said.append("in")
+            return super().__enter__()
+
+        def __exit__(self, *why):
+            said.append("out")
+            super().__exit__(*why)
+
+    def light(pose, time_s, height_mm):
+        return 60.0 if abs(pose.x_mm - 500.0) < 90 else 10.0
+
+    run = probewise.explore(sensor, arm=Mine(light), max_readings=1, rng=np.random.default_rng(1), progress=False)
+    assert said == ["in", "out"]
+    assert run.hidden is None
+    with pytest.raises(ParameterError, match="none with an arm of your own"):
+        probewise.explore(sensor, arm=Mine(light), truth=(1, 2, 3), rng=np.random.default_rng(1))
+
+
+@pytest.mark.parametrize(
+    ("shape", "truth", "name", "theta"),
+    [
+        ("circle", (500, 250, 90), "circle", [500, 250, 90]),
+        (["circle", "rectangle"], {"rectangle": [500, 250, 90, 60, 0.3]}, "rectangle", [500, 250, 90, 60, 0.3]),
+        (Circle(radius_mm=(50.0, 60.0)), (500, 250, 55), "circle", [500, 250, 55]),
+    ],
+)
+def test_what_is_hidden_is_the_truth_that_was_given(shape, truth, name, theta):
+    from probewise.experiment import Hidden, members_of, shape_of
+
+    field = Field()
+    hidden = Hidden.of(truth, members_of(shape_of(shape, field)), field, rng=np.random.default_rng(0))
+    assert (hidden.name, hidden.theta.tolist()) == (name, theta)
+
+
+@pytest.mark.parametrize(
+    ("truth", "message"),
+    [
+        ((500, 250), "truth is .*; allowed: 3 numbers, x_mm, y_mm, radius_mm"),
+        ((500, 250, 9000), "radius_mm of truth is 9000.0; allowed: 20 to 150, as the circle's prior has it"),
+        ({"heart": (1, 2, 3)}, "truth is {'heart': .*; allowed: one shape of circle, ellipse"),
+        ("500,250,90", "truth is '500,250,90'; allowed: numbers"),
+    ],
+)
+def test_a_truth_that_cannot_be_is_named(sensor, truth, message):
+    with pytest.raises(ParameterError, match=message):
+        probewise.explore(sensor, truth=truth, rng=np.random.default_rng(0))
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+def test_results_of_audit_and_predict_show_themselves(sensor, recording):
+    prediction = probewise.predict(sensor, recording)
+    assert "chi-square per reading" in prediction.summary()
+    for value in (prediction, probewise.predict(sensor, recording.plan)):
+        assert "data:image/png;base64" in value._repr_html_()
+    audit = audit_plan(recording.take(np.arange(10)), effects=FEW)
+    assert "data:image/png;base64" in audit._repr_html_()
+
+
+def test_an_audit_takes_the_noise_of_the_sensor_that_it_is_given(sensor, recording):
+    plan = recording.plan.take(np.arange(20))
+    assert "noise 0.6" in audit_plan(plan, sensor=sensor, effects=FEW).assumed

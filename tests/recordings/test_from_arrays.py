@@ -1,0 +1,173 @@
+"""Recordings and plans made from arrays, lists, dicts of columns and data frames."""
+
+import numpy as np
+import pytest
+
+from probewise.errors import ParameterError, ShapeError
+from probewise.recordings import (
+    Disc,
+    HalfPlane,
+    Instrumentation,
+    Plan,
+    Polygon,
+    Quadrant,
+    Recording,
+    Stripes,
+    Uniform,
+    read_recording,
+    shipped,
+    write_recording,
+)
+
+EDGE = HalfPlane(0.0, 0.0)
+THREE = {"x_mm": [-10, 0, 10], "y_mm": 0, "readings": [0.4, 1.6, 2.9], "patterns": {"edge": EDGE}, "unit": "V"}
+
+
+def made(**changes):
+    return Recording.from_arrays(**(THREE | changes))
+
+
+def columns_of(recording):
+    """Take a recording apart into the columns of its file."""
+    plan = recording.plan
+    return {
+        "reading": recording.readings,
+        "x_mm": plan.x_mm,
+        "y_mm": plan.y_mm,
+        "orientation_deg": np.degrees(plan.orientation_rad),
+        "scan": [plan.scan_names[k] for k in plan.scan],
+        "pattern": [plan.pattern_names[k] for k in plan.pattern],
+        "time_s": plan.time_s,
+        **plan.covariates,
+    }
+
+
+def require_same(one, other):
+    for name in ("x_mm", "y_mm", "time_s", "scan", "pattern"):
+        assert np.array_equal(getattr(one.plan, name), getattr(other.plan, name))
+    assert np.allclose(one.plan.orientation_rad, other.plan.orientation_rad, rtol=0, atol=1e-15)
+    assert np.array_equal(one.readings, other.readings, equal_nan=True)
+    assert (one.plan.scan_names, one.plan.pattern_names) == (other.plan.scan_names, other.plan.pattern_names)
+    assert list(one.plan.covariates) == list(other.plan.covariates)
+
+
+@pytest.mark.parametrize("frame", [dict, "pandas", np.rec.fromarrays], ids=["dict", "data frame", "records"])
+def test_a_table_and_a_file_make_the_same_recording(frame):
+    recording = read_recording(shipped("paper"))
+    columns = columns_of(recording)
+    if frame == "pandas":
+        frame = pytest.importorskip("pandas").DataFrame
+    table = frame(list(columns.values()), names=list(columns)) if frame is np.rec.fromarrays else frame(columns)
+    inst = recording.plan.instrumentation
+    other = Recording.from_table(
+        table, patterns=recording.plan.patterns, unit=inst.unit, min=inst.min, max=inst.max, controls=inst.controls
+    )
+    require_same(other, recording)
+
+
+def test_what_was_made_from_arrays_is_written_and_read_back(tmp_path):
+    recording = made(orientation_rad=np.pi / 2, scan=[*"aab"], covariates={"battery_mv": [8, 7, 6]}, min=0, max=5)
+    write_recording(recording, tmp_path / "made.csv")
+    require_same(read_recording(tmp_path / "made.csv"), recording)
+
+
+def test_scans_begin_where_their_name_changes_and_times_are_a_second_apart():
+    plan = made(scan=[1, 2, 1]).plan
+    assert (plan.scan.tolist(), plan.scan_names) == ([0, 1, 2], ("1", "2", "1"))
+    assert plan.time_s.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_one_pattern_lies_under_every_reading():
+    assert made(patterns=EDGE).plan.patterns == {"pattern": EDGE}
+    assert made(patterns={"edge": EDGE, "white": Uniform(1)}, pattern="white").plan.pattern.tolist() == [1, 1, 1]
+
+
+def test_missing_readings_and_those_out_of_range_are_left_out_and_noted():
+    recording = made(readings=[None, 9, 2.5], max=5)
+    assert recording.usable.tolist() == [False, False, True]
+    assert recording.notes == ("1 reading missing, left out", "1 reading outside the range up to 5, left out")
+    masked = np.ma.masked_greater([0.4, 99.0, 2.9], 50)
+    assert np.isnan(made(readings=masked).readings).tolist() == [False, True, False]
+
+
+def test_text_columns_of_a_table_are_noted_and_left_out():
+    table = {"x_mm": [0, 1], "y_mm": [0, 0], "reading": [1, 2], "who": ["me", "you"], "lux": [3, 4]}
+    recording = Recording.from_table(table, patterns=EDGE, unit="V")
+    assert list(recording.plan.covariates) == ["lux"]
+    assert recording.notes == ("column who holds no numbers, ignored",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pattern": "edgy"}, r"'edgy' is named but not described: pass patterns=\{'edgy': ...\}"),
+        ({"pattern": ["edge", "white", "edge"]}, "'white' is named but not described"),
+        ({"patterns": {"a": EDGE, "b": EDGE}}, "pattern is None; allowed: the name of each reading's pattern"),
+        ({"patterns": {}}, "patterns is {}; allowed: what lay under the sensor, by name"),
+        ({"patterns": {"edge": {"kind": "half_plane"}}}, r"patterns\['edge'\] is .*; allowed: a pattern such as"),
+        ({"patterns": {"edge": HalfPlane}}, r"patterns\['edge'\] is <class"),
+        ({"unit": None}, "unit is None; allowed: a text"),
+        ({"x_mm": ["a", "b", "c"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
+        ({"x_mm": ["1", "2", "3"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
+        ({"x_mm": [0, 1]}, r"x_mm has shape \(2,\); allowed: \(3,\)"),
+        ({"x_mm": [0, None, 1]}, r"x_mm\[1\] is nan; allowed: finite numbers"),
+        ({"y_mm": [[0, 1, 2]]}, r"y_mm has shape \(1, 3\); allowed: \(3,\), as x_mm"),
+        ({"readings": 3.0}, r"readings has shape \(\); allowed: one number per reading"),
+        ({"readings": "0.4,1.6,2.9"}, "readings is '0.4,1.6,2.9'; allowed: numbers"),
+        ({"readings": [np.nan] * 3}, "allowed: at least one number within the declared range"),
+        ({"readings": [1 + 2j, 0, 0]}, "readings is .*; allowed: numbers"),
+        ({"scan": ["a"]}, "scan has 1 names; allowed: 3"),
+        ({"min": 5, "max": 0}, "max is 0.0; allowed: greater than min, 5"),
+        ({"step": 0}, "step is 0.0; allowed: a number greater than 0"),
+        ({"controls": "led"}, "controls is 'led'; allowed: a tuple of texts"),
+    ],
+)
+def test_what_cannot_be_a_recording_is_refused_in_words(changes, message):
+    with pytest.raises((ParameterError, ShapeError), match=message):
+        made(**changes)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ([1, 2, 3], "table is .*; allowed: columns by name: a dict of arrays, or a data frame"),
+        ({"x": [1], "y_mm": [2], "reading": [3]}, "also x_mm; rename the table's columns"),
+        (
+            {"x_mm": [1], "y_mm": [2], "reading": [3], "orientation_deg": [0], "orientation_rad": [0]},
+            "one of orientation_deg and orientation_rad",
+        ),
+    ],
+)
+def test_a_table_that_cannot_be_a_recording_is_refused_in_words(table, message):
+    with pytest.raises(ParameterError, match=message):
+        Recording.from_table(table, patterns=EDGE, unit="V")
+
+
+def test_patterns_take_lists_and_numpy_numbers_as_they_take_tuples_and_floats():
+    assert Disc([0, 0], np.float32(40)) == Disc((0.0, 0.0), 40.0)
+    assert Polygon(np.array([[0, 0], [1, 0], [0, 1]])) == Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+    assert repr(Quadrant([0, 0], [1, -1])) == repr(Quadrant((0.0, 0.0), (1, -1)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: HalfPlane("0", 0), "normal_rad is '0'; allowed: a finite number"),
+        (lambda: HalfPlane(0.0, None), "offset_mm is None; allowed: a finite number"),
+        (lambda: Disc(0.0, 40.0), r"center_mm is 0.0; allowed: two finite numbers \(x, y\)"),
+        (lambda: Disc((0.0, 0.0), -1.0), "radius_mm is -1.0; allowed: a number greater than 0"),
+        (lambda: Disc(40.0, (0.0, 0.0)), "radius_mm is|center_mm is"),
+        (lambda: Polygon([(0, 0), (1, 1)]), "allowed: three corners"),
+        (lambda: Polygon("abc"), "vertices_mm is 'abc'; allowed: three corners"),
+        (lambda: Quadrant((0, 0), (0, 1)), r"direction is .*; allowed: \(1, 1\)"),
+        (lambda: Stripes(0.0, 8.0, 50, 0.0), "duty is 50.0; allowed: a number from 0 to 1"),
+        (lambda: Stripes(0.0, 0.0, 0.5, 0.0), "period_mm is 0.0"),
+        (lambda: Uniform([1.0]), r"albedo is \[1.0\]; allowed: a finite number"),
+        (lambda: Instrumentation(unit=3), "unit is 3; allowed: a text"),
+        (lambda: Instrumentation(height_mm="14"), "height_mm is '14'; allowed: a number or None"),
+        (lambda: Plan.from_arrays(x_mm=0, y_mm=0, patterns=EDGE, unit="V", orientation_rad="90"), "orientation_rad is"),
+    ],
+)
+def test_a_pattern_or_an_instrumentation_of_the_wrong_kind_is_refused_in_words(make, message):
+    with pytest.raises(ParameterError, match=message):
+        make()

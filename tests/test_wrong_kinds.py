@@ -1,0 +1,264 @@
+"""What a newcomer gets wrong first is said in words, where it is made: never a KeyError or a TypeError from below."""
+
+import numpy as np
+import pytest
+
+import probewise
+from probewise.arm import Pose, Reading, SimulatedArm
+from probewise.calibration import FittedSensor
+from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
+from probewise.experiment import Experiment, experiment_for, explore, shape_named
+from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
+from probewise.nested import diversify, run
+from probewise.priors import Joint, LogUniform, Normal, Product, Uniform
+from probewise.recordings import HalfPlane, Plan, Recording
+from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, Rectangle, RegularPolygon
+from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture, NaiveSensor
+from probewise.world import Blob, World, gaussian_spot
+
+RNG = np.random.default_rng(0)
+EDGE = HalfPlane(0.0, 0.0)
+RECORDING = Recording.from_arrays(
+    x_mm=np.linspace(-20, 20, 30), y_mm=0, readings=np.linspace(10, 60, 30), patterns={"edge": EDGE}, unit="LEGO"
+)
+PLAN = RECORDING.plan
+# The pattern is named, and nobody says what it is.
+UNDESCRIBED = Recording(
+    Plan(
+        PLAN.x_mm, PLAN.y_mm, PLAN.orientation_rad, PLAN.time_s, PLAN.scan, PLAN.scan_names, PLAN.pattern, ("edge",), {}
+    ),
+    RECORDING.readings,
+)
+CIRCLE = Circle()
+MIXTURE = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
+MODEL = Chain(MIXTURE, FixedLevels(10.0, 60.0), HypothesisScene(CIRCLE))
+SENSOR = FittedSensor(
+    names=("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max"),
+    samples=np.tile([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0], (500, 1)),
+    n_gaussians=1,
+    noise_sd=np.full(500, 0.6),
+    field=probewise.sensor.SSFField(np.ones((5, 5)), 1.0, (-2.0, -2.0)),
+    instrumentation=PLAN.instrumentation,
+)
+EXPERIMENT = Experiment(CIRCLE, MODEL, GaussianKnown(0.7), 0.7)
+ARM = SimulatedArm(lambda pose, time_s, height_mm: 10.0)
+
+
+class Frame:
+    """Stands for a data frame, of many lines."""
+
+    def __repr__(self):
+        return "   x_mm  reading\n" + "0  -10.0  0.4\n" * 60
+
+
+class Bell:
+    prior = Product({"x": Uniform(-5.0, 5.0), "y": Uniform(-5.0, 5.0)})
+
+    def __init__(self, log_likelihood=None):
+        self.log_likelihood = log_likelihood or (lambda theta: -0.5 * (theta**2).sum(axis=1))
+
+
+class NoPrior(Bell):
+    prior = {"x": (0, 1)}  # noqa: RUF012
+
+
+A_GENERATOR = r"allowed: a NumPy random generator: np.random.default_rng\("
+A_RECORDING = "allowed: a Recording: read_recording"
+A_PLAN = "allowed: a Plan: read_plan"
+A_SENSOR = "allowed: a FittedSensor: read_sensor"
+
+MISTAKES = {
+    # randomness
+    "a seed to calibrate": (lambda: probewise.calibrate(RECORDING, rng=0), r"rng is 0; .*default_rng\(0\)"),
+    "another seed": (lambda: probewise.diagnose(RECORDING, rng=42), r"rng is 42; .*default_rng\(42\)"),
+    "no generator": (lambda: probewise.explore(SENSOR, rng=None), f"rng is None; {A_GENERATOR}"),
+    "a module": (lambda: run(Bell(), rng=np.random), A_GENERATOR),
+    "a legacy state": (lambda: run(Bell(), rng=np.random.RandomState(0)), A_GENERATOR),
+    "a seed to samples": (lambda: EXPERIMENT and diversify([[0.0, 0.0]], Bell(), rng=1), r"default_rng\(1\)"),
+    "a seed to the engine": (lambda: probewise.diagnosis.diagnose(RECORDING, rng=0), A_GENERATOR),
+    "a seed to a run": (lambda: list(explore(ARM, EXPERIMENT, rng=0)), A_GENERATOR),
+    # calibrate
+    "a path": (lambda: probewise.calibrate("mine.csv", rng=RNG), f"recording is 'mine.csv'; {A_RECORDING}"),
+    "a table": (lambda: probewise.calibrate(Frame(), rng=RNG), f"{A_RECORDING}"),
+    "None": (lambda: probewise.calibrate(None, rng=RNG), f"recording is None; {A_RECORDING}"),
+    "a plan": (lambda: probewise.calibrate(PLAN, rng=RNG), A_RECORDING),
+    "several": (lambda: probewise.calibrate([RECORDING], rng=RNG), A_RECORDING),
+    "an unknown pattern": (lambda: probewise.calibrate(UNDESCRIBED, rng=RNG), "'edge' is named but not described"),
+    "one order": (lambda: probewise.calibrate(RECORDING, orders=2, rng=RNG), "orders is 2; allowed: one or more whole"),
+    "orders as text": (lambda: probewise.calibrate(RECORDING, orders="12", rng=RNG), "orders is '12'"),
+    "half an order": (lambda: probewise.calibrate(RECORDING, orders=[1.5], rng=RNG), r"orders is \(1.5,\)"),
+    "live points as text": (lambda: probewise.calibrate(RECORDING, n_live="300", rng=RNG), "n_live is '300'; allowed"),
+    "half a live point": (lambda: probewise.calibrate(RECORDING, n_live=99.5, rng=RNG), "n_live is 99.5; allowed"),
+    # predict
+    "swapped": (lambda: probewise.predict(PLAN, SENSOR), "sensor is .*order predict"),
+    "a sensor's path": (lambda: probewise.predict("sensor.json", PLAN), f"sensor is 'sensor.json'; {A_SENSOR}"),
+    "places": (lambda: probewise.predict(SENSOR, [(0, 0)]), f"plan is .*; {A_PLAN}"),
+    "a plan's path": (lambda: probewise.predict(SENSOR, "plan.csv"), f"plan is 'plan.csv'; {A_PLAN}"),
+    "an unknown pattern to predict": (lambda: probewise.predict(SENSOR, UNDESCRIBED), "'edge' is named but not"),
+    "readings twice": (
+        lambda: probewise.calibration.predict(SENSOR, RECORDING, RECORDING.readings),
+        "none beside a recording",
+    ),
+    # audit
+    "a path to audit": (lambda: probewise.audit("plan.csv"), f"plan is 'plan.csv'; {A_PLAN}"),
+    "a table to audit": (lambda: probewise.audit(Frame()), A_PLAN),
+    "a sensor's path to audit": (lambda: probewise.audit(PLAN, sensor="s.json"), f"sensor is 's.json'; {A_SENSOR}"),
+    "an unknown pattern to audit": (lambda: probewise.audit(UNDESCRIBED), "'edge' is named but not described"),
+    # diagnose
+    "a path to diagnose": (lambda: probewise.diagnose("mine.csv", rng=RNG), A_RECORDING),
+    "paths to diagnose": (lambda: probewise.diagnose(["a.csv", "b.csv"], rng=RNG), f"'a.csv'; {A_RECORDING}"),
+    "a table to diagnose": (lambda: probewise.diagnose(Frame(), rng=RNG), A_RECORDING),
+    "nothing to diagnose": (lambda: probewise.diagnose([], rng=RNG), r"recordings is \(\); allowed: one or more"),
+    "an unknown pattern to diagnose": (lambda: probewise.diagnose(UNDESCRIBED, rng=RNG), "'edge' is named but not"),
+    "a sensor's path to diagnose": (lambda: probewise.diagnose(RECORDING, sensor="s.json", rng=RNG), A_SENSOR),
+    # explore
+    "a path to explore": (lambda: probewise.explore("s.json", rng=RNG), f"sensor is 's.json'; {A_SENSOR}"),
+    "a recording to explore": (lambda: probewise.explore(RECORDING, rng=RNG), A_SENSOR),
+    "an unknown shape": (
+        lambda: probewise.explore(SENSOR, shape="heart", rng=RNG),
+        "shape is 'heart'; allowed: one of",
+    ),
+    "a class of shapes": (lambda: probewise.explore(SENSOR, shape=Circle, rng=RNG), r"a value of it is Circle\("),
+    "no shape": (lambda: probewise.explore(SENSOR, shape=None, rng=RNG), "shape is None; allowed: a shape such as"),
+    "a size as field": (lambda: probewise.explore(SENSOR, field=(1048, 520), rng=RNG), r"allowed: a Field: Field\("),
+    "an unknown model": (lambda: probewise.explore(SENSOR, model="SSF", rng=RNG), "model is 'SSF'; allowed: 'ssf' or"),
+    "an unknown utility": (lambda: probewise.explore(SENSOR, utility="bits", rng=RNG), "utility is 'bits'; allowed"),
+    "a number as utility": (lambda: probewise.explore(SENSOR, utility=3, rng=RNG), "utility is 3; allowed: a utility"),
+    "readings as text": (lambda: probewise.explore(SENSOR, max_readings="9", rng=RNG), "max_readings is '9'; allowed"),
+    "a port as arm": (
+        lambda: probewise.explore(SENSOR, arm="nxt:COM5", rng=RNG),
+        "arm is 'nxt:COM5'; allowed: an Inst",
+    ),
+    "swapped to run": (lambda: list(explore(EXPERIMENT, ARM, rng=RNG)), "instrument is .*; allowed: an Instrument"),
+    "no experiment": (lambda: list(explore(ARM, CIRCLE, rng=RNG)), "experiment is .*; allowed: an Experiment"),
+    "swapped to pose": (lambda: experiment_for(CIRCLE, SENSOR, Field()), "sensor is .*in the order experiment_for"),
+    "a shape that is none": (lambda: shape_named(["blob"], Field()), "shape is 'blob'; allowed: one of circle"),
+    "a number as likelihood": (lambda: Experiment(CIRCLE, MODEL, 0.7, 0.7), "likelihood is 0.7; allowed: a likelihood"),
+    "swapped experiment": (lambda: Experiment(MODEL, CIRCLE, GaussianKnown(1), 0.7), "shape is .*; allowed: a shape"),
+    # nested sampling
+    "a function as problem": (lambda: run(lambda theta: 0.0, rng=RNG), "allowed: a value with a prior and a log_likel"),
+    "a class as problem": (lambda: run(Bell, rng=RNG), r"this is the class, a value of it is Bell\("),
+    "a dict as prior": (lambda: run(NoPrior(), rng=RNG), "problem.prior is .*; allowed: a prior of named parameters"),
+    "a scalar likelihood": (
+        lambda: run(Bell(lambda theta: -0.5 * float((theta**2).sum())), rng=RNG),
+        r"returned shape \(\); allowed: \(300,\), one number per hypothesis: theta is a batch of shape \(300, 2\)",
+    ),
+    "a likelihood of one": (
+        lambda: run(Bell(lambda theta: -abs(theta[2])), rng=RNG, n_live=20),
+        r"theta is a batch of shape|a batch theta of shape \(20, 2\)",
+    ),
+    "a text as likelihood": (lambda: run(Bell(lambda theta: "high"), rng=RNG), "what are no numbers"),
+    "live points in quotes": (lambda: run(Bell(), rng=RNG, n_live="100"), "n_live is '100'; allowed: a whole number"),
+    "no live point": (lambda: run(Bell(), rng=RNG, n_live=0), "n_live is 0; allowed: 10 or more"),
+    # priors
+    "bounds for a distribution": (
+        lambda: Product({"a": (0, 1)}),
+        r"marginals\['a'\] is \(0, 1\); .*Uniform\(low, high",
+    ),
+    "a number for one": (lambda: Product({"a": 1.0}), r"marginals\['a'\] is 1.0; allowed: a distribution"),
+    "a class for one": (lambda: Product({"a": Uniform}), r"a value of it is Uniform\("),
+    "a list of them": (lambda: Product([Uniform(0, 1)]), "marginals is .*; allowed: distributions by name"),
+    "a number as name": (lambda: Product({1: Uniform(0, 1)}), "name of a marginal is 1; allowed: a text"),
+    "a marginal to join": (lambda: Joint((Uniform(0, 1),)), r"parts\[0\] is .*; allowed: a prior of named parameters"),
+    "a prior to join": (lambda: Joint(Bell.prior), "parts is .*; allowed: priors: Joint"),
+    "bounds as text": (lambda: Uniform("0", "1"), "low is '0'; allowed: a number"),
+    "bounds as a pair": (lambda: Uniform((0, 1), None), r"low is \(0, 1\); allowed: a number"),
+    "swapped bounds": (lambda: Uniform(1, 0), "low < high"),
+    "a scale as text": (lambda: LogUniform(1, "10"), "high is '10'; allowed: a number"),
+    "no sd": (lambda: Normal(0.0, None), "sd is None; allowed: a number"),
+    "parameters as text": (lambda: Bell.prior.log_prob("x"), "parameters is 'x'; allowed: numbers"),
+    "one hypothesis": (lambda: Bell.prior.log_prob([1.0, 2.0]), r"allowed: \(n_samples, 2\) for \('x', 'y'\)"),
+    # poses and readings
+    "a reading swapped": (
+        lambda: Reading(Pose(0, 0), 3.0, 0.0),
+        r"value is Pose\(.*order Reading\(value, pose, time_s",
+    ),
+    "a pair as its pose": (lambda: Reading(3.0, (0, 0), 0.0), r"pose is \(0, 0\); allowed: a Pose: Pose\(x_mm, y_mm"),
+    "a text as its value": (lambda: Reading("3", Pose(0, 0), 0.0), "value is '3'; allowed: a number"),
+    "no time": (lambda: Reading(3.0, Pose(0, 0), None), "time_s is None; allowed: a number"),
+    "a pair in a pose": (lambda: Pose((1.0, 2.0), 0.0), r"x_mm is \(1.0, 2.0\); allowed: a number"),
+    "a text in a pose": (lambda: Pose("1", 0.0), "x_mm is '1'; allowed: a number"),
+    "a pair to measure": (lambda: ARM.measure((500.0, 200.0)), r"pose is \(500.0, 200.0\); allowed: a Pose"),
+    "one place": (lambda: ARM.reachable([500.0, 200.0]), r"places_mm has shape \(2,\); allowed: \(n_places, 2\)"),
+    "a world as light": (
+        lambda: SimulatedArm(World(gaussian_spot([Blob(1.0, (0.0, 0.0), (4.0, 4.0))]))),
+        r"allowed: a function light\(pose, time_s, height_mm\)",
+    ),
+    "light without a number": (
+        lambda: SimulatedArm(lambda pose, time_s, height_mm: None).measure(Pose(500.0, 200.0)),
+        "what light returned is None; allowed: a number",
+    ),
+    # recordings and plans
+    "arrays as plan": (lambda: Recording(np.zeros(3), np.zeros(3)), f"plan is .*; {A_PLAN}"),
+    "a swapped recording": (lambda: Recording(RECORDING.readings, PLAN), f"plan is .*; {A_PLAN}"),
+    "readings as texts": (lambda: Recording(PLAN, ["a"] * 30), "readings is .*; allowed: numbers"),
+    # scenes
+    "a radius": (lambda: Circle(radius_mm=90.0), r"radius_mm is 90.0; allowed: \(low, high\)"),
+    "a radius first": (lambda: Circle(90.0), r"field is 90.0; allowed: a Field: Field\("),
+    "sides as text": (lambda: Rectangle(sides_mm="40,300"), "sides_mm is '40,300'; allowed"),
+    "half a side": (lambda: RegularPolygon(5.5), "n_sides is 5.5; allowed: a whole number"),
+    "a field of texts": (lambda: Field("1048", "520"), "width_mm is '1048'; allowed: a number"),
+    "a list of shapes": (lambda: AnyOf([CIRCLE]), "shapes is .*; allowed: shapes by name"),
+    "classes of shapes": (lambda: AnyOf({"circle": Circle}), r"shapes\['circle'\] is .*a value of it is Circle\("),
+    "a class in a scene": (lambda: HypothesisScene(Circle), r"a value of it is Circle\("),
+    "a list of patterns": (lambda: KnownScene([EDGE]), "patterns is .*; allowed: patterns by name"),
+    # sensors
+    "a chain swapped": (lambda: Chain(MIXTURE, HypothesisScene(CIRCLE), FreeLevels()), "levels is .*order Chain"),
+    "a shape as scene": (lambda: Chain(MIXTURE, FreeLevels(), CIRCLE), "scene is .*; allowed: a scene such as"),
+    "no SSF": (lambda: Chain(2, FreeLevels(), HypothesisScene(CIRCLE)), "ssf is 2; allowed: an SSF such as"),
+    "a shape for the naive": (lambda: NaiveSensor(FreeLevels(), CIRCLE), "scene is .*; allowed: a scene such as"),
+    "a naive unknown pattern": (
+        lambda: NaiveSensor(FixedLevels(0, 1), KnownScene({"a": EDGE})).predict(np.empty((1, 0)), PLAN),
+        "'edge' is named but not described",
+    ),
+    "levels as text": (lambda: FixedLevels("10", 60), "i_min is '10'; allowed: a number"),
+    "one and a half Gaussians": (lambda: FreeMixture(1.5), "n_gaussians is 1.5; allowed: a whole number"),
+    "weights as text": (lambda: FixedMixture("1", [[0, 0]], [np.eye(2)]), "weights is '1'; allowed: numbers"),
+    # likelihoods and problems
+    "an sd as text": (lambda: GaussianKnown("0.7"), "sd is '0.7'; allowed: numbers"),
+    "a level as text": (lambda: Naive("10", 1, 60, 1), "mu_black is '10'; allowed: a number"),
+    "a step as text": (lambda: Rounded(0.7, "1"), "step is '1'; allowed: a number"),
+    "an sd for a likelihood": (lambda: SensorProblem(CIRCLE.prior, MODEL, 0.7, RECORDING), "likelihood is 0.7"),
+    "a shape for a prior": (lambda: SensorProblem(CIRCLE, MODEL, GaussianKnown(1), RECORDING), "prior is .*; allowed"),
+    "readings for a recording": (
+        lambda: SensorProblem(CIRCLE.prior, MODEL, GaussianKnown(1), RECORDING.readings),
+        A_RECORDING,
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_a_mistake_is_said_in_words(make, message):
+    with pytest.raises(ProbewiseError, match=message) as raised:
+        make()
+    assert isinstance(raised.value, ValueError | NotConvergedError)
+    assert "\n" not in str(raised.value)
+    assert len(str(raised.value)) < 420
+
+
+def test_lists_are_taken_where_arrays_are_meant():
+    theta = [[0.5, 0.5]]
+    assert Bell.prior.log_prob(theta) == pytest.approx(-2 * np.log(10.0))
+    for likelihood in (
+        GaussianKnown(1.0),
+        Naive(10.0, 1.0, 60.0, 1.0),
+        Rounded(1.0),
+        StudentT(np.zeros(2, dtype=int), 0.1, 10.0),
+    ):
+        expected = likelihood.log_prob(np.array([10.0, 60.0]), np.array([[10.0, 60.0]]))
+        assert likelihood.log_prob([10, 60], [[10, 60]]).tolist() == expected.tolist()
+    assert ARM.reachable([[500, 200]]).tolist() == [True]
+    moved, _ = diversify([[0.1, 0.2], [0.3, 0.4]], Bell(), rng=np.random.default_rng(0), n_steps=2)
+    assert moved.shape == (2, 2)
+
+
+def test_numbers_of_numpy_are_numbers():
+    pose = Pose(np.float32(1.5), np.int64(2), np.array(0.5))
+    assert (pose.x_mm, pose.y_mm, pose.orientation_rad) == (1.5, 2.0, 0.5)
+    assert type(pose.x_mm) is float
+
+
+def test_a_long_value_is_cut_short_in_its_message_and_kept_whole_in_the_error():
+    error = ParameterError("x", list(range(1000)), "short")
+    assert str(error).endswith("... (list); allowed: short")
+    assert len(error.value) == 1000

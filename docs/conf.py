@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import io
+import tomllib
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -42,7 +44,10 @@ html_theme = "furo"
 html_title = f"probewise {__version__}"
 html_static_path = ["_static"]
 
+LEADS: dict[str, list[str]] = tomllib.loads((HERE / "reference" / "leads.toml").read_text(encoding="utf-8"))
+
 autosummary_generate = True
+autosummary_context = {"leads": LEADS}
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
@@ -70,6 +75,17 @@ def write_help(app: object) -> None:
         (folder / f"{name.replace(' ', '-') or 'probewise'}.txt").write_text(text.getvalue(), encoding="utf-8")
 
 
+def lead_with_what_people_call(app: object) -> None:
+    """Order the public names of a package, which its page follows: first what people call, then the helpers."""
+    for package, first in LEADS.items():
+        module = importlib.import_module(package)
+        unknown = sorted(set(first) - set(module.__all__))
+        if unknown:
+            raise ValueError(f"docs/reference/leads.toml: {package} has no public name {unknown[0]}")
+        module.__all__ = [*first, *(name for name in module.__all__ if name not in first)]
+
+
 def setup(app: object) -> None:
-    """Write the help texts before the pages are read."""
+    """Prepare what the pages are made of before they are read."""
     app.connect("builder-inited", write_help)  # type: ignore[attr-defined]
+    app.connect("builder-inited", lead_with_what_people_call)  # type: ignore[attr-defined]

@@ -1,10 +1,12 @@
 """What `import probewise` offers: one call for each verb, with the defaults and the results of the command line."""
 
 import argparse
+import importlib
 import inspect
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +59,13 @@ def test_every_package_that_is_documented_is_offered():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "api.rst").read_text()
     listed = {line.strip().split(".")[1] for line in page.splitlines() if line.strip().startswith("probewise.")}
     assert {"nested", "calibration", "diagnosis"} <= listed <= set(dir(probewise))
+
+
+def test_what_the_api_pages_lead_with_is_public():
+    leads = tomllib.loads((Path(__file__).parents[2] / "docs" / "reference" / "leads.toml").read_text())
+    assert "run" in leads["probewise.nested"]
+    for package, names in leads.items():
+        assert set(names) <= set(importlib.import_module(package).__all__), package
 
 
 DESTINATIONS = {

@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from probewise import scene
     from probewise.arm import Instrument
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis, PlanAudit
     from probewise.experiment import Exploration, Model, Step, Truth
     from probewise.inquiry import Utility
     from probewise.recordings import Plan, Prediction, Recording
-    from probewise.scene import Field, Shape
+    from probewise.scene import Shape
 
 __all__ = [
     "MAX_READINGS",
@@ -140,7 +141,7 @@ def explore(
     shape: str | Sequence[str] | Shape = SHAPE,
     truth: Truth | None = None,
     arm: Instrument | None = None,
-    field: Field | None = None,
+    field: scene.Field | None = None,
     model: Model = MODEL,
     utility: str | Utility = UTILITY,
     learn_sensor: bool = False,

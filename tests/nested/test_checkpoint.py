@@ -608,7 +608,7 @@ def _with_nan(theta: np.ndarray) -> np.ndarray:
         (lambda t: np.zeros((len(t), 1)), r"shape \(\d+, 1\); allowed: \(\d+,\).*p0 = 0\.\d+, p1 = 0\.\d+"),
         (lambda t: 0.0, r"shape \(\); allowed: \(\d+,\).*p0 = 0\.\d+"),
         (lambda t: ["low"] * len(t), r"no numbers \(could not convert string.*p0 = 0\.\d+"),
-        (lambda t: 1 / 0, r"raised ZeroDivisionError: division by zero; first of the \d+ .* p0 = 0\.\d+"),
+        (lambda t: 1 / 0, r"raised ZeroDivisionError: division by zero; .*first of the \d+ .* p0 = 0\.\d+"),
         (lambda t: next(iter(())), r"raised RuntimeError: generator raised StopIteration; .*p0 = 0\.\d+"),
     ],
 )

@@ -397,9 +397,7 @@ class Recording(ShowsItself):
         columns = columns_of(table)
         missing = [name for name in ("reading", "x_mm", "y_mm") if name not in columns]
         if missing:
-            raise ParameterError(
-                "columns", tuple(columns), f"also {', '.join(missing)}; rename the table's columns"
-            )
+            raise ParameterError("columns", tuple(columns), f"also {', '.join(missing)}; rename the table's columns")
         turn_deg, turn_rad = columns.get("orientation_deg"), columns.get("orientation_rad", 0.0)
         if turn_deg is not None:
             if "orientation_rad" in columns:

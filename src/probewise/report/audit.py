@@ -8,11 +8,11 @@ from probewise.diagnosis import PlanAudit
 from probewise.diagnosis.audit.detectability import ALIAS, LAMBDA, LEAST_NATS
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import audit_matrix, png
+from probewise.report.plots import AxesGrid, audit_matrix, png
 from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, number, readable
 
-__all__ = ["answer", "figures", "write_page"]
+__all__ = ["answer", "figures", "picture", "write_page"]
 
 
 def answer(audit: PlanAudit) -> str:
@@ -28,8 +28,13 @@ def answer(audit: PlanAudit) -> str:
 
 def figures(audit: PlanAudit) -> dict[str, bytes]:
     """Draw the figure of an audit: PNG by file name."""
+    return {"audit.png": png(picture(audit))}
+
+
+def picture(audit: PlanAudit) -> AxesGrid:
+    """Draw what the plan sees of every effect, and what it cannot tell apart."""
     names, sights = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
-    return {"audit.png": png(audit_matrix(names, sights, audit.cosines, alias=ALIAS))}
+    return audit_matrix(names, sights, audit.cosines, alias=ALIAS)
 
 
 def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:

@@ -113,14 +113,15 @@ def _(value: Exploration) -> str:
 def _(value: Prediction) -> str:
     recording = Recording(value.plan, value.readings)
     drawn = predicted_against_recorded(recording, value.mean, value.sd)
-    return _card(paragraph(value.summary()), figure(png(drawn, dpi=DPI), "Predicted readings, each with its 95 % band"))
+    said = value.summary().replace("\n", "; ")
+    return _card(paragraph(said), figure(png(drawn, dpi=DPI), "Predicted readings, each with its 95 % band"))
 
 
 @render_html.register
 def _(value: PlanAudit) -> str:
-    (drawn,) = audit_report.figures(value).values()
-    cures = Markup(f"<pre>{html.escape(value.summary())}</pre>")
-    return _card(paragraph(audit_report.answer(value)), figure(drawn, "What the plan sees and tells apart"), cures)
+    drawn = png(audit_report.picture(value), dpi=DPI)
+    text = Markup(f"<pre>{html.escape(value.summary())}</pre>")
+    return _card(paragraph(audit_report.answer(value)), figure(drawn, "What the plan sees and tells apart"), text)
 
 
 @render_html.register

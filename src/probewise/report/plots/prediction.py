@@ -60,7 +60,8 @@ def _draw_track(ax: Axes, recording: Recording, track: Track, mean: FloatArray, 
     rows, along = track.rows[order], track.along_mm[order]
     ok = recording.usable[rows]
     ax.fill_between(along, mean[rows] - 1.96 * sd[rows], mean[rows] + 1.96 * sd[rows], color=GREY, alpha=0.35, lw=0)
-    ax.plot(along[ok], recording.readings[rows][ok], ".", color=VERMILLION, markersize=3.5, label="recorded")
+    if ok.any():
+        ax.plot(along[ok], recording.readings[rows][ok], ".", color=VERMILLION, markersize=3.5, label="recorded")
     ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted, 95 %")
 
 

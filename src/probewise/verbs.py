@@ -222,6 +222,8 @@ def explore(
     >>> len(run.readings)
     2
     """
+    from pathlib import Path
+
     from tqdm import tqdm
 
     from probewise import experiment as posing
@@ -248,9 +250,10 @@ def explore(
         repeats=tuple(repeats),
     )
     streams, hidden = posing.Streams.of(rng), None
+    before = posing.read_journal(journal) if journal is not None and Path(journal).exists() else None
     if arm is None:
         hidden = posing.Hidden.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
-        taken = posing.readings_of(journal)
+        taken = () if before is None else before.readings
         arm = posing.arm_over(posing.world_like(sensor), hidden.surface, field, seed=streams.noise, taken=taken)
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
@@ -266,7 +269,7 @@ def explore(
             asked,
             rng=streams.run,
             max_readings=max_readings,
-            journal=journal,
+            journal=journal if before is None else before,
             progress=show,
             hidden=hidden,
         )

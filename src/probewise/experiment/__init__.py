@@ -10,7 +10,6 @@ from probewise.experiment.journal import (
     Journal,
     JournalWriter,
     read_journal,
-    readings_of,
     recording_of,
     require_same_settings,
 )
@@ -59,7 +58,6 @@ __all__ = [
     "least_readings",
     "members_of",
     "read_journal",
-    "readings_of",
     "recording_of",
     "require_same_settings",
     "run",

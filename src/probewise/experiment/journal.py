@@ -43,7 +43,6 @@ __all__ = [
     "Journal",
     "JournalWriter",
     "read_journal",
-    "readings_of",
     "recording_of",
     "require_same_settings",
 ]
@@ -140,11 +139,6 @@ def recording_of(
         instrumentation=Instrumentation() if instrumentation is None else instrumentation,
     )
     return Recording(plan, _column(readings, lambda r: r.value), source)
-
-
-def readings_of(path: str | Path | None) -> tuple[Reading, ...]:
-    """Give the readings that a journal holds; none where there is no journal yet."""
-    return () if path is None or not Path(path).exists() else read_journal(path).readings
 
 
 def _column(readings: Sequence[Reading], value: Any) -> FloatArray:

@@ -2,8 +2,8 @@
 The robot finds a circle
 ========================
 
-Shows the robot's view of the field as it chooses its own measurements: the entropy map in copper,
-50 circles drawn from the posterior in blue, readings as squares, the next place in green.
+Shows the robot's view of the field as it chooses its own measurements: what a reading would tell at each place,
+50 circles drawn from the posterior, the readings, and the next place.
 """
 
 # %%
@@ -14,7 +14,7 @@ from probewise.arm import SimulatedArm
 from probewise.experiment import Experiment, run
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
-from probewise.report import exploration
+from probewise.report import exploration, plots
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
@@ -44,5 +44,6 @@ places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
 # %%
 # The view in the middle of the search, and at its end.
 for n in (len(found.steps) // 2, len(found.steps)):
-    fig, ax = plt.subplots(figsize=(9, 5))
+    fig, ax = plt.subplots(figsize=(9, 5.4), layout="constrained")
     exploration.view(found.steps[n - 1], experiment, places[:n], levels=(10.0, 60.0), ax=ax)
+    plots.explain_field(ax)

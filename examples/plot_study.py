@@ -11,8 +11,6 @@ import csv
 from pathlib import Path
 from types import SimpleNamespace
 
-import matplotlib.pyplot as plt
-
 from probewise.report.plots import readings_needed
 from probewise.study import Estimate
 
@@ -39,5 +37,4 @@ needed = {
     )
     for row in rows
 }
-_, axes = plt.subplots(1, 2, figsize=(9, 1.2 + 0.34 * len(needed)), sharey=True, squeeze=False, layout="constrained")
-readings_needed(needed, axes=axes)
+readings_needed(needed)

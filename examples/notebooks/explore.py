@@ -33,5 +33,5 @@ with robot:
 found
 
 # %%
-# What is believed in the end.
+# The posterior of the circle after the last reading, with its errors in a sentence.
 found.posterior

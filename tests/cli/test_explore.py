@@ -1,5 +1,6 @@
 """What `probewise explore` says of the choices it offers."""
 
+import csv
 import json
 import math
 from dataclasses import replace
@@ -72,7 +73,7 @@ def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, mon
         assert [step.reading.value for _, step, _ in views] == [line["reading"]] * 2
         (_, naive, _), (_, ssf, _) = views
         assert ssf.mean.tolist() == [line["belief"]["mean"][name] for name in ssf.names] != naive.mean.tolist()
-    assert "naive model makes of the same readings" in (tmp_path / "found" / "report.html").read_text()
+    assert "The SSF model chose the readings" in (tmp_path / "found" / "report.html").read_text()
 
 
 @pytest.fixture
@@ -141,3 +142,24 @@ def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behin
     said = capsys.readouterr().err
     assert "parameter is 'width_mm'; allowed: one of x_mm, y_mm, radius_mm" in said
     assert not list(tmp_path.glob("found/*"))
+
+
+def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path):
+    """Of a set of shapes the samples name theirs, and leave the parameters of the others empty."""
+    status, lines = explore("--shape", "circle", "rectangle", "--max-readings", 2)
+    assert status == 0
+    found = json.loads((tmp_path / "found" / "result.json").read_text(), parse_constant=pytest.fail)
+    assert (found["format"], found["readings"], found["known"]) == ("exploration/1", 2, False)
+    assert found["seconds"] == lines[-1]["time_s"]
+    assert found["shape"]["name"] in ("circle", "rectangle")
+    own = {"circle": {"x_mm", "y_mm", "radius_mm"}, "rectangle": {"x_mm", "y_mm", "width_mm", "height_mm", "angle_rad"}}
+    assert {p["name"] for p in found["shape"]["parameters"]} == own[found["shape"]["name"]]
+    with (tmp_path / "found" / "samples.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert sum(float(row["weight"]) for row in rows) == pytest.approx(1.0, abs=1e-3)
+    for row in rows:
+        names = {name for name, cell in row.items() if cell and name not in ("weight", "shape")}
+        assert {name.removeprefix(f"{row['shape']}.") for name in names} == own[row["shape"]]
+    share = sum(float(row["weight"]) for row in rows if row["shape"] == found["shape"]["name"])
+    assert found["shape"]["probability"] == pytest.approx(share, abs=1e-3)
+    assert found["chance_off_12mm"] >= 1 - share - 1e-3

@@ -105,6 +105,18 @@ def test_worth_a_second_prefers_the_near_place(made):
         PerSecond()(made.listed(APART, cost_s=[0.0, 1.0, 1.0]))
 
 
+def test_a_map_of_one_of_two_measures_says_which(made):
+    """Near the end the default shows probabilities, before that bits: a colour bar has one quantity."""
+    spread = np.array([2.0, 2.0, 4.5]) * np.random.default_rng(8).standard_normal((300, 3))
+    far = made.over_discs(made.chain(20), np.array([500.0, 250.0, 100.0]) + spread, grid=Grid(n_x=66, n_y=33))
+    near = replace(far, goal=Goal((0, 1, 2), 4.0))
+    assert utility_map(far, Finishing()).label == "expected information (bits)"
+    shown = utility_map(near, Finishing(least=1e-6))
+    assert shown.label == "probability that a reading there ends the run"
+    assert 0 < shown.highest <= 1
+    np.testing.assert_array_equal(shown.values[near.rows], Finishing(least=1e-6)(near))
+
+
 @pytest.mark.parametrize("least", [0.0, 1.5])
 def test_a_chance_that_is_none_is_refused(least):
     with pytest.raises(ParameterError, match="least"):

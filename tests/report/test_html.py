@@ -1,15 +1,24 @@
 """Pages are self-contained and escape what they are given."""
 
+import io
 import re
 from html.parser import HTMLParser
 
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, slideshow, table
 from probewise.report.words import count, number, probability, signed
 
-PNG = b"\x89PNG fake"
+
+def png(size, dpi=None):
+    out = io.BytesIO()
+    Image.new("RGB", size).save(out, "PNG", **({} if dpi is None else {"dpi": (dpi, dpi)}))
+    return out.getvalue()
+
+
+PNG = png((3, 2))
 
 
 class Reader(HTMLParser):
@@ -100,3 +109,10 @@ def test_a_slideshow_shows_its_last_picture_where_scripts_are_off():
     assert "<label hidden>" in made
     assert made.count("<script>") == 1
     assert "<script>" not in page("t", answer="a", key_figure=figure(PNG, "key"), sections=())
+
+
+def test_on_a_narrow_screen_a_picture_stays_large_enough_to_be_read():
+    """Drawn seven inches wide it is never shown narrower than nine tenths of that: it scrolls in its frame."""
+    assert "--least: 605px" in figure(png((770, 50), dpi=110), "seven inches")
+    style = page("t", answer="a", key_figure=figure(PNG, "k"), sections=[]).split("<style>")[1]
+    assert "min-width: var(--least" in style.partition("@media (max-width")[2]

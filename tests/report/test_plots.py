@@ -1,7 +1,5 @@
 """Figures show the data that they are given, and leave nothing behind."""
 
-import sys
-
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -105,9 +103,3 @@ def test_a_figure_returns_its_axes_and_renders(draw):
 def test_drawing_on_given_axes_makes_no_figure_of_its_own(recording):
     given = plots.grid_of_axes(1, 1, size_in=(4, 3))[0, 0]
     assert plots.readings_by_orientation(recording, ax=given) is given
-
-
-def test_figures_leave_no_global_state():
-    plots.posterior_widths({"a": np.array([5.0])})
-    pyplot = sys.modules.get("matplotlib.pyplot")
-    assert pyplot is None or pyplot.get_fignums() == []

@@ -68,15 +68,31 @@ def test_the_bound_stands_beside_what_was_measured(study):
 
 def test_each_curve_is_the_median_of_its_runs():
     widths = [np.array([100.0, 10.0, 2.0]), np.array([200.0, 50.0, 30.0, 3.0]), np.array([300.0, 3.0])]
-    ax = plots.widths_of_runs({"some": widths})
-    drawn = ax.lines[0].get_ydata()
+    axes = plots.widths_of_runs({"some": widths, "other": widths[:2]})
+    assert axes.shape == (1, 2)
+    for ax in axes.flat:
+        (own,) = (line for line in ax.lines if line.get_label() == "median")
+        (other,) = (line for line in ax.lines if line.get_label() == "median of another panel")
+        assert own.get_linewidth() > other.get_linewidth()
+    (median,) = (line for line in axes[0, 0].lines if line.get_label() == "median")
     # A run that has ended stays at its last width.
-    np.testing.assert_allclose(drawn, [200.0, 10.0, 3.0, 3.0])
-    assert "mm" in ax.get_ylabel()
+    np.testing.assert_allclose(median.get_ydata(), [200.0, 10.0, 3.0, 3.0])
+    assert "mm" in axes[0, 0].get_ylabel()
 
 
 def test_what_rows_need_is_drawn_with_its_bounds(study):
     axes = plots.readings_needed({row.name: found for row, found in study.table().items()})
     assert [text.get_text() for text in axes[0, 0].get_yticklabels()] == [row.name for row in ROWS]
     assert len(axes[0, 0].containers) == 2
+    low, high = sorted(axes[0, 0].get_ylim())
+    assert low <= -0.5
+    assert high >= len(ROWS) - 0.5
     assert len(axes[0, 1].containers) == 1
+
+
+def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
+    one = Study({ROWS[1]: study.trials[ROWS[1]]}, 40)
+    page = report.write_page(one, command="probewise study --model naive")
+    assert "<tbody></tbody>" not in page
+    assert max(head.count("<th ") for head in page.split("<thead>")[1:]) <= 7
+    assert report.table_of_bounds(one) is None

@@ -10,6 +10,7 @@ from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, poole
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import PriorRow, ScanGeometry, SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
+from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 
 __all__ = [
     "Calibration",
@@ -17,6 +18,7 @@ __all__ = [
     "OrderEvidence",
     "OrderFit",
     "PriorRow",
+    "Quantity",
     "SSFPrior",
     "ScanGeometry",
     "ScanNoise",
@@ -33,5 +35,6 @@ __all__ = [
     "problem_for",
     "read_sensor",
     "scan_geometry",
+    "ssf_quantities",
     "write_sensor",
 ]

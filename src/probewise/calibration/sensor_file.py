@@ -20,6 +20,7 @@ from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
+from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
 from probewise.recordings import Instrumentation, strict_json, write_text_atomically
@@ -237,6 +238,14 @@ class FittedSensor(ShowsItself):
         """Posterior standard deviation by parameter."""
         return dict(zip(self.names, self.samples.std(axis=0).tolist(), strict=True))
 
+    def median(self) -> dict[str, float]:
+        """Posterior median by parameter: unlike the mean, no single sample far off moves it."""
+        return dict(zip(self.names, np.median(self.samples, axis=0).tolist(), strict=True))
+
+    def ssf(self) -> tuple[Quantity, ...]:
+        """Sum up the SSF by its centre, widths and angle; of a few Gaussians also each of them."""
+        return ssf_quantities(self.samples, self.n_gaussians, each=not self.free_form)
+
     def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
         """Central interval of each parameter that holds `mass`."""
         if not 0 < mass < 1:
@@ -263,14 +272,13 @@ class FittedSensor(ShowsItself):
                 for o in self.orders
             ]
         told = [name for name in self.names if name not in bending]
-        width = max(9, *(len(name) for name in told))
-        lines.append(f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval")
-        mean, sd, interval = self.mean(), self.sd(), self.interval()
-        lines += [
-            f"{name:<{width}}  {mean[name]:>11.5g}  {sd[name]:>11.3g}  {interval[name][0]:.5g} to "
-            f"{interval[name][1]:.5g}"
-            for name in told
-        ]
+        quantities = self.ssf()
+        width = max(9, *(len(name) for name in (*told, *(q.name for q in quantities))))
+        lines.append(f"{'parameter':<{width}}  {'median':>11}  95 % interval")
+        median, interval = self.median(), self.interval()
+        rows = [(q.name, q.median, q.interval95) for q in quantities]
+        rows += [(name, median[name], interval[name]) for name in told]
+        lines += [f"{name:<{width}}  {value:>11.5g}  {low:.5g} to {high:.5g}" for name, value, (low, high) in rows]
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
     def _how_often(self, effect: str) -> str:
@@ -279,7 +287,7 @@ class FittedSensor(ShowsItself):
 
     def to_json(self) -> str:
         """Write the sensor as strict JSON, format "sensor/1"."""
-        mean, sd, interval = self.mean(), self.sd(), self.interval()
+        mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
         document = {
             "format": FORMAT,
             "version": self.version,
@@ -287,9 +295,17 @@ class FittedSensor(ShowsItself):
             "instrumentation": asdict(self.instrumentation),
             "n_gaussians": self.n_gaussians,
             "parameters": [
-                {"name": n, "unit": self.unit(n), "mean": mean[n], "sd": sd[n], "interval95": list(interval[n])}
+                {
+                    "name": n,
+                    "unit": self.unit(n),
+                    "mean": mean[n],
+                    "sd": sd[n],
+                    "median": median[n],
+                    "interval95": list(interval[n]),
+                }
                 for n in self.names
             ],
+            "ssf": [asdict(quantity) for quantity in self.ssf()],
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},

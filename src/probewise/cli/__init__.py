@@ -68,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stop.code if isinstance(stop.code, int) else 2
     arguments.words = words
     verb = next(v for v in VERBS if v.name == arguments.verb)
+    os.environ["MPLBACKEND"] = "Agg"  # pictures go to files: no window, and no display needed
     with warnings.catch_warnings():
         warnings.showwarning = _one_line_warning
         try:

@@ -208,6 +208,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
         write_text_atomically(stage / "report.html", page)
         write_bytes_atomically(stage / "run.gif", gif(frames))
+        write_text_atomically(stage / "result.json", posing.result_json(result))
+        write_text_atomically(stage / "samples.csv", posing.samples_csv(result))
     say(result.summary(), quiet=arguments.quiet)
     if known is not None:
         say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)

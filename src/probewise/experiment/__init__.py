@@ -3,6 +3,7 @@
 from probewise.experiment.asking import Field
 from probewise.experiment.beside import beside
 from probewise.experiment.digest import value_digest
+from probewise.experiment.found import OFF_MM, FoundParameter, FoundShape, found_shape, result_json, samples_csv
 from probewise.experiment.hidden import Hidden, Truth, members_of
 from probewise.experiment.journal import (
     Belief,
@@ -13,6 +14,7 @@ from probewise.experiment.journal import (
     recording_of,
     require_same_settings,
 )
+from probewise.experiment.judging import chance_off
 from probewise.experiment.learning import AdjustedMixture, Change, sensor_prior
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
@@ -32,6 +34,7 @@ from probewise.experiment.start import run_from
 from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 
 __all__ = [
+    "OFF_MM",
     "PAPER_BITS",
     "SHAPES",
     "AdjustedMixture",
@@ -41,6 +44,8 @@ __all__ = [
     "Experiment",
     "Exploration",
     "Field",
+    "FoundParameter",
+    "FoundShape",
     "Hidden",
     "Journal",
     "JournalWriter",
@@ -53,15 +58,19 @@ __all__ = [
     "arm_over",
     "begin",
     "beside",
+    "chance_off",
     "experiment_for",
     "explore",
+    "found_shape",
     "least_readings",
     "members_of",
     "read_journal",
     "recording_of",
     "require_same_settings",
+    "result_json",
     "run",
     "run_from",
+    "samples_csv",
     "sensor_prior",
     "shape_named",
     "shape_of",

@@ -15,7 +15,7 @@ from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.scene.shapes import AnyOf
 
-__all__ = ["doubt", "fit", "information", "learnt", "moments", "stop_reason"]
+__all__ = ["chance_off", "doubt", "fit", "information", "learnt", "moments", "stop_reason"]
 
 
 def information(posterior: Weighted) -> float:
@@ -43,6 +43,23 @@ def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, Fl
     mean[columns] = given @ own
     sd[columns] = np.sqrt(given @ (own - mean[columns]) ** 2)
     return mean, sd, dict(zip(experiment.shape.labels, (float(p) for p in share / share.sum()), strict=True))
+
+
+def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
+    """Probability that a length is farther than `off_mm` from its posterior mean.
+
+    Of a set of shapes: from the mean given the most probable shape, and every other shape counts as far off.
+    """
+    theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
+    mean, _, _ = moments(experiment, posterior)
+    lengths = [
+        k for k, name in enumerate(experiment.shape.prior.names) if name.endswith("_mm") and np.isfinite(mean[k])
+    ]
+    off = (np.abs(theta[:, lengths] - mean[lengths]) > off_mm).any(axis=1)
+    if isinstance(experiment.shape, AnyOf):
+        which = experiment.shape.which(theta)
+        off |= which != np.bincount(which, weights=weight).argmax()
+    return float(weight[off].sum() / weight.sum())
 
 
 def learnt(experiment: Experiment, posterior: Weighted) -> dict[str, tuple[float, float]]:

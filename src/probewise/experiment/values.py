@@ -165,6 +165,11 @@ class Exploration(ShowsItself):
         return trusted and self.experiment.is_known(self.last.sd, self.last.shapes)
 
     @property
+    def seconds(self) -> float:
+        """Seconds of arm time up to the last reading."""
+        return self.last.reading.time_s
+
+    @property
     def bits_per_reading(self) -> float:
         """Bits gained a reading, from differential entropies."""
         return self.last.bits / len(self.steps)

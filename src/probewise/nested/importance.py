@@ -18,13 +18,14 @@ import numpy as np
 from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._display import ShowsItself
 from probewise._kinds import require_rng, require_whole
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.proposal import Proposal, find_parts, fit_proposals, joined
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled, weighted_quantiles
 
 __all__ = ["Weighted", "pareto_k", "refine", "update"]
 
@@ -41,7 +42,7 @@ _BRIDGE_STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Weighted:
+class Weighted(ShowsItself):
     """Hold weighted samples of a posterior and its evidence, by importance sampling.
 
     Attributes
@@ -130,6 +131,16 @@ class Weighted:
     def sd(self) -> FloatArray:
         """Posterior standard deviation of the parameters, (n_params,)."""
         return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
+
+    def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
+        """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
+        return weighted_quantiles(self.theta, self.weight, q)
+
+    def interval(self, mass: float = 0.95) -> FloatArray:
+        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
+        if not 0 < mass < 1:
+            raise ParameterError("mass", mass, "greater than 0, less than 1")
+        return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
 
     def summary(self) -> str:
         """Describe evidence and posterior in plain text."""

@@ -22,6 +22,7 @@ from probewise._version import __version__
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.nested import conversions
 from probewise.nested.evidence import log_volumes
+from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.atomic import write_bytes_atomically
 
 __all__ = ["Agreement", "NestedResult", "versions"]
@@ -249,16 +250,7 @@ class NestedResult(ShowsItself):
 
     def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
         """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
-        levels = np.asarray(q, dtype=np.float64)
-        if levels.ndim != 1 or not ((levels >= 0) & (levels <= 1)).all():
-            raise ParameterError("q", q, "a list of numbers from 0 to 1")
-        out = np.empty((levels.size, len(self.names)))
-        for i in range(len(self.names)):
-            order = np.argsort(self.theta[:, i])
-            weight = self.weight[order]
-            ladder = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
-            out[:, i] = np.interp(levels, ladder, self.theta[order, i])
-        return out
+        return weighted_quantiles(self.theta, self.weight, q)
 
     def interval(self, mass: float = 0.95) -> FloatArray:
         """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
 
-__all__ = ["n_effective", "resampled"]
+__all__ = ["n_effective", "resampled", "weighted_quantiles"]
 
 
 def n_effective(log_weight: FloatArray) -> float:
@@ -25,3 +26,25 @@ def resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
     ladder = np.cumsum(weight)
     rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
     return np.asarray(np.minimum(rows, len(ladder) - 1))
+
+
+def weighted_quantiles(
+    values: FloatArray, weight: FloatArray, q: FloatArray | list[float] | tuple[float, ...]
+) -> FloatArray:
+    """Weighted quantiles of each column, (n, n_columns) with weights (n,) and levels (n_q,) -> (n_q, n_columns).
+
+    Raises
+    ------
+    ParameterError
+        If a level is not between 0 and 1.
+    """
+    levels = np.asarray(q, dtype=np.float64)
+    if levels.ndim != 1 or not ((levels >= 0) & (levels <= 1)).all():
+        raise ParameterError("q", q, "a list of numbers from 0 to 1")
+    out = np.empty((levels.size, values.shape[1]))
+    for i in range(values.shape[1]):
+        order = np.argsort(values[:, i])
+        own = weight[order]
+        ladder = (np.cumsum(own) - 0.5 * own) / own.sum()
+        out[:, i] = np.interp(levels, ladder, values[order, i])
+    return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 
+import numpy as np
 from PIL import Image
 
 from probewise.errors import ParameterError
@@ -30,8 +31,22 @@ def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -
     for picture in pictures:
         sheet = Image.new("RGB", size, "white")
         sheet.paste(picture, (0, 0))
-        sheets.append(sheet.convert("P", palette=Image.Palette.ADAPTIVE))
+        sheets.append(sheet)
+    palette = _palette(sheets)
+    sheets = [sheet.quantize(palette=palette, dither=Image.Dither.NONE) for sheet in sheets]
     durations = [round(1000 * frame_s)] * (len(sheets) - 1) + [round(1000 * last_s)]
     out = io.BytesIO()
     sheets[0].save(out, "GIF", save_all=True, append_images=sheets[1:], duration=durations, loop=0)
     return out.getvalue()
+
+
+def _palette(sheets: Sequence[Image.Image]) -> Image.Image:
+    """Choose 256 colours for all frames together: a palette a frame would let one colour change from frame to frame.
+
+    By coverage, not by frequency: the one small square that shows the next place has a colour of its own.
+    """
+    weights = np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    codes = np.unique(np.concatenate([np.unique(np.asarray(sheet) @ weights) for sheet in sheets]))
+    colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=-1).astype(np.uint8)
+    every = Image.fromarray(colours[None])
+    return every.quantize(256, method=Image.Quantize.MAXCOVERAGE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import PurePath
 
@@ -18,9 +19,9 @@ from probewise.report.plots import (
     spatial_sensitivity,
     ssf_by_order,
 )
-from probewise.report.words import count, number, signed, unit_name
+from probewise.report.words import count, number, readable, signed, unit_name, with_error, within, without_unit
 
-__all__ = ["answer", "evidence_table", "figures", "parameter_table", "sections", "write_page"]
+__all__ = ["answer", "evidence_table", "figures", "parameter_table", "sections", "ssf_table", "write_page"]
 
 
 def answer(sensor: FittedSensor) -> str:
@@ -31,12 +32,13 @@ def answer(sensor: FittedSensor) -> str:
     if others:
         chosen = next(o for o in sensor.orders if o.n_gaussians == n)
         lead = chosen.log_z - others[0].log_z
-        said += f", ahead of {others[0].n_gaussians} by {number(lead, 1)} in ln Z"
+        error = math.hypot(chosen.log_z_error, others[0].log_z_error)
+        said += f", ahead of {others[0].n_gaussians} by {with_error(lead, error)} in ln Z"
     center_x, center_y, widths = field_shape(sensor)
     return (
         f"{said}: centred at ({signed(center_x, 1)}, {signed(center_y, 1)}) mm on the sensor, "
         f"{number(widths[0], 1)} by {number(widths[1], 1)} mm (sd), "
-        f"noise {number(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} a reading."
+        f"noise {number(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} per reading."
     )
 
 
@@ -77,8 +79,8 @@ def sections(
             (
                 figure(
                     drawn["ssf_by_order.png"],
-                    "Mean SSF of each number of Gaussians, in the sensor frame seen from above; lines at a half and a "
-                    "tenth of the peak, the cross at the package's centre.",
+                    "Mean SSF of each number of Gaussians, in the sensor frame seen from above. White lines: a half "
+                    "and a tenth of the peak; white cross: the package's centre.",
                 ),
                 evidence_table(sensor),
             ),
@@ -86,7 +88,7 @@ def sections(
         Section(
             "Readings",
             (
-                figure(drawn["readings.png"], "Readings as recorded, a symbol for each orientation of the sensor."),
+                figure(drawn["readings.png"], "Readings as recorded, along the scans; single readings are below."),
                 *_notes(recording.notes),
             ),
         ),
@@ -95,22 +97,26 @@ def sections(
             (
                 figure(
                     drawn["predicted.png"],
-                    "Recorded (red) and predicted (black, with the band that should hold 95 % of new readings).",
+                    "Recorded readings, and what the model predicts.",
                 ),
                 paragraph(
-                    f"Chi-square a reading is {number(float(np.mean(z**2)), 3)} over {count(int(ok.sum()), 'reading')} "
+                    f"Chi-square per reading is {number(float(np.mean(z**2)), 3)} over "
+                    f"{count(int(ok.sum()), 'reading')} "
                     "(near 1 where the model and its noise are right; they were fitted, so a little below)."
                 ),
-                figure(drawn["residuals.png"], "Standardised residuals in the order of taking."),
+                figure(
+                    drawn["residuals.png"],
+                    "Standardised residuals in the order of taking; 95 % should lie between the dashed lines.",
+                ),
             ),
         ),
-        Section("Parameters", (parameter_table(sensor), *_notes(sensor.notes))),
+        Section("Parameters", (ssf_table(sensor), parameter_table(sensor), *_notes(sensor.notes))),
         Section(
-            "What was believed before",
+            "Prior",
             (
                 table(
                     ("parameter", "unit", "prior", "why"),
-                    ((p.parameter, p.unit, p.distribution, p.reason) for p in sensor.priors),
+                    ((p.parameter, _unit(p.unit), readable(p.distribution), readable(p.reason)) for p in sensor.priors),
                 ),
             ),
         ),
@@ -138,7 +144,7 @@ def evidence_table(sensor: FittedSensor) -> Markup:
         (
             (
                 str(o.n_gaussians),
-                f"{number(o.log_z, 2)} ± {number(o.log_z_error, 2)}",
+                with_error(o.log_z, o.log_z_error),
                 number(best - o.log_z, 2),
                 f"{o.n_ssf_parameters} ({o.n_parameters})",
             )
@@ -149,16 +155,28 @@ def evidence_table(sensor: FittedSensor) -> Markup:
 
 
 def parameter_table(sensor: FittedSensor) -> Markup:
-    """Build the table of posterior means, sds and 95 % intervals."""
-    mean, sd, interval = sensor.mean(), sensor.sd(), sensor.interval()
+    """Build the table of posterior medians and 95 % intervals: no single sample far off moves them."""
+    median, ends = sensor.median(), sensor.interval()
     return table(
-        ("parameter", "unit", "mean", "sd", "95 % interval"),
-        (
-            (n, sensor.unit(n), f"{mean[n]:.5g}", f"{sd[n]:.3g}", f"{interval[n][0]:.5g} to {interval[n][1]:.5g}")
-            for n in sensor.names
-        ),
-        caption="Posterior of the chosen model. The covariance of Gaussian n is half the inverse of [[A, C], [C, B]].",
+        ("parameter", "unit", "median", "95 % interval"),
+        ((n, _unit(sensor.unit(n)), *within(median[n], *ends[n])) for n in sensor.names),
+        caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
+        "[[A, C], [C, B]].",
     )
+
+
+def ssf_table(sensor: FittedSensor) -> Markup:
+    """Build the table of the SSF's centre, widths and angle: medians and 95 % intervals."""
+    return table(
+        ("SSF", "unit", "median", "95 % interval"),
+        ((without_unit(q.name), _unit(q.unit), *within(q.median, *q.interval95)) for q in sensor.ssf()),
+        caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "
+        "and of the angle of the long axis from the x' axis, anticlockwise.",
+    )
+
+
+def _unit(unit: str) -> str:
+    return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_name(unit))
 
 
 def write_page(
@@ -168,7 +186,11 @@ def write_page(
     return page(
         f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
         answer=answer(calibration.sensor),
-        key_figure=figure(drawn["ssf.png"], "Spatial sensitivity function: the weight of each point below the sensor."),
+        key_figure=figure(
+            drawn["ssf.png"],
+            "Spatial sensitivity function (SSF): how much each point below the sensor counts in a reading. White "
+            "lines: a half and a tenth of the peak; white cross: the package's centre.",
+        ),
         sections=sections(calibration.sensor, recording, prediction, drawn, seed=seed),
     )
 

@@ -8,13 +8,32 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise.experiment import Experiment, Exploration, Step
+from probewise.experiment import OFF_MM, Experiment, Exploration, Step, chance_off, found_shape
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import grid_of_axes, information_gained, playing_field, png, posterior_widths
-from probewise.report.words import count, number, signed
-from probewise.scene import AnyOf, outlines
+from probewise.report.plots import (
+    explain_field,
+    grid_of_axes,
+    information_gained,
+    playing_field,
+    png,
+    posterior_widths,
+)
+from probewise.report.words import count, interval, number, probability, unit_of, with_error, without_unit
+from probewise.scene import outlines
 
-__all__ = ["answer", "errors_text", "frame", "frame_of_both", "live_page", "steps_table", "view", "write_page"]
+__all__ = [
+    "answer",
+    "errors_text",
+    "frame",
+    "frame_of_both",
+    "live_page",
+    "shape_table",
+    "steps_table",
+    "view",
+    "write_page",
+]
+
+MODEL_NAMES = {"ssf": "SSF"}
 
 
 def view(
@@ -70,8 +89,10 @@ def frame(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the picture of one step as a PNG."""
-    return png(view(step, experiment, readings, levels=levels, truth_mm=truth_mm), dpi=90)
+    """Draw the picture of one step, with its key, as a PNG."""
+    ax = view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
+    explain_field(ax)
+    return png(ax, dpi=90, tight=False)
 
 
 def frame_of_both(
@@ -81,29 +102,31 @@ def frame_of_both(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw what several sensor models make of the same readings side by side (the paper's panels) as a PNG.
+    """Draw what several sensor models make of the same readings, one below the other (the paper's panels) as a PNG.
 
     Each view is a title, a step and the experiment it belongs to; the rest is as in `view`.
     """
-    axes = grid_of_axes(1, len(views), size_in=(7.2 * len(views), 4.2))
-    for ax, (title, step, experiment) in zip(axes[0], views, strict=True):
+    axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
+    for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
         known = f"{title}, {count(step.number, 'reading')}, {number(step.bits, 1)} bits"
         view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
-    return png(axes, dpi=75)
+    explain_field(axes)
+    return png(axes, dpi=75, tight=False)
 
 
 def live_page(step: Step, picture: bytes) -> str:
     """Write the page that shows a run while it works: it loads itself anew every second until the run is over."""
     state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
-    found = figure(picture, f"Next, the robot reads at the green place. {step.summary()}.")
+    following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
+    found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
     return page("The robot's search", answer=f"{state}.", key_figure=found, sections=(), reload_s=every_s)
 
 
 def errors_text(step: Step, truth: Mapping[str, float]) -> str:
-    """Say how far from the truth the estimates are."""
+    """Say how far from the truth the estimates are, each beside its posterior sd."""
     return ", ".join(
-        f"{_plain(name)} {signed(float(mean) - truth[name], _decimals(name))} ± {number(float(sd), _decimals(name))}"
+        f"{without_unit(_own(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
         for name, mean, sd in zip(step.names, step.mean, step.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
@@ -111,26 +134,34 @@ def errors_text(step: Step, truth: Mapping[str, float]) -> str:
 
 def answer(run: Exploration) -> str:
     """Say in one sentence what was found."""
-    what = found_shape(run)
-    known = ", ".join(
-        f"{_plain(name)} {number(float(mean), _decimals(name))} ± {number(float(sd), _decimals(name))}{_unit(name)}"
-        for name, mean, sd in zip(run.last.names, run.last.mean, run.last.sd, strict=True)
-        if np.isfinite(mean) and name != "shape"
-    )
+    found = found_shape(run)
+    several = f" (probability {probability(found.probability)})" if run.last.shapes else ""
+    known = ", ".join(f"{without_unit(p.name)} {with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters)
     if not run.reached:
-        return f"Not found to the precision asked for in {count(len(run.steps), 'reading')}: {known}."
-    return f"Found in {count(len(run.steps), 'reading')}: {what} with {known}."
+        taken = count(len(run.steps), "reading")
+        return f"Not found to the precision asked for in {taken}; so far {_a(found.name)}{several} with {known}."
+    return f"Found in {count(len(run.steps), 'reading')}: {_a(found.name)}{several} with {known}."
 
 
-def found_shape(run: Exploration) -> str:
-    """Name the shape; of a set of shapes the most probable, with its share of the posterior."""
-    shape = run.experiment.shape
-    if not isinstance(shape, AnyOf):
-        return "a " + type(shape).__name__.replace("RegularPolygon", "regular polygon").lower()
-    which = shape.which(run.posterior.theta[:, run.experiment.shape_columns])
-    share = np.bincount(which, weights=run.posterior.weight, minlength=len(shape.labels))
-    best = int(np.argmax(share))
-    return f"a {shape.labels[best]} (probability {number(float(share[best]), 3)})"
+def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
+    """Build the table of the shape's parameters with their errors, and beside them the truth where it is known."""
+    found, true = found_shape(run), truth or {}
+    short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
+    header = ("parameter", "unit", "mean", "sd", "95 % interval", *(("truth",) if truth else ()))
+    return table(
+        header,
+        (
+            (
+                without_unit(p.name),
+                unit_of(p.name),
+                *with_error(p.mean, p.sd).partition(" ± ")[::2],
+                interval(*p.interval95),
+                *((f"{short[p.name]:.6g}" if p.name in short else "–",) if truth else ()),
+            )
+            for p in found.parameters
+        ),
+        caption=f"Posterior of the {found.name} after the last reading.",
+    )
 
 
 def steps_table(run: Exploration) -> Markup:
@@ -174,19 +205,40 @@ def write_page(
     beside
         What other sensor models made of the same readings, step by step, by name of the model.
     """
-    runs = {f"{model} model": run.steps} | {f"{name} model": steps for name, steps in (beside or {}).items()}
+    said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
+    runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
+    spent = f"{count(len(run.steps), 'reading')}, {number(run.seconds, 0)} s of arm time"
+    gained = f"{number(run.last.bits, 1)} bits, {number(run.bits_per_reading, 2)} per reading"
+    off = probability(chance_off(run.experiment, run.posterior, OFF_MM))
     facts = [
-        ("sensor model", model),
+        ("sensor model", MODEL_NAMES.get(model, model)),
         ("stopped because", run.stop_reason),
-        ("information", f"{number(run.last.bits, 1)} bits, {number(run.bits_per_reading, 2)} a reading"),
-        ("the paper's count", f"{number(run.paper_bits_per_reading, 2)} bits a reading (25 bits over the readings)"),
+        ("cost", spent),
+        ("information", gained),
+        ("the paper's count", f"{number(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"),
+        (f"chance that a length is off by over {OFF_MM:g} mm", off),
         ("fit of the best hypothesis", f"p = {run.last.p_value:.2g}"),
         ("seed", str(seed)),
     ]
     if truth:
-        facts.insert(2, ("error against the truth", errors_text(run.last, truth)))
+        facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run.last, truth)))
+    sensor = [
+        (without_unit(name), unit_of(name), *with_error(mean, sd).partition(" ± ")[::2])
+        for name, (mean, sd) in run.last.sensor.items()
+    ]
+    learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)
+    shapes = (table(("shape", "probability"), ((n, probability(p)) for n, p in run.last.shapes.items())),)
     sections = [
-        Section("The run", (definition_list(facts), *(paragraph(f"Doubtful: {note}.") for note in run.notes))),
+        Section(
+            "The shape and what it cost",
+            (
+                shape_table(run, truth),
+                *(shapes if run.last.shapes else ()),
+                definition_list(facts),
+                *(learnt if sensor else ()),
+                *(paragraph(f"Doubtful: {note}.") for note in run.notes),
+            ),
+        ),
         Section(
             "How fast",
             (
@@ -197,7 +249,7 @@ def write_page(
                             target_mm=run.experiment.stop_sd_mm,
                         )
                     ),
-                    "Widest posterior sd after each reading, and the precision asked for.",
+                    "Widest posterior sd of a length after each reading; dashed: the precision asked for.",
                 ),
                 figure(
                     png(information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()})),
@@ -215,22 +267,20 @@ def write_page(
         ),
     ]
     caption = (
-        "The robot's view of the field: in copper where a reading would tell most, blue the 50 hypotheses drawn from "
-        "what is believed, squares the readings by their brightness, green the place chosen next"
-        + (", dashed white what really lies there." if truth else ".")
-        + (f" Beside it what the {' and the '.join(beside)} model makes of the same readings." if beside else "")
+        "The robot's view of the field after the last reading: the lighter a place, the more a reading there tells."
     )
+    if beside:
+        caption += (
+            f" The {said[model]} chose the readings; the other panel shows what the other model makes of them, and "
+            "where it would read next."
+        )
     return page("The robot's search", answer=answer(run), key_figure=figure(frames[-1], caption), sections=sections)
 
 
-def _plain(name: str) -> str:
-    return name.removesuffix("_mm").removesuffix("_rad").replace("_", " ").replace(".", " ")
+def _own(step: Step, name: str) -> str:
+    """Leave out the shape before the name of its parameter."""
+    return name.removeprefix(f"{step.likely_shape}.")
 
 
-def _decimals(name: str) -> int:
-    """Decimals of a parameter: an angle in radians needs more than a length in mm."""
-    return 3 if name.endswith("_rad") else 1
-
-
-def _unit(name: str) -> str:
-    return " mm" if name.endswith("_mm") else " rad" if name.endswith("_rad") else ""
+def _a(noun: str) -> str:
+    return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+from PIL import Image
 
 __all__ = [
     "Markup",
@@ -21,6 +24,8 @@ __all__ = [
 ]
 
 _FEWEST_LISTED = 4  # sections from which on a page has a list of contents
+_CSS_DPI = 96.0
+_MOST_COLUMNS = 3  # of a table that fits a narrow screen
 
 
 class Markup(str):
@@ -57,17 +62,23 @@ def paragraph(*children: str, class_: str = "") -> Markup:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "") -> Markup:
-    """Build a table; cells that look like numbers are set right, in figures of one width."""
+    """Build a table; cells that look like numbers are set in figures of one width.
+
+    On a narrow screen a table of more than three columns is shown row by row, each cell under its heading.
+    """
+    wide = len(header) > _MOST_COLUMNS
     head = element("tr", *(element("th", cell, scope="col") for cell in header))
-    body = [element("tr", *(_cell(cell) for cell in row)) for row in rows]
+    labels = header if wide else [""] * len(header)
+    body = [element("tr", *(_cell(cell, label) for cell, label in zip(row, labels, strict=True))) for row in rows]
     title = (element("caption", caption),) if caption else ()
     inner = element("table", *title, element("thead", head), element("tbody", *body))
-    return element("div", inner, class_="scroll")
+    return element("div", inner, class_="scroll wide" if wide else "scroll")
 
 
-def _cell(text: str) -> Markup:
+def _cell(text: str, label: str) -> Markup:
     is_number = bool(text) and (text.lstrip("-−+<≈ ")[:1].isdigit())
-    return element("td", text, class_="number") if is_number else element("td", text)
+    attributes = ({"class_": "number"} if is_number else {}) | ({"data-label": label} if label else {})
+    return element("td", text, **attributes)
 
 
 def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
@@ -79,8 +90,16 @@ def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
     """Embed a PNG or an SVG; the caption is the text for those who cannot see it unless `alt` is given."""
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}">')
-    return element("figure", shown, element("figcaption", caption))
+    size = "" if kind == "svg+xml" else _least_width(image)
+    shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}"{size}>')
+    return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
+
+
+def _least_width(png: bytes) -> str:
+    """Say how wide a PNG must be shown at least for its type to be read: nine tenths of what it was drawn for."""
+    with Image.open(io.BytesIO(png)) as picture:
+        dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
+        return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
@@ -208,6 +227,12 @@ code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
 @media (max-width: 34rem) {
   p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
+  .drawing { overflow-x: auto; } .drawing img[style] { min-width: var(--least); max-width: none; }
+  figure:has(img[style]) figcaption::before { content: "← scroll → "; }
+  .wide thead { display: none; } .wide table, .wide tbody, .wide tr, .wide td, .wide caption { display: block; }
+  .wide tr { border-bottom: 1px solid var(--line); padding: .4rem 0; }
+  .wide td { border: 0; padding: .1rem 0; white-space: normal; }
+  .wide td[data-label]::before { content: attr(data-label) ": "; color: var(--soft); }
 }
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }
 """

@@ -10,7 +10,7 @@ from probewise._display import render_html
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit
 from probewise.experiment import Exploration, Step
-from probewise.nested import NestedResult
+from probewise.nested import NestedResult, Weighted
 from probewise.recordings import Prediction, Recording
 from probewise.report import audit as audit_report
 from probewise.report import calibration as calibration_report
@@ -28,12 +28,13 @@ from probewise.report.plots import (
     spatial_sensitivity,
     ssf_by_order,
 )
-from probewise.report.words import count
+from probewise.report.words import count, unit_of, with_error, without_unit
 from probewise.sensor import SSFField
 
 __all__: list[str] = []
 
-DPI = 70  # notebooks keep every picture: small files
+DPI = 96  # as large as drawn, so that 9 point type is 9 point; notebooks keep every picture, so no larger
+SSF_CAPTION = "Spatial sensitivity function, seen from above; white lines at a half and a tenth of its peak"
 MOST_PARAMETERS = 6  # of a run's picture in a notebook: compact; `corner_plot` draws all of them
 
 
@@ -43,7 +44,12 @@ def _card(*parts: Markup) -> str:
 
 @render_html.register
 def _(value: SSFField) -> str:
-    return _card(figure(png(spatial_sensitivity(value), dpi=DPI), "Spatial sensitivity function, seen from above"))
+    return _card(
+        figure(
+            png(spatial_sensitivity(value), dpi=DPI),
+            SSF_CAPTION,
+        )
+    )
 
 
 @render_html.register
@@ -83,6 +89,18 @@ def _(value: NestedResult) -> str:
     left_out = len(value.names) - MOST_PARAMETERS
     of = f" of the first {MOST_PARAMETERS} of {len(value.names)} parameters" if left_out > 0 else ""
     return _card(figure(png(drawn, dpi=DPI), f"Posterior{of}: each by itself, and each pair"), text)
+
+
+@render_html.register
+def _(value: Weighted) -> str:
+    names = value.names[:MOST_PARAMETERS]
+    believed = zip(names, value.mean(), value.sd(), strict=False)
+    known = ", ".join(f"{without_unit(n)} {with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed)
+    drawn = corner_plot(value, parameters=names)
+    return _card(
+        figure(png(drawn, dpi=DPI), "Posterior: each parameter by itself, and each pair"),
+        paragraph(f"{known}; {count(len(value.theta), 'sample')}, effective sample size {value.n_eff:.0f}."),
+    )
 
 
 @render_html.register

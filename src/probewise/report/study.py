@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from probewise.experiment import least_readings
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, readings_needed, widths_of_runs
-from probewise.report.words import count, number
+from probewise.report.words import count, number, with_error
 from probewise.study import REFERENCE, Estimate, Row, Study, Summary, experiment_of
 
 __all__ = ["answer", "table_csv", "table_of_bounds", "table_of_rows", "write_page"]
@@ -23,7 +23,7 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
     ("median", "median readings, 95 % interval"),
     ("to_white", "mean readings up to the first on white, standard error (none counted as the limit)"),
     ("after_white", "mean readings after the first on white, standard error"),
-    ("bits_each", "bits a reading, standard error"),
+    ("bits_each", "bits per reading, standard error"),
     ("held", "share of 95 % intervals that hold the truth, standard error"),
     ("arm_s", "arm time (s), standard error"),
 )
@@ -31,36 +31,38 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
 
 def answer(study: Study) -> str:
     """Say in one sentence what the first row needs."""
-    summaries = study.table()
-    row, found = next(iter(summaries.items()))
+    row, found = next(iter(study.table().items()))
+    share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
     return (
-        f"{row.name}: {number(found.mean.value, 1)} ± {number(_half(found.mean), 1)} readings on average, "
-        f"median {found.median.value:g}; {number(100 * found.reached.value, 1)} % of {found.n_runs} circles reached."
+        f"{row.name[0].upper()}{row.name[1:]}: {with_error(found.mean.value, _half(found.mean))} readings on average, "
+        f"median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
     )
 
 
 def table_of_rows(study: Study) -> Markup:
-    """Build the table, one line a row."""
-    header = (
+    """Build the tables, one line a row: how many readings, and how much they tell and cost."""
+    readings = ("row", "runs", "reached (95 %)", "mean", "median (95 %)", "up to the first on white", "after it")
+    worth = (
         "row",
-        "runs",
-        "reached",
-        "mean",
-        "median (95 %)",
-        "to white",
-        "after white",
-        "bits a reading",
+        "bits per reading",
         "error (mm)",
         "sure and wrong (expected, limit)",
-        "95 % intervals hold",
+        "95 % intervals that hold",
         "arm time (s)",
-        "cpu a decision (s)",
+        "processor time per decision (s)",
     )
-    return table(header, (_line(row, found) for row, found in study.table().items()))
+    lines = [(_needed(row, found), _told(row, found)) for row, found in study.table().items()]
+    return fragment(
+        table(readings, (first for first, _ in lines), caption="Readings that a run needs."),
+        table(worth, (second for _, second in lines), caption="What readings tell, how right the runs are, the cost."),
+    )
 
 
-def table_of_bounds(study: Study) -> Markup:
-    """Build the table of the fewest readings that any strategy could do with on average, beside what was measured."""
+def table_of_bounds(study: Study) -> Markup | None:
+    """Build the table of the fewest readings that any strategy could do with on average, beside what was measured.
+
+    None where the study has no row that it is worked out for: a robot that knows its sensor, the reference otherwise.
+    """
     lines = []
     for row, found in study.table().items():
         if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
@@ -68,8 +70,14 @@ def table_of_bounds(study: Study) -> Markup:
             search = _over(least.search_bits, least.search_capacity_bits)
             refinement = _over(least.refinement_bits, least.capacity_bits)
             lines.append((row.name, search, _shown(found.to_white), refinement, _shown(found.after_white)))
-    header = ("row", "to white, at least (bits over bits a reading)", "measured", "from there, at least", "measured")
-    return table(header, lines)
+    header = (
+        "row",
+        "up to white, at least (bits over bits per reading)",
+        "measured",
+        "from there, at least",
+        "measured",
+    )
+    return table(header, lines) if lines else None
 
 
 def table_csv(study: Study) -> str:
@@ -102,41 +110,50 @@ def write_page(study: Study, *, command: str) -> str:
     if curves:
         drawn = figure(
             png(widths_of_runs(curves)),
-            "Widest posterior sd against the number of readings: median and middle 68 % of the runs.",
+            "Widest posterior sd of a length against the number of readings; a run that has ended stays where it was.",
         )
         sections.insert(0, Section("How fast", (drawn,)))
-    bounds = paragraph(
-        "Bits needed over the most that a reading can carry. Until the first reading on white that is a yes or no, "
-        "yes as often as the best place is covered; from there to the precision asked for, the sensor's capacity."
-    )
-    sections.append(Section("The least that any strategy needs", (table_of_bounds(study), bounds)))
+    least = table_of_bounds(study)
+    if least is not None:
+        bounds = paragraph(
+            "Bits needed over the most that a reading can carry. Until the first reading on white that is a yes or no, "
+            "yes as often as the best place is covered; from there to the precision asked for, the sensor's capacity."
+        )
+        sections.append(Section("The least that any strategy needs", (least, bounds)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
     return page("How many measurements?", answer=answer(study), key_figure=needed, sections=sections)
 
 
 def _legend() -> Markup:
     return paragraph(
-        "Every row looks for the same circles and meets the same noise. Sure and wrong: stopped with a length off by "
-        "more than 12 mm, beside the number that the runs' own posteriors expect and the one that chance exceeds in "
-        "one study of a hundred."
+        "After ± stands the standard error. Every row looks for the same circles and meets the same noise. On white: "
+        "a reading at least a tenth of the way from dark to bright. Error: of the worst length, median over the runs "
+        "that reached the end. Sure and wrong: stopped with a length off by more than 12 mm, beside the number that "
+        "the runs' own posteriors expect and the one that chance exceeds in one study of a hundred."
     )
 
 
-def _line(row: Row, found: Summary) -> tuple[str, ...]:
+def _needed(row: Row, found: Summary) -> tuple[str, ...]:
+    reached = found.reached
     return (
         row.name,
         str(found.n_runs),
-        f"{number(100 * found.reached.value, 1)} % ({number(100 * found.reached.low, 1)} to "
-        f"{number(100 * found.reached.high, 1)})",
+        f"{number(100 * reached.value, 1)} % ({number(100 * reached.low, 1)} to {number(100 * reached.high, 1)})",
         _shown(found.mean),
         f"{found.median.value:g} ({found.median.low:g} to {found.median.high:g})",
         _shown(found.to_white),
         _shown(found.after_white),
-        _shown(found.bits_each, 2),
+    )
+
+
+def _told(row: Row, found: Summary) -> tuple[str, ...]:
+    return (
+        row.name,
+        _shown(found.bits_each),
         number(found.error_mm, 1),
         f"{count(found.wrong, 'run')} ({number(found.wrong_expected, 1)}, {found.wrong_limit})",
-        f"{number(100 * found.held.value, 1)} ± {number(100 * _half(found.held), 1)} %",
-        _shown(found.arm_s, 0),
+        _percent(found.held),
+        _shown(found.arm_s),
         number(found.cpu_s, 2),
     )
 
@@ -145,8 +162,14 @@ def _over(bits: float, capacity_bits: float) -> str:
     return f"{number(bits / capacity_bits, 1)} = {number(bits, 1)} / {number(capacity_bits, 2)}"
 
 
-def _shown(estimate: Estimate, digits: int = 1) -> str:
-    return f"{number(estimate.value, digits)} ± {number(_half(estimate), digits)}"
+def _shown(estimate: Estimate) -> str:
+    half = _half(estimate)
+    return with_error(estimate.value, half) if half > 0 else number(estimate.value, 1)
+
+
+def _percent(estimate: Estimate) -> str:
+    scaled = Estimate(100 * estimate.value, 100 * estimate.low, 100 * estimate.high)
+    return f"{_shown(scaled)} %" if math.isfinite(estimate.value) else "–"
 
 
 def _half(estimate: Estimate) -> float:

@@ -5,14 +5,68 @@ from __future__ import annotations
 import math
 import re
 
-__all__ = ["count", "number", "probability", "readable", "signed", "unit_name"]
+__all__ = [
+    "count",
+    "interval",
+    "number",
+    "probability",
+    "readable",
+    "signed",
+    "unit_name",
+    "unit_of",
+    "with_error",
+    "within",
+    "without_unit",
+]
 
+_UNITS = {"mm": "mm", "rad": "rad", "deg": "°", "s": "s", "counts": "counts", "mv": "mV", "v": "V"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float, digits: int) -> str:
     """Write with a fixed number of decimals and a true minus sign; a dash where there is no number."""
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
+
+
+def with_error(value: float, error: float, unit: str = "") -> str:
+    """Write a value with its error, both to the error's second figure, so that no error shows as zero."""
+    if not math.isfinite(value):
+        return "–"
+    if not (math.isfinite(error) and error > 0):
+        written = f"{value:.6g}"
+    elif -6 < (digits := 1 - math.floor(math.log10(error))) <= 8:
+        written = f"{signed(value, max(digits, 0))} ± {number(error, max(digits, 0))}"
+    else:
+        written = f"{value:.3g} ± {error:.1g}"
+    return readable(f"{written} {unit}".rstrip()).replace("-", "−")
+
+
+def interval(low: float, high: float) -> str:
+    """Write the ends of an interval to the third figure of its width."""
+    width = high - low
+    if not (math.isfinite(width) and width > 0):
+        return "–" if not math.isfinite(low) else f"{low:.6g}"
+    digits = min(max(2 - math.floor(math.log10(width)), 0), 8)
+    return f"{signed(low, digits)} to {signed(high, digits)}"
+
+
+def within(value: float, low: float, high: float) -> tuple[str, str]:
+    """Write a value and its interval to the same decimals, the third figure of the interval's width."""
+    ends = interval(low, high)
+    decimals = len(ends.partition(" ")[0].partition(".")[2])
+    return (signed(value, decimals) if high > low else f"{value:.6g}"), ends
+
+
+def unit_of(name: str) -> str:
+    """Take the unit that ends a parameter's name, "" where none does."""
+    stem, _, suffix = name.rpartition("_")
+    return _UNITS.get(suffix, "") if stem else ""
+
+
+def without_unit(name: str) -> str:
+    """Write a parameter's name as words, without the unit that ends it."""
+    stem = name.rpartition("_")[0] if unit_of(name) else name
+    return stem.replace("_", " ").replace(".", " ")
 
 
 def signed(value: float, digits: int) -> str:

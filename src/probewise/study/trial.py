@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Pose, Reach, SimulatedArm
-from probewise.experiment import AdjustedMixture, Change, Experiment, Step, explore
+from probewise.experiment import AdjustedMixture, Change, Experiment, Step, chance_off, explore
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.priors import Normal, Product
@@ -125,14 +125,13 @@ def _judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, 
     """Hold the last posterior of the shape against the truth, (3,)."""
     columns = experiment.shape_columns
     theta, weight = last.posterior.theta[:, columns], last.posterior.weight
-    off = np.abs(theta - weight @ theta).max(axis=1)
     held = []
     for values, true in zip(theta.T, truth, strict=True):
         below = float(weight[values < true].sum() + 0.5 * weight[values == true].sum())
         held.append(bool(0.025 <= below <= 0.975))
     return {
         "error_mm": round(float(np.abs(last.mean - truth).max()), 3),
-        "chance_wrong": float(weight[off > WRONG_MM].sum()),
+        "chance_wrong": chance_off(experiment, last.posterior, WRONG_MM),
         "held": held,
     }
 

@@ -1,4 +1,7 @@
-"""The paper's figures, one function each: data first, then the axes to draw on, and nothing global.
+"""The paper's figures, one function each: data first, then the axes to draw on.
+
+Without axes a function opens a figure of pyplot, as large as its drawing needs, so that `plt.savefig` and `plt.show`
+find it; no global style is set.
 
 The arm and its sensor (figure 1 of the paper), the sensor's orientations and the quadrant patterns (figures 3 and 4),
 data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
@@ -10,7 +13,7 @@ run of nested sampling.
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
-from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png, stack_of_axes, svg
+from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.noise import (
@@ -32,12 +35,14 @@ from probewise.report.plots.residuals import (
     residual_clouds,
 )
 from probewise.report.plots.scans import before_and_after, residuals_by_scan
-from probewise.report.plots.scene import playing_field
+from probewise.report.plots.scene import explain_field, playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
 from probewise.report.plots.study import readings_needed, widths_of_runs
 from probewise.report.plots.verdict import hypothesis_probabilities
 
 __all__ = [
+    "PAGE_IN",
+    "SMALL_PT",
     "AxesGrid",
     "arm_and_sensor",
     "audit_matrix",
@@ -46,6 +51,7 @@ __all__ = [
     "confusion_matrix",
     "corner_plot",
     "correlation_of_neighbours",
+    "explain_field",
     "gain_by_scan",
     "grid_of_axes",
     "hypothesis_probabilities",

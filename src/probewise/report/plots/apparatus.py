@@ -12,13 +12,13 @@ from matplotlib.transforms import Affine2D
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.errors import ReachError
-from probewise.report.plots.canvas import BLACK, GREY, ORANGE, VERMILLION, AxesGrid, grid_of_axes, tidy
+from probewise.report.plots.canvas import BLACK, GREY, ORANGE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, tidy
 
 __all__ = ["arm_and_sensor", "draw_sensor_face"]
 
 _ROD_MM = 26.0  # between the two rods of each parallelogram, as drawn
 _ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
-_LABEL: dict[str, Any] = {"fontsize": "small", "textcoords": "offset points", "arrowprops": _ARROW}
+_LABEL: dict[str, Any] = {"fontsize": SMALL_PT, "textcoords": "offset points", "arrowprops": _ARROW}
 
 
 def arm_and_sensor(
@@ -48,7 +48,7 @@ def arm_and_sensor(
     base, shoulder, elbow = geometry.angles_rad(place, geometry.read_height_mm)[0].tolist()
     if not np.isfinite(base):
         raise ReachError("place_mm", place_mm, geometry.sentence())
-    axes = grid_of_axes(1, 3, size_in=(10.6, 3.5), width_ratios=[1.75, 1.6, 0.75])
+    axes = grid_of_axes(1, 3, size_in=(9.6, 3.3), width_ratios=[1.75, 1.6, 0.75])
     side, above, face = axes[0]
     lower = shoulder + elbow if geometry.elbow_is_relative else elbow
     _draw_side(side, geometry, shoulder, lower)
@@ -57,8 +57,8 @@ def arm_and_sensor(
     face.set_axis_off()
     face.set(xlim=(-0.95, 0.95), ylim=(-0.95, 0.95), aspect="equal")
     face.set_title("sensor, from below", fontsize="medium", loc="left")
-    face.annotate("photodiode", (0.0, 0.24), xytext=(0.0, 0.72), ha="center", fontsize="small", arrowprops=_ARROW)
-    face.annotate("LED", (0.0, -0.24), xytext=(0.0, -0.8), ha="center", fontsize="small", arrowprops=_ARROW)
+    face.annotate("photodiode", (0.0, 0.24), xytext=(0.0, 0.72), ha="center", fontsize=SMALL_PT, arrowprops=_ARROW)
+    face.annotate("LED", (0.0, -0.24), xytext=(0.0, -0.8), ha="center", fontsize=SMALL_PT, arrowprops=_ARROW)
     return axes
 
 
@@ -128,6 +128,6 @@ def _draw_above(ax: Axes, geometry: Geometry, place_mm: tuple[float, float], out
     ax.plot([x, at_x], [y, at_y], color=ORANGE, linewidth=4.0, solid_capstyle="round")
     ax.plot(x, y, marker="o", markersize=11, color="#e3e3e3", markeredgecolor=BLACK)
     ax.plot(at_x, at_y, marker="s", markersize=7, color="#9a9a9a", markeredgecolor=VERMILLION, markeredgewidth=1.4)
-    ax.annotate("base", (x, y), xytext=(12, 0), textcoords="offset points", va="center", fontsize="small")
+    ax.annotate("base", (x, y), xytext=(12, 0), textcoords="offset points", va="center", fontsize=SMALL_PT)
     ax.set(xlim=(-20, width + 20), ylim=(-20, max(height, y) + 50), aspect="equal")
     tidy(ax, x="x (mm)", y="y (mm)", title="from above, with the field")

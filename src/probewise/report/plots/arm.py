@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, axes_or_new, tidy
+from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, tidy
+from probewise.report.plots.scene import bar_beside, out_of_reach
 
 __all__ = ["reach_map"]
 
@@ -44,9 +46,15 @@ def reach_map(
         vmax=180.0,
         interpolation="nearest",
     )
-    ax.set_facecolor("#d9d9d9")  # out of reach
-    ax.figure.colorbar(image, ax=ax, label="orientation of the sensor (degrees)", shrink=0.8, pad=0.015)
+    left, right, low, high = image.get_extent()
+    out_of_reach(ax)
+    bar_beside(ax, image, "orientation of the sensor (degrees)")
+    ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=BLACK, linewidth=0.8))
     ax.plot(*axis_mm, marker="o", markersize=9, color=BLACK)
-    ax.annotate("arm", axis_mm, textcoords="offset points", xytext=(8, 0), va="center")
+    ax.annotate("arm's axis", axis_mm, textcoords="offset points", xytext=(8, 0), va="center", fontsize=SMALL_PT)
+    ax.set_xlim(min(left, axis_mm[0] - 20.0), max(right, axis_mm[0] + 20.0))
+    ax.set_ylim(min(low, axis_mm[1] - 20.0), max(high, axis_mm[1] + 20.0))
     ax.set_aspect("equal")
-    return tidy(ax, x="x (mm)", y="y (mm)", title=f"within reach: {np.isfinite(degrees).mean():.0%} of the field")
+    share = 100 * float(np.isfinite(degrees).mean())
+    title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
+    return tidy(ax, x="x (mm)", y="y (mm)", title=title)

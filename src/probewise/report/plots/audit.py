@@ -8,14 +8,26 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLUE, COPPER, GREY, ORANGE, AxesGrid, grid_of_axes, tidy
+from probewise.report.plots.canvas import (
+    BLUE,
+    COPPER,
+    GREY,
+    ORANGE,
+    SMALL_PT,
+    AxesGrid,
+    axes_or_grid,
+    key_below,
+    tidy,
+)
 
 __all__ = ["audit_matrix"]
 
 COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
 
 
-def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArray, *, alias: float) -> AxesGrid:
+def audit_matrix(
+    names: Sequence[str], sights: Sequence[str], cosines: FloatArray, *, alias: float, axes: AxesGrid | None = None
+) -> AxesGrid:
     """Draw how much of each effect survives, and beside it how well each is imitated by each other.
 
     Parameters
@@ -26,6 +38,8 @@ def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArra
         Row imitated by column, (n_effects, n_effects); the surviving share on the diagonal.
     alias
         Cosine from which two are not told apart: marked.
+    axes
+        Axes to draw on, (1, 2), with one y axis; a new figure without.
 
     Returns
     -------
@@ -34,7 +48,8 @@ def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArra
     order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(sights[k]), -cosines[k, k]))
     labels = [names[k].replace("_", " ") for k in order]
     at = np.arange(len(order))
-    axes = grid_of_axes(1, 2, size_in=(9.4, 0.9 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
+    own = axes is None
+    axes = axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
     bars, matrix = axes[0]
     bars.barh(at, np.diag(cosines)[order], color=[COLOUR[sights[k]] for k in order], height=0.7)
     bars.set_yticks(at, labels)
@@ -43,11 +58,12 @@ def audit_matrix(names: Sequence[str], sights: Sequence[str], cosines: FloatArra
     for sight, colour in COLOUR.items():
         if sight in sights:
             bars.barh([np.nan], [0], color=colour, label=sight)
-    bars.legend(
-        frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(-0.35, 1.0), ncols=3, columnspacing=1
-    )
     tidy(bars, x="detectable share (no unit)", y="")
     _matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
+    if own:
+        key_below(axes)
+    else:
+        bars.legend(frameon=False, fontsize=SMALL_PT)
     return axes
 
 
@@ -56,7 +72,7 @@ def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) 
     image = ax.imshow(shown, cmap=COPPER, vmin=0, vmax=1, aspect="auto")
     rows, columns = np.nonzero(np.nan_to_num(shown) >= alias)
     ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
-    ax.set_xticks(np.arange(len(labels)), labels, rotation=90, fontsize="small")
+    ax.set_xticks(np.arange(len(labels)), labels, rotation=90, fontsize=SMALL_PT)
     ax.tick_params(left=False)
     ax.figure.colorbar(image, ax=ax, label="cosine of row and column (no unit)", shrink=0.7)
     tidy(ax, x="", y="", title="circles: aliased pairs")

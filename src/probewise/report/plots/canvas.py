@@ -1,6 +1,7 @@
 """Sheets to draw on, the palette, and the way from a drawing to a PNG.
 
-Figures are made without pyplot: no global state, no window, nothing to close.
+Without axes to draw on, a plot function opens a figure of pyplot, so that `plt.savefig` and `plt.show` find it;
+`png` closes those again, so that a page of many pictures leaves none open.
 """
 
 from __future__ import annotations
@@ -9,37 +10,41 @@ import io
 import math
 from collections.abc import Sequence
 from typing import Any, TypeAlias, cast
+from weakref import WeakSet
 
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
+from probewise.errors import ShapeError
 from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from probewise.report.words import readable
 
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
-__all__ += [
-    "AxesGrid",
-    "axes_or_new",
-    "grid_of_axes",
-    "legend_above",
-    "plain_numbers",
-    "png",
-    "stack_of_axes",
-    "svg",
-    "tidy",
-]
+__all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "axes_or_new", "grid_of_axes"]
+__all__ += ["key_below", "legend_above", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg", "tidy"]
 
-_LETTERS_PER_IN = 17.5  # of a legend, about
+_LETTERS_PER_IN = 16.2  # of a legend, about
 _LEAST_IN_FULL = 1e-5  # length of an axis whose labels are written without a power of ten
 
 AxesGrid: TypeAlias = NDArray[Any]
+
+PAGE_IN = 9.6
+"""Width of a report's column: a wider drawing is shrunk, and its type with it."""
+
+SMALL_PT = 9.0
+"""The smallest type of any drawing: 8.5 pt or more on a page."""
+
+OUT_OF_REACH = "#d9d9d9"
+"""Where the arm cannot put its sensor, in every drawing of the field."""
+
+_OPENED: WeakSet[Figure] = WeakSet()  # figures that plot functions opened: `png` closes them, and no others
 
 # The paper's copper tones. They start above black, so that black squares and blue outlines
 # stay legible, and lightness rises evenly, so that the map also reads in grey.
@@ -54,34 +59,71 @@ def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -
 
 
 def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any) -> AxesGrid:
-    """Make a new figure of several axes, shape (n_rows, n_columns); options go to `Figure.subplots`."""
-    sheet = Figure(figsize=size_in, layout="constrained")
-    FigureCanvasAgg(sheet)
-    return np.asarray(sheet.subplots(n_rows, n_columns, squeeze=False, **options), dtype=np.object_)
+    """Open a figure of several axes, shape (n_rows, n_columns); options go to `Figure.subplots`."""
+    return np.asarray(
+        new_figure(size_in, layout="constrained").subplots(n_rows, n_columns, squeeze=False, **options),
+        dtype=np.object_,
+    )
 
 
-def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110) -> bytes:
-    """Render the figure that holds a drawing."""
+def axes_or_grid(
+    axes: AxesGrid | None, n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any
+) -> AxesGrid:
+    """Return the axes given, shape (n_rows, n_columns), or those of a new figure.
+
+    Raises
+    ------
+    ShapeError
+        If those given have another shape.
+    """
+    if axes is None:
+        return grid_of_axes(n_rows, n_columns, size_in=size_in, **options)
+    given = np.asarray(axes, dtype=np.object_)
+    if given.shape != (n_rows, n_columns):
+        raise ShapeError(f"axes have shape {given.shape}; allowed: ({n_rows}, {n_columns})")
+    return given
+
+
+def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
+    """Open a figure of pyplot, which `png` closes."""
+    sheet = plt.figure(figsize=size_in, layout=layout)
+    _OPENED.add(sheet)
+    return sheet
+
+
+def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True) -> bytes:
+    """Render the figure that holds a drawing; one that a plot function opened is closed, others stay open.
+
+    Parameters
+    ----------
+    drawing
+        Axes of the figure, or the figure.
+    dpi
+        Dots per inch.
+    tight
+        Cut off empty margins; without, pictures of figures of one size have one size, as a moving picture needs.
+    """
     if isinstance(drawing, Figure):
         sheet = drawing
     else:
         ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
         sheet = cast(Figure, ax.figure)  # none of our figures has subfigures
     buffer = io.BytesIO()
-    sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight")
+    sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight" if tight else None)
+    if sheet in _OPENED:
+        plt.close(sheet)
     return buffer.getvalue()
 
 
 def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
-    """Make a new figure of axes one above another, shape (n_axes,); `svg` finds their margins in one pass."""
-    sheet = Figure(figsize=(width_in, sum(heights_in)))
-    FigureCanvasAgg(sheet)
+    """Open a figure of axes one above another, shape (n_axes,); `svg` finds their margins in one pass."""
+    sheet = new_figure((width_in, sum(heights_in)))
     axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
     return np.asarray(axes[:, 0], dtype=np.object_)
 
 
 def svg(drawing: Axes | AxesGrid) -> bytes:
-    """Render the figure that holds a drawing as SVG, the same bytes for the same drawing."""
+    """Render the figure that holds a drawing as SVG, the same bytes for the same drawing; see `png` on closing it."""
     ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
     sheet = cast(Figure, ax.figure)
     sheet.tight_layout(pad=0.4, h_pad=0.9)
@@ -90,11 +132,13 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
     with mpl.rc_context({"svg.hashsalt": "probewise"}):
         canvas.print_svg(buffer, metadata={"Date": None})  # `savefig` would draw everything twice
     sheet.set_canvas(own)
+    if sheet in _OPENED:
+        plt.close(sheet)
     text = buffer.getvalue()
     return text[text.index(b"<svg") :]
 
 
-def legend_above(ax: Axes) -> None:
+def legend_above(ax: Axes, *, title: str = "") -> None:
     """Set the legend above the axes, in as many columns as fit: it never lies over data."""
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
@@ -108,7 +152,10 @@ def legend_above(ax: Axes) -> None:
         bbox_to_anchor=(0.0, 1.0),
         ncols=n_columns,
         frameon=False,
-        fontsize="small",
+        fontsize=SMALL_PT,
+        title=title or None,
+        title_fontsize=SMALL_PT,
+        alignment="left",
         borderaxespad=0.1,
         columnspacing=1.2,
     )
@@ -131,6 +178,35 @@ def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
         else:
             digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
             axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: readable(f"{round(v, digits) + 0.0:g}")))
+
+
+def key_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
+    """Explain everything that is drawn once, below all axes: a key there hides nothing.
+
+    Parameters
+    ----------
+    axes
+        Axes of one figure with constrained layout.
+    n_columns
+        Entries in a row at most.
+    ground, ink
+        Colours behind the entries and of their text.
+    """
+    every: list[Axes] = [ax for ax in (axes.flat if isinstance(axes, np.ndarray) else [axes]) if ax is not None]
+    found = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if found:
+        cast(Figure, every[0].figure).legend(
+            list(found.values()),
+            list(found),
+            loc="outside lower center",
+            ncols=min(n_columns, len(found)),
+            frameon=ground != "none",
+            facecolor=ground,
+            framealpha=1.0,
+            edgecolor="none",
+            labelcolor=ink,
+            fontsize=SMALL_PT,
+        )
 
 
 def tidy(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

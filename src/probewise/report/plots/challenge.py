@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import IntArray
 from probewise.challenge import Bin
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, axes_or_new, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, SMALL_PT, axes_or_new, legend_above, tidy
 
 __all__ = ["confusion_matrix", "reliability_diagram"]
 
@@ -32,9 +32,11 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
     whiskers = np.maximum([value - low, high - value], 0.0)
     ax.errorbar(stated, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
     for b in bins:
-        ax.annotate(str(b.right.n), (b.stated, b.right.value), xytext=(6, -3), textcoords="offset points", fontsize=8)
+        ax.annotate(
+            str(b.right.n), (b.stated, b.right.value), xytext=(6, -3), textcoords="offset points", fontsize=SMALL_PT
+        )
     ax.set(xlim=(0, 1.04), ylim=(-0.02, 1.04), aspect="equal")
-    ax.legend(frameon=False, fontsize="small", loc="upper left")
+    legend_above(ax)
     return tidy(ax, x="probability stated", y="share that was right")
 
 
@@ -56,7 +58,7 @@ def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArra
     for (row, column), n in np.ndenumerate(counts):
         if n:
             colour = "white" if shares[row, column] > 0.6 else BLACK
-            ax.text(column, row, str(n), ha="center", va="center", fontsize=8, color=colour)
-    ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=8)
-    ax.set_yticks(np.arange(len(truths)), truths, fontsize=8)
+            ax.text(column, row, str(n), ha="center", va="center", fontsize=SMALL_PT, color=colour)
+    ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=SMALL_PT)
+    ax.set_yticks(np.arange(len(truths)), truths, fontsize=SMALL_PT)
     return tidy(ax, x="most probable", y="concealed")

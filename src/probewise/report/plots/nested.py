@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
@@ -18,22 +17,40 @@ from scipy.stats import binom
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.nested import NestedResult
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, VERMILLION, AxesGrid, axes_or_new, grid_of_axes, tidy
+from probewise.nested import NestedResult, Weighted
+from probewise.report.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    PAGE_IN,
+    SMALL_PT,
+    VERMILLION,
+    AxesGrid,
+    axes_or_grid,
+    axes_or_new,
+    new_figure,
+    tidy,
+)
+from probewise.report.words import unit_of, with_error, within, without_unit
 
 __all__ = ["corner_plot", "insertion_plot", "run_plot", "trace_plot"]
 
+Posterior: TypeAlias = NestedResult | Weighted
+
 # Darker is heavier: on white, the points that count are seen; lightness falls evenly, so that it reads in grey.
 _WEIGHT: Colormap = LinearSegmentedColormap.from_list("probewise_weight", ["#dcdcdc", "#8fbbdb", BLUE, "#00233b"])
-_UNITS = {"mm": "mm", "rad": "rad", "s": "s", "counts": "counts"}
+_SSF_UNITS = {"u": "mm", "v": "mm", "A": "mm⁻²", "B": "mm⁻²", "C": "mm⁻²"}  # of the paper's symbols
 _MASSES = (0.68, 0.95)
 _SHADES = ("#aecfe6", "#4d9bcb")  # of the larger mass, of the smaller
 _MOST_POINTS = 4000
+_LEFT_IN, _BOTTOM_IN, _TOP_IN, _RIGHT_IN, _GAP_IN = 0.9, 0.9, 0.65, 0.2, 0.06  # of a corner plot
 _DEPTH = "−ln X (X: share of the prior)"
-_FEW = 8  # parameters up to which a corner plot has room for numbers
+_FEW = 6  # parameters up to which a corner plot fits a page, with numbers
 
 
-def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None) -> AxesGrid:
+def trace_plot(
+    result: NestedResult, *, parameters: Sequence[str] | None = None, axes: AxesGrid | None = None
+) -> AxesGrid:
     """Draw each parameter of the dead points against the log volume left, darker where the posterior is.
 
     On top, the posterior mass for each nat of volume; to the right of each trace, the posterior
@@ -45,6 +62,8 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
         The run.
     parameters
         Names of those to draw, in this order; all of them where not given.
+    axes
+        Axes to draw on, of the shape returned; a new figure without.
 
     Returns
     -------
@@ -52,8 +71,9 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     """
     columns = _columns(result, parameters)
     n = len(columns)
-    height = 1.5 if n <= _FEW else 1.05
-    axes = grid_of_axes(
+    height = 1.5 if n <= _FEW else 1.15
+    axes = axes_or_grid(
+        axes,
         n + 1,
         2,
         size_in=(8.6, 1.9 + height * n),
@@ -71,8 +91,8 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
     place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
     bar = key.figure.colorbar(scale, cax=place, orientation="horizontal", ticks=[0, 1])
-    bar.set_label("posterior per nat,\nshare of its peak", fontsize="small")
-    bar.ax.tick_params(labelsize="small")
+    bar.set_label("posterior per nat,\nshare of its peak", fontsize=SMALL_PT)
+    bar.ax.tick_params(labelsize=SMALL_PT)
     for row, i in enumerate(columns, start=1):
         trace, side = axes[row]
         values = result.theta[:, i]
@@ -98,12 +118,9 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
         tidy(side, x="posterior" if last else "", y="")
         side.set_xticks([])
         side.yaxis.tick_right()
-        side.tick_params(labelsize="small")
+        side.tick_params(labelsize=SMALL_PT)
         for ax in (trace, side):
             ax.yaxis.set_major_locator(MaxNLocator(3))
-        if n > _FEW:
-            trace.yaxis.label.set_size("small")
-            trace.tick_params(labelsize="small")
     for ax in axes[:, 0]:
         ax.set_xlim(0, depth[-1])
         if ax is not axes[-1, 0]:
@@ -112,12 +129,15 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     return axes
 
 
-def corner_plot(result: NestedResult, *, parameters: Sequence[str] | None = None) -> AxesGrid:
+def corner_plot(
+    result: Posterior, *, parameters: Sequence[str] | None = None, axes: AxesGrid | None = None
+) -> AxesGrid:
     """Draw the posterior of each parameter, and of each pair the regions that hold 68 % and 95 % of it.
 
-    Intervals of single parameters are central ones. Regions of pairs are those of highest density, from
-    a histogram of the weighted samples smoothed by a kernel that narrows as the effective number
-    of samples grows.
+    Intervals of single parameters are central ones; up to six parameters also have their median and 95 % interval
+    written above. Regions of pairs are those of highest density, from a histogram of the weighted samples
+    smoothed by a kernel that narrows as the effective number of samples grows. Up to six parameters fit the
+    width of a page; the drawing of more grows, its type does not shrink.
 
     Parameters
     ----------
@@ -125,6 +145,8 @@ def corner_plot(result: NestedResult, *, parameters: Sequence[str] | None = None
         The run.
     parameters
         Names of those to draw, in this order; all of them where not given.
+    axes
+        Axes to draw on, (n, n); those above the diagonal are hidden. A new figure without.
 
     Returns
     -------
@@ -132,56 +154,65 @@ def corner_plot(result: NestedResult, *, parameters: Sequence[str] | None = None
     """
     columns = _columns(result, parameters)
     n = len(columns)
-    few = n <= _FEW
-    side = min(1.9, max(11.0 / n, 0.62)) if n > 1 else 3.2
-    left, bottom, top, right = (0.85, 0.85, 0.65, 0.2) if few else (0.7, 0.7, 0.3, 0.15)
-    gap = 0.06
-    width, height = left + n * side + right, bottom + n * side + top
-    sheet = Figure(figsize=(width, height))
-    FigureCanvasAgg(sheet)
-    axes = np.full((n, n), None, dtype=np.object_)
+    side = (min(1.9, (PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
+    cells = _cells(n, side) if axes is None else axes_or_grid(axes, n, n, size_in=(PAGE_IN, PAGE_IN))
+    drawn = np.full((n, n), None, dtype=np.object_)
     spans = [_span(result, i) for i in columns]
-    text = "small" if few else "x-small"
-    for row in range(n):
-        for column in range(row + 1):
-            corner = (left + column * side, bottom + (n - 1 - row) * side)
-            box = (corner[0] / width, corner[1] / height, (side - gap) / width, (side - gap) / height)
-            ax = axes[row, column] = sheet.add_axes(box)
-            if row == column:
-                _draw_one(ax, result, columns[row], spans[row], titled=few)
-            else:
-                _draw_pair(ax, result, (columns[column], columns[row]), (spans[column], spans[row]))
-            ax.set_xlim(spans[column])
-            ax.tick_params(labelsize=text if few else 6, length=3 if few else 2)
-            ax.xaxis.set_major_locator(MaxNLocator(3 if few else 2, prune="both"))
-            ax.tick_params(axis="x", labelrotation=45 if few else 90)
-            if row == n - 1:
-                ax.set_xlabel(_label(result.names[columns[column]]), fontsize=text)
-                ax.xaxis.set_label_coords(0.5, -0.55 / (side - gap) if few else -0.52 / (side - gap))
-            else:
-                ax.set_xticklabels([])
-            if row != column:
-                ax.yaxis.set_major_locator(MaxNLocator(3 if few else 2, prune="both"))
-            if column == 0 and row > 0:
-                ax.set_ylabel(_label(result.names[columns[row]]), fontsize=text)
-                ax.yaxis.set_label_coords(-0.6 / (side - gap) if few else -0.52 / (side - gap), 0.5)
-            elif row != column:
-                ax.set_yticklabels([])
+    for (row, column), ax in np.ndenumerate(cells):
+        if ax is None:
+            continue
+        if column > row:
+            ax.set_axis_off()
+            continue
+        drawn[row, column] = ax
+        if row == column:
+            _draw_one(ax, result, columns[row], spans[row], titled=n <= _FEW)
+        else:
+            _draw_pair(ax, result, (columns[column], columns[row]), (spans[column], spans[row]))
+            ax.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
+        ax.set_xlim(spans[column])
+        ax.tick_params(labelsize=SMALL_PT, length=3)
+        ax.tick_params(axis="x", labelrotation=45)
+        ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+        if row == n - 1:
+            ax.set_xlabel(_label(result.names[columns[column]]))
+            ax.xaxis.set_label_coords(0.5, -0.6 / (side - _GAP_IN))
+        else:
+            ax.set_xticklabels([])
+        if column == 0 and row > 0:
+            ax.set_ylabel(_label(result.names[columns[row]]))
+            ax.yaxis.set_label_coords(-0.65 / (side - _GAP_IN), 0.5)
+        elif row != column:
+            ax.set_yticklabels([])
     if n > 1:
         patches = [
             Patch(facecolor=colour, label=f"{mass:.0%}".replace("%", " %"))
             for mass, colour in zip(_MASSES, reversed(_SHADES), strict=True)
         ]
-        sheet.legend(
+        cells[0, n - 1].legend(
             handles=patches,
             title=f"{_evidence(result)}\nposterior within",
             loc="upper right",
+            borderaxespad=0.0,
             frameon=False,
-            fontsize="small" if few else "medium",
-            title_fontsize="small" if few else "medium",
+            fontsize=SMALL_PT,
+            title_fontsize=SMALL_PT,
             alignment="left",
         )
-    return axes
+    return drawn
+
+
+def _cells(n: int, side_in: float) -> AxesGrid:
+    """Lay out square axes on and below the diagonal and, for the key, at the upper right: (n, n), None elsewhere."""
+    width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
+    sheet = new_figure((width, height))
+    cells = np.full((n, n), None, dtype=np.object_)
+    for row, column in [*((i, j) for i in range(n) for j in range(i + 1)), (0, n - 1)]:
+        if cells[row, column] is None:
+            left, bottom = _LEFT_IN + column * side_in, _BOTTOM_IN + (n - 1 - row) * side_in
+            size = side_in - _GAP_IN
+            cells[row, column] = sheet.add_axes((left / width, bottom / height, size / width, size / height))
+    return cells
 
 
 def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
@@ -222,24 +253,26 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     ax.axhline(n / n_bars, color=BLACK, linewidth=0.9, label="uniform")
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1.3 * max(high, counts.max()))
-    ax.legend(frameon=False, fontsize="small", loc="upper right", ncols=2)
+    ax.legend(frameon=False, fontsize=SMALL_PT, loc="upper right", ncols=2)  # above every bar
     title = f"{n} new points, p = {result.insertion_p_value:.2g}"
     return tidy(ax, x="rank among the live points (0: worst, 1: best)", y="new points", title=title)
 
 
-def run_plot(result: NestedResult) -> AxesGrid:
+def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     """Draw the course of a run: likelihood, posterior mass, live points and evidence so far against the log volume.
 
     Parameters
     ----------
     result
         The run.
+    axes
+        Axes to draw on, (4, 1); a new figure without.
 
     Returns
     -------
     Axes, (4, 1). The likelihood's lower end is cut off where nothing of the posterior lies.
     """
-    axes = grid_of_axes(4, 1, size_in=(7.0, 7.6), sharex=True)
+    axes = axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
     depth, mass = -result.log_volume, _mass_per_nat(result)
     likelihood, posterior, alive, evidence = axes[:, 0]
     peak = float(result.log_likelihood.max())
@@ -260,18 +293,18 @@ def run_plot(result: NestedResult) -> AxesGrid:
     so_far = np.logaddexp.accumulate(result.log_weight) + result.log_z
     evidence.plot(depth, so_far, color=BLUE, linewidth=1.4, label="from the points so far")
     evidence.set_ylim(result.log_z - max(6.0, 4 * error), result.log_z + max(1.0, 2 * error))
-    evidence.legend(frameon=False, fontsize="small", loc="lower right")
+    evidence.legend(frameon=False, fontsize=SMALL_PT, loc="lower right")
     evidence.set_xlim(0, depth[-1])
     tidy(evidence, x=_DEPTH, y="ln Z")
     evidence.figure.align_ylabels(list(axes[:, 0]))
     return axes
 
 
-def _evidence(result: NestedResult) -> str:
-    return f"ln Z = {result.log_z:.2f} ± {result.log_z_error:.2f}".replace("-", "−")
+def _evidence(result: Posterior) -> str:
+    return f"ln Z = {with_error(result.log_z, result.log_z_error)}"
 
 
-def _columns(result: NestedResult, parameters: Sequence[str] | None) -> list[int]:
+def _columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there is nothing to draw")
     if parameters is None:
@@ -284,14 +317,15 @@ def _columns(result: NestedResult, parameters: Sequence[str] | None) -> list[int
 
 def _label(name: str) -> str:
     """Write a parameter's name as a label: its unit in brackets, a symbol's index lowered."""
-    stem, _, unit = name.rpartition("_")
-    if stem and unit in _UNITS:
-        return f"{stem.replace('_', ' ').replace('.', ' ')} ({_UNITS[unit]})"
+    unit = unit_of(name)
+    if unit:
+        return f"{without_unit(name)} ({unit})"
     symbol = re.fullmatch(r"([A-Za-z])_(\w+)", name)
     if symbol:
         letter, index = symbol.groups()
-        return rf"${letter}_{{{index}}}$" if index.isdigit() else rf"${letter}_\mathrm{{{index}}}$"
-    return name.replace("_", " ").replace(".", " ")
+        lowered = rf"${letter}_{{{index}}}$" if index.isdigit() else rf"${letter}_\mathrm{{{index}}}$"
+        return f"{lowered} ({_SSF_UNITS[letter]})" if index.isdigit() and letter in _SSF_UNITS else lowered
+    return without_unit(name)
 
 
 def _mass_per_nat(result: NestedResult) -> FloatArray:
@@ -303,7 +337,7 @@ def _thinned(n: int) -> IntArray:
     return np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).astype(np.int64))
 
 
-def _span(result: NestedResult, column: int) -> tuple[float, float]:
+def _span(result: Posterior, column: int) -> tuple[float, float]:
     """Limits that hold 99 % of the posterior with a margin, within the dead points, which fill the prior."""
     values = result.theta[:, column]
     order = np.argsort(values)
@@ -333,7 +367,7 @@ def _marginal(
     return centres, np.asarray(gaussian_filter1d(density, width, mode="reflect"))
 
 
-def _draw_one(ax: Axes, result: NestedResult, column: int, span: tuple[float, float], *, titled: bool) -> None:
+def _draw_one(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
     centres, density = _marginal(result.theta[:, column], result.weight, span, result.n_eff)
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
     ax.plot(centres, density, color=BLUE, linewidth=1.2)
@@ -343,20 +377,16 @@ def _draw_one(ax: Axes, result: NestedResult, column: int, span: tuple[float, fl
     ax.set_yticks([])
     ax.spines[["top", "right", "left"]].set_visible(False)
     if titled:
-        mean, sd = float(result.mean()[column]), float(result.sd()[column])
-        ax.set_title(_with_error(mean, sd), fontsize="small")
-
-
-def _with_error(mean: float, sd: float) -> str:
-    """Write mean and sd to the second figure of the sd."""
-    digits = 1 - int(np.floor(np.log10(sd))) if sd > 0 else 3
-    if -2 < digits < 6:
-        return f"{mean:.{max(digits, 0)}f} ± {sd:.{max(digits, 0)}f}".replace("-", "−")
-    return f"{mean:.3g} ± {sd:.1g}".replace("-", "−")
+        median = float(result.quantiles([0.5])[0, column])
+        low, high = (float(end) for end in cuts[0])
+        ax.set_title("\n".join(within(median, low, high)), fontsize=SMALL_PT)
 
 
 def _draw_pair(
-    ax: Axes, result: NestedResult, columns: tuple[int, int], spans: tuple[tuple[float, float], tuple[float, float]]
+    ax: Axes,
+    result: Posterior,
+    columns: tuple[int, int],
+    spans: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
     x, y = (result.theta[:, i] for i in columns)
     density, x_edges, y_edges = np.histogram2d(x, y, bins=48, range=spans, weights=result.weight)

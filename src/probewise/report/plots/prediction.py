@@ -7,7 +7,20 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Recording
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, VERMILLION, AxesGrid, axes_or_new, grid_of_axes, tidy
+from probewise.report.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    PAGE_IN,
+    SMALL_PT,
+    VERMILLION,
+    AxesGrid,
+    axes_or_grid,
+    axes_or_new,
+    key_below,
+    legend_above,
+    tidy,
+)
 from probewise.report.plots.readings import Track, along_label, tracks
 from probewise.report.words import unit_name
 
@@ -16,8 +29,10 @@ __all__ = ["calibration_check", "predicted_against_recorded", "residuals_against
 MAX_PANELS = 8
 
 
-def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: FloatArray) -> AxesGrid:
-    """Draw recorded (red) and predicted (black, with its 95 % band) readings, a panel each scan (paper, figure 7).
+def predicted_against_recorded(
+    recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: AxesGrid | None = None
+) -> AxesGrid:
+    """Draw recorded and predicted readings, with a band for 95 % of new ones, a panel each scan (paper, figure 7).
 
     Parameters
     ----------
@@ -25,13 +40,21 @@ def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: Float
         What was recorded.
     mean, sd
         Predicted reading of each row and the sd of one new reading, shape (n_points,).
+    axes
+        Axes to draw on, of the shape returned; a new figure without.
+
+    Returns
+    -------
+    Axes, three columns (two where there are two or four panels, one for one panel).
     """
     found, alone = tracks(recording.plan)
     shown = [found[i] for i in _spread(len(found), MAX_PANELS - bool(alone.size))]
     n_panels = max(len(shown) + bool(alone.size), 1)
     n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
     n_rows = -(-n_panels // n_columns)
-    axes = grid_of_axes(n_rows, n_columns, size_in=(4.0 * n_columns, 2.9 * n_rows), sharey=True)
+    width = 4.4 * n_columns if n_columns < 3 else PAGE_IN
+    own = axes is None
+    axes = axes_or_grid(axes, n_rows, n_columns, size_in=(width, 0.4 + 2.4 * n_rows), sharey=True)
     unit = recording.plan.instrumentation.unit
     for ax, track in zip(axes.flat, shown, strict=False):
         _draw_track(ax, recording, track, mean, sd)
@@ -46,7 +69,10 @@ def predicted_against_recorded(recording: Recording, mean: FloatArray, sd: Float
         ax.set_ylabel(f"reading ({unit_name(unit)})")
     for k in range(max(n_panels - n_columns, 0), len(shown)):
         axes.flat[k].set_xlabel(along_label(shown).replace(", white side positive", ""))
-    axes.flat[0].legend(frameon=False, fontsize="small")
+    if own:
+        key_below(axes)
+    else:
+        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
     return axes
 
 
@@ -59,10 +85,11 @@ def _draw_track(ax: Axes, recording: Recording, track: Track, mean: FloatArray, 
     order = np.argsort(track.along_mm, kind="stable")
     rows, along = track.rows[order], track.along_mm[order]
     ok = recording.usable[rows]
-    ax.fill_between(along, mean[rows] - 1.96 * sd[rows], mean[rows] + 1.96 * sd[rows], color=GREY, alpha=0.35, lw=0)
+    low, high = mean[rows] - 1.96 * sd[rows], mean[rows] + 1.96 * sd[rows]
+    ax.fill_between(along, low, high, color=GREY, alpha=0.35, lw=0, label="holds 95 % of new readings")
     if ok.any():
         ax.plot(along[ok], recording.readings[rows][ok], ".", color=VERMILLION, markersize=3.5, label="recorded")
-    ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted, 95 %")
+    ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted")
 
 
 def _draw_alone(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray, sd: FloatArray) -> None:
@@ -72,12 +99,12 @@ def _draw_alone(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray
     ax.plot(at[ok], recording.readings[rows][ok], "o", color=VERMILLION, markersize=5)
     names = [recording.plan.pattern_names[recording.plan.pattern[r]].replace("_", " ") for r in rows]
     if len(rows) <= 8:
-        ax.set_xticks(at, names, rotation=30, ha="right", fontsize="small")
+        ax.set_xticks(at, names, rotation=30, ha="right", fontsize=SMALL_PT)
     ax.margins(x=0.15)
 
 
 def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
-    """Draw standardised residuals in the order of taking; 95 % should lie between the lines.
+    """Draw standardised residuals in the order of taking; 95 % should lie between the dashed lines.
 
     Parameters
     ----------
@@ -126,7 +153,7 @@ def residuals_against(
         center, average = _running_mean(covariate[ok], residual[ok])
         ax.plot(center, average, color=colour, linewidth=2.0, label=name)
     ax.axhline(0, color=BLACK, linewidth=0.7)
-    ax.legend(frameon=False, fontsize="small")
+    legend_above(ax)
     return tidy(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")
 
 

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, CYCLE, axes_or_new, tidy
+from probewise.report.plots.canvas import BLACK, CYCLE, SMALL_PT, axes_or_new, legend_above, tidy
+from probewise.report.words import count
 
 __all__ = ["information_gained", "posterior_widths", "towards_target"]
 
@@ -29,15 +30,23 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     ax = axes_or_new(ax, size_in=(6.4, 3.6))
     for (name, sd), colour in zip(widths_mm.items(), CYCLE, strict=False):
         number = np.arange(1, len(sd) + 1)
-        ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {len(sd)} readings")
-    ax.legend(frameon=False, fontsize="small")
+        ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {count(len(sd), 'reading')}")
+    legend_above(ax)
     return towards_target(ax, target_mm)
 
 
 def towards_target(ax: Axes, target_mm: float) -> Axes:
     """Lay out axes for posterior sds against the number of readings, with a line at the precision asked for."""
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
-    ax.annotate(f"{target_mm:g} mm", (1, target_mm), xytext=(2, -11), textcoords="offset points", fontsize="small")
+    ax.annotate(
+        f"{target_mm:g} mm,\nasked for",
+        (1.0, target_mm),
+        xycoords=("axes fraction", "data"),
+        xytext=(4, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=SMALL_PT,
+    )
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
@@ -65,8 +74,8 @@ def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None
             marker="o",
             markersize=3.5,
             color=colour,
-            label=f"{name}: {per_reading:.2f} bits a reading",
+            label=f"{name}: {per_reading:.2f} bits per reading",
         )
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend(frameon=False, fontsize="small")
+    legend_above(ax)
     return tidy(ax, x="number of readings", y="information about the shape (bits)")

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Plan, Recording
 from probewise.recordings.patterns import HalfPlane
-from probewise.report.plots.canvas import CYCLE, axes_or_new, tidy
+from probewise.report.plots.canvas import CYCLE, axes_or_new, legend_above, tidy
 from probewise.report.words import unit_name
 
 __all__ = ["Track", "readings_by_orientation", "tracks"]
@@ -114,5 +114,5 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
             label=track.label,
         )
     if 0 < len(found) <= MAX_NAMED:
-        ax.legend(title="orientation", frameon=False, fontsize="small", title_fontsize="small")
+        legend_above(ax, title="orientation of the sensor")
     return tidy(ax, x=along_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")

@@ -17,6 +17,7 @@ from probewise.report.plots.canvas import (
     BLUE,
     GREY,
     SKY,
+    SMALL_PT,
     VERMILLION,
     AxesGrid,
     legend_above,
@@ -239,7 +240,7 @@ def _names_on_x(ax: Axes, names: Sequence[str]) -> None:
     skip = max(1, round(len(names) / (4 * width_in)))
     slant: dict[str, Any] = {} if fits else {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
     at = np.arange(len(names))
-    ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize="small", **slant)
+    ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize=SMALL_PT, **slant)
     ax.set_xlim(-0.6, len(names) - 0.4)
 
 

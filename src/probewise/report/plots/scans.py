@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings import Recording
-from probewise.report.plots.canvas import BLACK, BLUE, VERMILLION, AxesGrid, grid_of_axes, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, tidy
 from probewise.report.plots.readings import Track, tracks
 from probewise.report.words import unit_name
 
@@ -47,7 +47,7 @@ def residuals_by_scan(
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in found]
     shown = [found[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // columns), 1)
-    axes = grid_of_axes(n_rows, columns, size_in=(3.6 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
+    axes = grid_of_axes(n_rows, columns, size_in=(3.2 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
     for ax, track in zip(axes.flat, shown, strict=False):
         for predicted, colour in ((before, VERMILLION), (after, BLUE)):
             along, residual = _residuals(recording, track, predicted)
@@ -61,7 +61,7 @@ def residuals_by_scan(
     sheet.supxlabel(_ALONG if all(track.from_edge for track in shown) else f"{_ALONG}, or {_ALONG_OTHERS}", fontsize=10)
     sheet.supylabel(f"recorded − predicted ({unit_name(recording.plan.instrumentation.unit)})", fontsize=10)
     lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (VERMILLION, BLUE)]
-    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize="small")
+    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize=SMALL_PT)
     return axes
 
 
@@ -112,7 +112,7 @@ def before_and_after(
     below.axhline(0.0, color=BLACK, linewidth=0.7)
     below.set_xlim(low, high)
     unit = unit_name(recording.plan.instrumentation.unit)
-    above.legend(frameon=False, fontsize="small")
+    above.legend(frameon=False, fontsize=SMALL_PT)
     tidy(above, x="", y=f"reading ({unit})", title=name)
     from_edge = all(track.from_edge for track in found)
     tidy(below, x=_ALONG if from_edge else _ALONG_OTHERS, y=f"recorded − predicted\n({unit})")

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, COPPER, SKY, axes_or_new
+from probewise.report.plots.canvas import BLACK, COPPER, OUT_OF_REACH, SMALL_PT, AxesGrid, axes_or_new, key_below
 
-__all__ = ["playing_field"]
+__all__ = ["bar_beside", "explain_field", "out_of_reach", "playing_field"]
 
 LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
 NEXT_GREEN = "#00e08a"  # the palette's green, lighter: the next place must stand out on copper
 OUTLINE_BLUE = "#3fa7ff"  # likewise; the paper's hypotheses are blue
+DARK_EDGE = "#c8c8c8"  # of a square whose reading was dark
+GROUND = "#2a1a12"  # of the key, the map's darkest: on it all that is drawn on the map is seen
 
 
 def playing_field(
@@ -60,9 +65,10 @@ def playing_field(
     ax
         Axes to draw on; a new figure without.
     """
-    ax = axes_or_new(ax, size_in=(8.2, 5.0))
+    ax = axes_or_new(ax, size_in=(8.2, 5.2))
     dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
-    ax.set_facecolor("#d9d9d9")  # out of reach
+    if np.isnan(utility).any():
+        out_of_reach(ax)
     top = utility_max if utility_max is not None else max(float(np.nanmax(utility)), 1e-9)
     image = ax.imshow(
         np.ma.masked_invalid(utility),
@@ -73,21 +79,28 @@ def playing_field(
         vmax=top,
         interpolation="nearest",
     )
-    ax.figure.colorbar(image, ax=ax, label=utility_label, shrink=0.8, pad=0.015)
+    bar_beside(ax, image, utility_label)
     if len(outlines_mm):
         ax.add_collection(LineCollection(list(outlines_mm), colors=OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
+        ax.plot([], [], color=OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
     if truth_mm is not None:
-        ax.plot(truth_mm[:, 0], truth_mm[:, 1], color="white", linewidth=1.4, linestyle=(0, (5, 3)))
+        dashes = (0, (5, 3))
+        label = "what really lies there"
+        ax.plot(truth_mm[:, 0], truth_mm[:, 1], color="white", linewidth=1.4, linestyle=dashes, label=label)
     if places_mm is not None and readings is not None and len(places_mm):
         low, high = levels
         shade = np.clip((np.asarray(readings) - low) / max(high - low, 1e-9), 0, 1)
         face = np.repeat(shade[:, None], 3, axis=1)
-        edge = [SKY if s < 0.5 else BLACK for s in shade]
+        edge = [DARK_EDGE if s < 0.5 else BLACK for s in shade]
         ax.scatter(
             places_mm[:, 0], places_mm[:, 1], s=34, marker="s", c=face, edgecolors=edge, linewidths=0.9, zorder=3
         )
+        for name, colour, rim in (("dark reading", "black", DARK_EDGE), ("bright reading", "white", BLACK)):
+            ax.plot([], [], "s", color=colour, markersize=6, markeredgecolor=rim, label=name)
     if next_mm is not None:
-        ax.scatter(*next_mm, s=52, marker="s", c=NEXT_GREEN, edgecolors=BLACK, linewidths=1.0, zorder=4)
+        ax.scatter(
+            *next_mm, s=52, marker="s", c=NEXT_GREEN, edgecolors=BLACK, linewidths=1.0, zorder=4, label="next place"
+        )
     ax.set_xlim(x_mm[0] - dx, x_mm[-1] + dx)
     ax.set_ylim(y_mm[0] - dy, y_mm[-1] + dy)
     ax.set_aspect("equal")
@@ -99,11 +112,30 @@ def playing_field(
     return ax
 
 
+def explain_field(axes: Axes | AxesGrid) -> None:
+    """Explain lines and squares of one or several playing fields in one figure, below them."""
+    key_below(axes, n_columns=3, ground=GROUND, ink="white")
+
+
+def out_of_reach(ax: Axes) -> None:
+    """Show what is not drawn over as out of the arm's reach: the same grey on every drawing of the field."""
+    ax.set_facecolor(OUT_OF_REACH)
+    ax.add_patch(Rectangle((0.0, 0.0), 0.0, 0.0, facecolor=OUT_OF_REACH, label="out of the arm's reach"))
+
+
+def bar_beside(ax: Axes, image: ScalarMappable, label: str) -> None:
+    """Stand a colour bar beside axes, as tall as they are."""
+    ax.figure.colorbar(image, cax=ax.inset_axes((1.015, 0.0, 0.022, 1.0)))
+    bar = ax.child_axes[-1]
+    bar.set_ylabel("\n".join(textwrap.wrap(label, 32)), fontsize=SMALL_PT)
+    bar.tick_params(labelsize=SMALL_PT)
+
+
 def _add_lego_scale(ax: Axes) -> None:
     """Add the paper's coordinates, LEGO distance units, on top."""
     lego = ax.secondary_xaxis("top", functions=(_to_lego, _from_lego))
-    lego.set_xlabel("LEGO distance units (8 mm)", fontsize="small")
-    lego.tick_params(labelsize="small")
+    lego.set_xlabel("LEGO distance units (8 mm)", fontsize=SMALL_PT)
+    lego.tick_params(labelsize=SMALL_PT)
 
 
 def _to_lego(mm: ArrayLike) -> FloatArray:

@@ -9,7 +9,9 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_new, grid_of_axes, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_grid, axes_or_new, tidy
+from probewise.report.plots.scene import bar_beside
+from probewise.report.words import with_error
 from probewise.sensor import SSFField
 
 __all__ = ["log_evidences", "spatial_sensitivity", "ssf_by_order"]
@@ -19,20 +21,32 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     """Draw an SSF in the sensor frame: shade, and the lines at 1/2 and 1/10 of its peak.
 
     The cross marks the mechanical origin of the sensor package.
+
+    Parameters
+    ----------
+    field
+        The SSF.
+    ax
+        Axes to draw on; a new figure without.
+    title
+        Its title.
     """
-    ax = axes_or_new(ax, size_in=(4.2, 4.0))
+    ax = axes_or_new(ax, size_in=(4.8, 4.0))
     values = np.asarray(field.values)
     x, y = field.u_mm, field.v_mm
     half = field.pixel_mm / 2
     ax.set_facecolor(colormaps["cividis"](0.0))  # beyond the field's pixels there is nothing
-    ax.imshow(
-        values,
+    peak = float(values.max())
+    image = ax.imshow(
+        values / peak,
         origin="lower",
         extent=(x[0] - half, x[-1] + half, y[0] - half, y[-1] + half),
         cmap="cividis",
+        vmin=0.0,
+        vmax=1.0,
         interpolation="nearest",
     )
-    peak = float(values.max())
+    bar_beside(ax, image, "sensitivity (share of its peak)")
     ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
     ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
     reach = _reach(values, x, y, field.pixel_mm)
@@ -52,7 +66,11 @@ def _reach(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) ->
 
 
 def ssf_by_order(
-    fields: Mapping[int, SSFField], log_z: Mapping[int, float], log_z_error: Mapping[int, float]
+    fields: Mapping[int, SSFField],
+    log_z: Mapping[int, float],
+    log_z_error: Mapping[int, float],
+    *,
+    axes: AxesGrid | None = None,
 ) -> AxesGrid:
     """Draw the mean SSF of each number of Gaussians with its log-evidence (paper, figure of the four MoG models).
 
@@ -60,16 +78,20 @@ def ssf_by_order(
     ----------
     fields, log_z, log_z_error
         By number of Gaussians: mean field, natural log of the evidence and its standard error.
+    axes
+        Axes to draw on, two columns where there are two orders or more; a new figure without.
     """
     orders = sorted(fields)
-    n_columns = 2 if len(orders) in (2, 4) else len(orders)
+    n_columns = min(len(orders), 2)
     n_rows = -(-len(orders) // n_columns)
-    axes = grid_of_axes(n_rows, n_columns, size_in=(3.7 * n_columns, 3.7 * n_rows))
+    axes = axes_or_grid(axes, n_rows, n_columns, size_in=(4.6 * n_columns, 3.9 * n_rows))
     best = max(orders, key=lambda n: log_z[n])
     for ax, n in zip(axes.flat, orders, strict=False):
         name = "1 Gaussian" if n == 1 else f"{n} Gaussians"
         mark = ", most probable" if n == best and len(orders) > 1 else ""
-        spatial_sensitivity(fields[n], ax=ax, title=f"{name}{mark}\nln Z = {log_z[n]:.1f} ± {log_z_error[n]:.1f}")
+        spatial_sensitivity(fields[n], ax=ax, title=f"{name}{mark}\nln Z = {with_error(log_z[n], log_z_error[n])}")
+    for ax in list(axes.flat)[len(orders) :]:
+        ax.set_visible(False)
     widest = max(ax.get_xlim()[1] for ax in list(axes.flat)[: len(orders)])
     for ax in list(axes.flat)[: len(orders)]:
         ax.set_xlim(-widest, widest)

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import (
     BLUE,
-    CYCLE,
     GREY,
+    PAGE_IN,
+    SMALL_PT,
     VERMILLION,
     AxesGrid,
-    axes_or_new,
-    grid_of_axes,
+    axes_or_grid,
+    key_below,
     tidy,
 )
 from probewise.report.plots.progress import towards_target
+from probewise.report.words import count
 from probewise.study import Summary
 
 __all__ = ["readings_needed", "widths_of_runs"]
@@ -26,10 +28,12 @@ __all__ = ["readings_needed", "widths_of_runs"]
 _BAND = (0.16, 0.84)
 
 
-def widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
-    """Draw the widest posterior sd against the number of readings: median and middle 68 % of many runs.
+def widths_of_runs(
+    runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0, axes: AxesGrid | None = None
+) -> AxesGrid:
+    """Draw the widest posterior sd against the number of readings: median and middle 68 % of many runs, a panel each.
 
-    A run that has ended stays at its last width.
+    The other panels' medians are thin lines, to compare with. A run that has ended stays at its last width.
 
     Parameters
     ----------
@@ -37,19 +41,49 @@ def widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float
         By name: of each run the widest posterior sd after each reading, (n_readings,), mm.
     target_mm
         The precision asked for.
-    ax
-        Axes to draw on; a new figure without.
+    axes
+        Axes to draw on, of the shape returned; a new figure without.
+
+    Returns
+    -------
+    Axes, two columns; one for a single name.
     """
-    ax = axes_or_new(ax, size_in=(6.8, 4.0))
-    for (name, widths), colour in zip(runs.items(), CYCLE, strict=False):
-        longest = max(len(w) for w in widths)
-        table = np.array([np.pad(w, (0, longest - len(w)), mode="edge") for w in widths])
-        number = np.arange(1, longest + 1)
+    n_columns = min(len(runs), 2)
+    n_rows = -(-len(runs) // max(n_columns, 1))
+    own = axes is None
+    size_in = (PAGE_IN if n_columns == 2 else 6.8, 0.5 + 2.9 * n_rows)
+    axes = axes_or_grid(axes, n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
+    tables = {name: _ended(widths) for name, widths in runs.items()}
+    for ax, (name, table) in zip(axes.flat, tables.items(), strict=False):
+        for other, more in tables.items():
+            if other != name:
+                label = "median of another panel"
+                ax.plot(_numbers(more), np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
         low, high = np.quantile(table, _BAND, axis=0)
-        ax.fill_between(number, low, high, color=colour, alpha=0.18, linewidth=0)
-        ax.plot(number, np.median(table, axis=0), color=colour, label=f"{name} ({len(widths)} runs)")
-    ax.legend(frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
-    return towards_target(ax, target_mm)
+        ax.fill_between(_numbers(table), low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs")
+        ax.plot(_numbers(table), np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
+        towards_target(ax, target_mm)
+        ax.set_title(f"{name} ({count(len(table), 'run')})", fontsize="medium", loc="left")
+        ax.label_outer()
+    for ax in list(axes.flat)[len(runs) :]:
+        ax.set_visible(False)
+        axes.flat[len(runs) - n_columns].xaxis.set_tick_params(labelbottom=True)
+        axes.flat[len(runs) - n_columns].set_xlabel("number of readings")
+    if own:
+        key_below(axes)
+    else:
+        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
+    return axes
+
+
+def _ended(widths: Sequence[FloatArray]) -> FloatArray:
+    """Let every run stay at its last width until the longest has ended: (n_runs, n_readings)."""
+    longest = max(len(w) for w in widths)
+    return np.array([np.pad(w, (0, longest - len(w)), mode="edge") for w in widths])
+
+
+def _numbers(table: FloatArray) -> FloatArray:
+    return np.arange(1.0, table.shape[1] + 1)
 
 
 def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None) -> AxesGrid:
@@ -66,24 +100,30 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
     -------
     Axes, (1, 2).
     """
-    names = list(rows)
-    if axes is None:
-        axes = grid_of_axes(1, 2, size_in=(9.0, 1.2 + 0.34 * len(names)), sharey=True)
+    names = ["\n".join(textwrap.wrap(name, 30)) for name in rows]
+    n_lines = sum(1 + name.count("\n") for name in names)
+    own = axes is None
+    axes = axes_or_grid(axes, 1, 2, size_in=(PAGE_IN, 1.5 + 0.2 * len(names) + 0.16 * n_lines), sharey=True)
     y = np.arange(len(names))
     for ax, parts, title in (
-        (axes[0, 0], (("mean", BLUE, -0.14), ("median", VERMILLION, 0.14)), "in all"),
-        (axes[0, 1], (("after_white", BLUE, 0.0),), "after the first on white"),
+        (axes[0, 0], (("mean", BLUE, "o", -0.14), ("median", VERMILLION, "s", 0.14)), "in all"),
+        (axes[0, 1], (("after_white", BLUE, "o", 0.0),), "after the first on white"),
     ):
-        for part, colour, shift in parts:
+        for part, colour, marker, shift in parts:
             estimates = [getattr(summary, part) for summary in rows.values()]
             value, low, high = (np.array([getattr(e, k) for e in estimates]) for k in ("value", "low", "high"))
             whiskers = np.array([value - low, high - value])
             label = "mean ± standard error" if part != "median" else "median, 95 % interval"
-            ax.errorbar(value, y + shift, xerr=whiskers, fmt="o", color=colour, markersize=5, capsize=3, label=label)
+            style = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 3, "label": label}
+            ax.errorbar(value, y + shift, xerr=whiskers, **style)
         ax.set_xlim(left=0)
         ax.grid(axis="x", color=GREY, alpha=0.25)
         ax.set_yticks(y, names)
-        tidy(ax, x="readings", y="", title=title)
-    axes[0, 0].invert_yaxis()
-    axes[0, 0].legend(frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.04))
+        tidy(ax, x="number of readings", y="", title=title)
+    # Half a row of room at either end, for one row too.
+    axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
+    if own:
+        key_below(axes)
+    else:
+        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
     return axes

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise.report.plots.canvas import BLUE, GREY, axes_or_new, tidy
+from probewise.report.plots.canvas import BLUE, GREY, SMALL_PT, axes_or_new, tidy
 
 __all__ = ["hypothesis_probabilities"]
 
@@ -35,7 +35,7 @@ def hypothesis_probabilities(
     ax = axes_or_new(ax, size_in=(6.6, 0.6 + 0.42 * len(shown)))
     at = -np.arange(len(shown), dtype=np.float64)
     ax.barh(at - 0.22, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.34)
-    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": "small"}
+    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": SMALL_PT}
     for y, (name, p) in zip(at, shown, strict=True):
         ax.annotate(f"{p:.3f}", (p, y - 0.22), xytext=(4, 0), va="center", **beside)
         ax.annotate(name.replace("_", " "), (0.0, y + 0.06), xytext=(3, 0), **beside)

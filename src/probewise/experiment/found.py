@@ -1,0 +1,110 @@
+"""What a run found, as a value and as files: result.json and samples.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from probewise.experiment.judging import chance_off
+from probewise.experiment.values import Exploration
+from probewise.nested.weights import weighted_quantiles
+from probewise.scene.albedo import Shape
+from probewise.scene.shapes import AnyOf, RegularPolygon
+
+__all__ = ["FORMAT", "OFF_MM", "FoundParameter", "FoundShape", "found_shape", "result_json", "samples_csv"]
+
+FORMAT = "exploration/1"
+
+OFF_MM = 12.0
+"""An error that the stopping rule rules out, three times its 4 mm."""
+
+_POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octagon"}
+
+
+@dataclass(frozen=True)
+class FoundParameter:
+    """A parameter of the shape: its name, which ends in its unit, and its posterior."""
+
+    name: str
+    mean: float
+    sd: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FoundShape:
+    """The most probable shape, its probability among those that might lie there, and its parameters given it."""
+
+    name: str
+    probability: float
+    parameters: tuple[FoundParameter, ...]
+
+
+def found_shape(run: Exploration) -> FoundShape:
+    """Sum up the posterior after the last reading: the most probable shape and its parameters."""
+    shape, last = run.experiment.shape, run.last
+    theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
+    name = last.likely_shape or _name(shape)
+    if isinstance(shape, AnyOf):
+        own = shape.which(theta) == shape.labels.index(name)
+        theta, weight = theta[own], weight[own]
+    low, high = weighted_quantiles(theta, weight, [0.025, 0.975])
+    parameters = tuple(
+        FoundParameter(
+            last.names[k].removeprefix(f"{name}."),
+            float(last.mean[k]),
+            float(last.sd[k]),
+            (float(low[k]), float(high[k])),
+        )
+        for k in np.flatnonzero(np.isfinite(last.mean)).tolist()
+        if last.names[k] != "shape"
+    )
+    return FoundShape(name, last.shapes.get(name, 1.0), parameters)
+
+
+def result_json(run: Exploration) -> str:
+    """Write what was found and what it cost as strict JSON, format "exploration/1"."""
+    document = {
+        "format": FORMAT,
+        "readings": len(run.steps),
+        "stop_reason": run.stop_reason,
+        "known": run.reached,
+        "shape": asdict(found_shape(run)),
+        "chance_off_12mm": chance_off(run.experiment, run.posterior, OFF_MM),
+        "bits": run.last.bits,
+        "seconds": run.seconds,
+    }
+    return json.dumps(document, allow_nan=False, indent=1) + "\n"
+
+
+def samples_csv(run: Exploration) -> str:
+    """Write the weighted posterior samples of the shape as CSV: a column "weight", then one a parameter.
+
+    Of a set of shapes the column "shape" names each sample's, and parameters of the others are left empty.
+    """
+    shape, names = run.experiment.shape, run.last.names
+    theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    several = isinstance(shape, AnyOf)
+    columns = [k for k, name in enumerate(names) if name != "shape"]
+    writer.writerow(["weight", *(["shape"] if several else []), *(names[k] for k in columns)])
+    which = shape.which(theta) if isinstance(shape, AnyOf) else np.zeros(len(theta), dtype=np.int64)
+    for row in np.flatnonzero(weight > 0).tolist():
+        label, held = [], set(columns)
+        if isinstance(shape, AnyOf):
+            label = [shape.labels[which[row]]]
+            held = set(shape.prior.columns[which[row]])
+        values = (f"{theta[row, k]:.7g}" if k in held else "" for k in columns)
+        writer.writerow([f"{weight[row]:.7g}", *label, *values])
+    return text.getvalue()
+
+
+def _name(shape: Shape) -> str:
+    if isinstance(shape, RegularPolygon):
+        return _POLYGONS.get(shape.n_sides, f"regular polygon of {shape.n_sides} sides")
+    return type(shape).__name__.lower()

@@ -1,0 +1,182 @@
+"""Pages of a search, a calibration and a study: what a caption names is in its picture, what is said has its error."""
+
+import base64
+import io
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from probewise.arm import SimulatedArm
+from probewise.calibration import FittedSensor, OrderEvidence, predict
+from probewise.experiment import Experiment, Exploration, chance_off, explore, found_shape, result_json, samples_csv
+from probewise.inference import GaussianKnown
+from probewise.recordings import Disc, Instrumentation, read_recording, shipped
+from probewise.report import calibration as calibration_report
+from probewise.report import exploration
+from probewise.report.animation import gif
+from probewise.scene import Circle, HypothesisScene, outlines
+from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
+from probewise.world import Blob, World, gaussian_spot
+
+TRUTH = np.array([[600.0, 260.0, 120.0]])
+COLOURS = {
+    "green": (0, 224, 138),
+    "blue": (63, 167, 255),
+    "white": (255, 255, 255),
+    "red": (213, 60, 30),
+    "orange": (230, 159, 0),
+    "grey": (140, 140, 140),
+    "copper": (184, 115, 51),
+    "purple": (204, 121, 167),
+}
+
+
+def searched(n_readings):
+    rng = np.random.default_rng(4)
+    world = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]))
+    hidden = Disc((600.0, 260.0), 120.0)
+    circle = Circle(radius_mm=(50.0, 150.0), inside=True)
+    mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
+    model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
+    experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, n_live=40, n_particles=300)
+    arm = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng))
+    with arm:
+        return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=n_readings)))
+
+
+@pytest.fixture(scope="module")
+def run():
+    return searched(3)
+
+
+@pytest.fixture(scope="module")
+def frames(run):
+    places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in run.readings]
+    outline = outlines(run.experiment.shape.region(TRUTH))[0]
+    return [
+        exploration.frame(step, run.experiment, places[: step.number], levels=(10.0, 60.0), truth_mm=outline)
+        for step in run.steps
+    ]
+
+
+def pictures_with_captions(page):
+    for found in re.findall(r"<figure>.*?</figure>", page, flags=re.S):
+        image = base64.b64decode(re.search(r"base64,([^\"]+)", found)[1])
+        yield image, re.sub("<[^>]+>", "", found.partition("<figcaption>")[2])
+
+
+def named_but_not_there(page):
+    missing = []
+    for image, caption in pictures_with_captions(page):
+        pixels = np.asarray(Image.open(io.BytesIO(image)).convert("RGB")).reshape(-1, 3).astype(int)
+        for name, colour in COLOURS.items():
+            if re.search(rf"\b{name}\b", caption.lower()) and (np.abs(pixels - colour).max(axis=1) < 30).sum() < 20:
+                missing.append((name, caption))
+    return missing
+
+
+def has_green(image):
+    return (np.abs(np.asarray(image.convert("RGB")).astype(int) - COLOURS["green"]).max(axis=2) < 16).sum() > 40
+
+
+def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_picture(frames):
+    """In the frames it is in the key and in the field; the last frame has no next place."""
+    moving = Image.open(io.BytesIO(gif(frames)))
+    for number, frame in enumerate(frames):
+        moving.seek(number)
+        still = Image.open(io.BytesIO(frame))
+        assert has_green(still) == has_green(moving) == (number < len(frames) - 1)
+
+
+def test_the_page_of_a_search_names_no_colour_that_is_not_there(run, frames):
+    page = exploration.write_page(run, frames, seed=4, model="ssf")
+    assert named_but_not_there(page) == []
+    for step, frame in zip(run.steps, frames, strict=True):
+        assert named_but_not_there(exploration.live_page(step, frame)) == []
+    assert "green" in exploration.live_page(run.steps[0], frames[0])
+    assert "green" not in exploration.live_page(run.last, frames[-1])
+
+
+def test_the_page_of_a_search_gives_the_shape_with_its_errors_and_what_it_cost(run, frames):
+    page = exploration.write_page(run, frames, seed=4, model="ssf", truth={"x_mm": 600.0, "y_mm": 260.0})
+    text = re.sub("<[^>]+>", " ", page)
+    found = found_shape(run)
+    for parameter in found.parameters:
+        assert parameter.name.removesuffix("_mm") in text
+    assert f"{run.seconds:.0f} s of arm time" in text
+    assert "95 % interval" in text
+    assert "600" in text
+    assert re.search(r"a circle with x [\d.]+ ± [\d.]+ mm", page)
+
+
+def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run):
+    document = json.loads(result_json(run), parse_constant=pytest.fail)
+    assert list(document) == [
+        "format",
+        "readings",
+        "stop_reason",
+        "known",
+        "shape",
+        "chance_off_12mm",
+        "bits",
+        "seconds",
+    ]
+    assert (document["format"], document["readings"], document["known"]) == ("exploration/1", 3, False)
+    assert document["stop_reason"] == run.stop_reason
+    assert document["shape"]["name"] == "circle"
+    rows = np.genfromtxt(io.StringIO(samples_csv(run)), delimiter=",", names=True)
+    assert rows.dtype.names == ("weight", "x_mm", "y_mm", "radius_mm")
+    weight = rows["weight"]
+    assert weight.sum() == pytest.approx(1.0, abs=1e-4)
+    off = np.zeros(len(rows), dtype=bool)
+    for parameter in document["shape"]["parameters"]:
+        values = rows[parameter["name"]]
+        mean = weight @ values
+        assert parameter["mean"] == pytest.approx(mean, abs=0.01)
+        assert parameter["sd"] == pytest.approx(np.sqrt(weight @ (values - mean) ** 2), abs=0.01)
+        low, high = parameter["interval95"]
+        assert weight[(values >= low) & (values <= high)].sum() == pytest.approx(0.95, abs=0.02)
+        off |= np.abs(values - mean) > 12.0
+    assert document["chance_off_12mm"] == pytest.approx(weight[off].sum(), abs=1e-3)
+    assert chance_off(run.experiment, run.posterior, 1e6) == 0.0
+
+
+def hand_made_sensor():
+    """One sample far off, as the posterior of a long scan along one line may have."""
+    rng = np.random.default_rng(0)
+    samples = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0]) + 1e-3 * rng.standard_normal((500, 8))
+    samples[0, 3:6] = 0.5, 0.9, 0.65
+    axis = np.arange(-20.0, 20.5)
+    return FittedSensor(
+        names=("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max"),
+        samples=samples,
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.6),
+        field=field_of(footprint_of(samples[1:2, :6], 1), u_mm=axis, v_mm=axis),
+        instrumentation=Instrumentation(),
+        orders=(OrderEvidence(1, -389.8199, 0.0234), OrderEvidence(2, -394.28, 0.53)),
+    )
+
+
+def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_zero():
+    recording = read_recording(shipped("paper"))
+    sensor = hand_made_sensor()
+    found = SimpleNamespace(sensor=sensor, orders=sensor.orders, fields={1: sensor.field, 2: sensor.field})
+    prediction = predict(sensor, recording.plan, recording.readings)
+    drawn = calibration_report.figures(found, recording, prediction)
+    page = calibration_report.write_page(found, recording, prediction, drawn, seed=0)
+    assert named_but_not_there(page) == []
+    text = re.sub("<[^>]+>", " ", page)
+    assert not re.search(r"± 0\.?0*(?![\d.])", text)
+    for name in ("centre u", "sd long", "sd short", "angle", "A_1"):
+        assert name in text
+    assert "median" in text
+    # The one sample far off makes the sd of A_1; median and interval do not know of it.
+    assert sensor.sd()["A_1"] > 0.02
+    cells = re.search(r"A_1</td>.*?</tr>", page)[0]
+    assert "0.031" in cells
+    assert f"{sensor.sd()['A_1']:.3f}" not in cells

@@ -1,0 +1,197 @@
+"""Every plot function: pyplot knows its figure, its type can be read, its keys hide nothing."""
+
+import io
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.text import Text
+from PIL import Image
+
+from probewise.arm.geometry_file import read_geometry, shipped_geometry
+from probewise.challenge import Bin
+from probewise.challenge.estimates import share
+from probewise.errors import ShapeError
+from probewise.nested import run
+from probewise.priors import Product, Uniform
+from probewise.recordings import read_recording, shipped
+from probewise.report import plots
+from probewise.sensor import SSFField
+from probewise.study import Estimate
+
+X, Y = np.linspace(4, 1044, 66), np.linspace(4, 516, 33)
+
+
+class Bell:
+    """Six parameters, as many as fit a page; C_1 has long numbers."""
+
+    prior = Product({n: Uniform(-0.5, 0.5) for n in ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1")})
+
+    def log_likelihood(self, theta):
+        return -0.5 * ((theta / 0.012) ** 2).sum(axis=1)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run(Bell(), rng=np.random.default_rng(0), n_live=25)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return read_recording(shipped("paper"))
+
+
+def blob():
+    x = np.arange(-20.0, 21.0)
+    return SSFField(np.exp(-(x[None, :] ** 2) / 32 - x[:, None] ** 2 / 18), 1.0, (-20.0, -20.0))
+
+
+def field(**more):
+    utility = np.tile(np.linspace(0.0, 1.0, X.size), (Y.size, 1))
+    utility[:3, :5] = np.nan
+    return {
+        "utility": utility,
+        "x_mm": X,
+        "y_mm": Y,
+        "outlines_mm": [np.array([[300.0, 200.0], [400.0, 300.0], [500.0, 200.0], [300.0, 200.0]])],
+        "places_mm": np.array([[100.0, 300.0], [200.0, 300.0]]),
+        "readings": np.array([10.0, 60.0]),
+        "levels": (10.0, 60.0),
+        "next_mm": (700.0, 300.0),
+        "truth_mm": np.array([[300.0, 100.0], [400.0, 200.0], [500.0, 100.0], [300.0, 100.0]]),
+        "utility_label": "information about rectangle.width_mm (bits) per second",
+    } | more
+
+
+def row(mean):
+    return SimpleNamespace(**{k: Estimate(mean, mean - 2, mean + 2) for k in ("mean", "median", "after_white")})
+
+
+ROWS = {"inside, naive": row(16.0), "inside, SSF, believed 30% too narrow, learning it": row(9.0)}
+RUNS = {name: [np.geomspace(300, 3, 10 + k) for k in range(4)] for name in ("inside, SSF", "anywhere, naive", "more")}
+WIDTHS = {"naive model": np.geomspace(300, 3, 26), "SSF model": np.geomspace(300, 3, 16)}
+EFFECTS = [f"an_effect_of_a_long_name_{k}" for k in range(24)]
+
+FIGURES = {
+    "corner_plot": lambda s: plots.corner_plot(s.result),
+    "trace_plot": lambda s: plots.trace_plot(s.result),
+    "insertion_plot": lambda s: plots.insertion_plot(s.result),
+    "run_plot": lambda s: plots.run_plot(s.result),
+    "playing_field": lambda s: plots.playing_field(**field()),
+    "reach_map": lambda s: plots.reach_map(field()["utility"], X, Y, axis_mm=(524.0, 580.0)),
+    "spatial_sensitivity": lambda s: plots.spatial_sensitivity(blob()),
+    "ssf_by_order": lambda s: plots.ssf_by_order(
+        dict.fromkeys((1, 2, 3), blob()), {1: -389.8, 2: -394.0, 3: -397.7}, {1: 0.02, 2: 0.5, 3: 0.6}
+    ),
+    "log_evidences": lambda s: plots.log_evidences([1, 2], [-3.0, -5.0], [0.1, 0.2]),
+    "posterior_widths": lambda s: plots.posterior_widths(WIDTHS),
+    "information_gained": lambda s: plots.information_gained({k: np.arange(16.0) for k in WIDTHS}),
+    "readings_by_orientation": lambda s: plots.readings_by_orientation(s.recording),
+    "predicted_against_recorded": lambda s: plots.predicted_against_recorded(
+        s.recording, s.recording.readings, np.ones(len(s.recording))
+    ),
+    "calibration_check": lambda s: plots.calibration_check(s.recording, s.recording.readings, s.recording.readings),
+    "residuals_against": lambda s: plots.residuals_against(
+        np.arange(40.0), np.sin(np.arange(40.0)), np.zeros(40), label="time (s)", unit="LEGO"
+    ),
+    "readings_needed": lambda s: plots.readings_needed(ROWS),
+    "readings_needed, one row": lambda s: plots.readings_needed({"inside, naive": row(16.0)}),
+    "widths_of_runs": lambda s: plots.widths_of_runs(RUNS),
+    "widths_of_runs, one": lambda s: plots.widths_of_runs({"inside, SSF": RUNS["inside, SSF"]}),
+    "hypothesis_probabilities": lambda s: plots.hypothesis_probabilities(EFFECTS[:3], [0.5, 0.3, 0.2]),
+    "audit_matrix": lambda s: plots.audit_matrix(
+        EFFECTS, ["fine", "aliased", "invisible"] * 8, np.full((24, 24), 0.995), alias=0.99
+    ),
+    "arm_and_sensor": lambda s: plots.arm_and_sensor(read_geometry(shipped_geometry()), (600.0, 260.0)),
+    "sensor_orientations": lambda s: plots.sensor_orientations(s.recording),
+    "quadrant_patterns": lambda s: plots.quadrant_patterns(s.recording),
+    "residuals_by_scan": lambda s: plots.residuals_by_scan(
+        s.recording, np.sin(np.arange(len(s.recording))), np.zeros(len(s.recording))
+    ),
+    "reliability_diagram": lambda s: plots.reliability_diagram(
+        [Bin(0.15, share([True] * 3 + [False] * 17)), Bin(0.5, share([True] * 11 + [False] * 9))]
+    ),
+    "confusion_matrix": lambda s: plots.confusion_matrix(["a", "b"], ["a", "b"], np.array([[3, 1], [0, 4]])),
+}
+
+
+def test_every_plot_function_is_here():
+    others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "explain_field", "grid_of_axes", "png", "stack_of_axes", "svg"}
+    of_a_diagnosis = {  # laid out by `svg`, and drawn by the tests of its pages
+        "before_and_after",
+        "correlation_of_neighbours",
+        "gain_by_scan",
+        "lattice_of_readings",
+        "lost_readings",
+        "mean_residuals_along",
+        "one_scan",
+        "readings_in_order",
+        "residual_clouds",
+        "spread_by_level",
+        "tails",
+    }
+    assert {name.partition(",")[0] for name in FIGURES} == set(plots.__all__) - others - of_a_diagnosis
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_is_pyplots_can_be_read_and_its_key_hides_nothing(name, result, recording):
+    drawn = FIGURES[name](SimpleNamespace(result=result, recording=recording))
+    figure = next(ax for ax in np.atleast_1d(drawn).flat if ax is not None).figure
+    assert plt.gcf() is figure
+    out = io.BytesIO()
+    plt.savefig(out, dpi=20)
+    assert np.asarray(Image.open(out).convert("L")).std() > 1.0
+    assert smallest_type_pt(figure) >= 8.5
+    assert hidden_by_keys(figure) == []
+    plots.png(figure, dpi=20)
+    assert plt.get_fignums() == []
+
+
+def smallest_type_pt(figure):
+    """As a page shows it: drawn with a tight box and shrunk to the page's width where it is wider."""
+    width_in = figure.get_tightbbox().width + 0.2  # matplotlib's margin around it
+    shown = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]
+    return min(t.get_fontsize() for t in shown) * min(1.0, plots.PAGE_IN / width_in)
+
+
+def hidden_by_keys(figure):
+    """Titles, labels, numbers at ticks and points of curves that lie under a key."""
+    axes = [ax for ax in figure.axes if ax.get_visible()]
+    renderer, hidden = figure.canvas.get_renderer(), []
+    for key in [*figure.legends, *(ax.get_legend() for ax in axes if ax.get_legend())]:
+        box = key.get_window_extent()
+        for ax in (ax for ax in axes if ax.axison):
+            texts = [t for t in (ax.title, ax._left_title, *ax.texts) if t.get_text()]
+            hidden += [t.get_text() for t in texts if t.get_visible() and box.overlaps(t.get_window_extent())]
+            for axis in (ax.xaxis, ax.yaxis):
+                around = axis.get_tightbbox(renderer)  # ticks that are drawn, their numbers, the label
+                hidden += [f"{axis.axis_name} axis"] * bool(around is not None and box.overlaps(around))
+            for line in ax.lines:
+                xy = np.asarray(line.get_xydata(), dtype=float)
+                if line.get_transform() == ax.transData:
+                    points = ax.transData.transform(xy[np.isfinite(xy).all(axis=1)])
+                    hidden += [f"{line.get_label()} at {p}" for p in points if box.contains(*p)]
+    return hidden
+
+
+def test_drawing_on_given_axes_opens_no_figure(result):
+    sheet = plt.figure()
+    cells = sheet.subplots(6, 6)
+    assert plots.corner_plot(result, axes=cells)[5, 0] is cells[5, 0]
+    with pytest.raises(ShapeError, match=r"allowed: \(4, 1\)"):
+        plots.run_plot(result, axes=cells)
+    one = sheet.add_subplot()
+    assert plots.posterior_widths(WIDTHS, ax=one) is one
+    assert plt.get_fignums() == [sheet.number]
+    plots.png(one, dpi=20)
+    assert plt.get_fignums() == [sheet.number]
+
+
+def test_the_arms_reach_is_the_same_grey_in_both_drawings():
+    view = plots.playing_field(**field())
+    check = plots.reach_map(field()["utility"], X, Y, axis_mm=(524.0, 580.0))
+    assert view.get_facecolor() == check.get_facecolor()
+    for ax in (view, check):
+        image = ax.images[0].get_array()
+        assert np.ma.getmaskarray(image).tolist() == np.isnan(field()["utility"]).tolist()

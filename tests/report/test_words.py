@@ -1,0 +1,47 @@
+"""Numbers with their errors, names without their units."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from probewise.report.words import interval, unit_of, with_error, within, without_unit
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "written"),
+    [
+        (-389.8199, 0.0234, "−389.820 ± 0.023"),
+        (-394.28, 0.53, "−394.28 ± 0.53"),
+        (1022.83, 1.53, "1022.8 ± 1.5"),
+        (137.2, 11.4, "137 ± 11"),
+        (0.0, 0.0996, "0.000 ± 0.100"),
+        (12.5, 0.0, "12.5"),
+        (float("nan"), 1.0, "–"),
+        (3.0, float("nan"), "3"),
+    ],
+)
+def test_a_value_is_written_to_the_second_figure_of_its_error(value, error, written):
+    assert with_error(value, error) == written
+
+
+def test_a_unit_follows_the_error():
+    assert with_error(90.94, 3.82, "mm") == "90.9 ± 3.8 mm"
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-8, 1e6))
+def test_no_error_above_zero_is_written_as_zero(value, error):
+    written = with_error(value, error).partition(" ± ")[2]
+    assert any(figure in written for figure in "123456789")
+
+
+def test_an_interval_is_written_to_the_third_figure_of_its_width():
+    assert interval(0.030724, 0.035694) == "0.03072 to 0.03569"
+    assert interval(-0.020431, 5.4e-06) == "−0.0204 to 0.0000"
+    assert within(0.032489, 0.030724, 0.035694) == ("0.03249", "0.03072 to 0.03569")
+    assert within(3.0, 3.0, 3.0) == ("3", "3")
+
+
+def test_a_parameters_unit_is_told_once():
+    assert (without_unit("rectangle.width_mm"), unit_of("rectangle.width_mm")) == ("rectangle width", "mm")
+    assert (without_unit("angle_rad"), unit_of("angle_rad")) == ("angle", "rad")
+    assert (without_unit("A_1"), unit_of("A_1")) == ("A 1", "")

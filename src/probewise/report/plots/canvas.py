@@ -162,9 +162,8 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
 
 
 def _legend_width(labels: Sequence[str], n_columns: int) -> int:
-    """Count the letters across a legend, which is filled column by column; each sample is as wide as five."""
-    n_rows = -(-len(labels) // n_columns)
-    return sum(max(map(len, labels[k : k + n_rows])) + 6 for k in range(0, len(labels), n_rows))
+    """Count the letters across a legend, whose first columns hold one label more; each sample is as wide as five."""
+    return sum(max(map(len, column)) + 6 for column in np.array_split(np.array(labels, dtype=np.object_), n_columns))
 
 
 def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:

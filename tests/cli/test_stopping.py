@@ -232,7 +232,8 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
     (out / "notes.txt").write_text("mine")
     assert main(command(sensor_file, out)) == 0
     names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
-    assert names == {"journal.jsonl", "frames/001.png", "report.html", "run.gif", "notes.txt"}
+    results = {"report.html", "run.gif", "result.json", "samples.csv"}
+    assert names == {"journal.jsonl", "frames/001.png", "notes.txt"} | results
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows cannot bound the size of a file")

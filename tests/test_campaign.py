@@ -79,7 +79,7 @@ def test_other_settings_and_damaged_files_are_refused(tmp_path):
     path.write_text(json.dumps({"something": "else"}) + "\n")
     with pytest.raises(FileError, match="no campaign begins here"):
         read_campaign(path)
-    with pytest.raises(FileError, match="cannot be read"):
+    with pytest.raises(FileError, match="there is no such file"):
         read_campaign(tmp_path / "missing.jsonl")
 
 

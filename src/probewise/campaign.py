@@ -17,8 +17,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from probewise.errors import FileError, NotConvergedError, ParameterError
-from probewise.recordings import locked, write_text_atomically
+from probewise.errors import FileError, NotConvergedError, ParameterError, shown
+from probewise.progress import Progress, silent
+from probewise.recordings import json_of, locked, read_bytes, write_text_atomically
 
 __all__ = ["FORMAT", "Finished", "read_campaign", "run_campaign"]
 
@@ -42,7 +43,8 @@ def run_campaign(
     path: str | os.PathLike[str],
     settings: Mapping[str, Any],
     executor: Executor | None = None,
-    progress: Callable[[str, Result], None] | None = None,
+    progress: Progress = silent,
+    noun: str = "tasks",
 ) -> dict[str, Result]:
     """Do every task that the file does not hold yet.
 
@@ -59,7 +61,9 @@ def run_campaign(
     executor
         Any `concurrent.futures.Executor`, also one of other machines; None: here, one after another.
     progress
-        Called with key and result of every task that ends.
+        Told how many tasks have ended, those of an earlier go with them, and the key of the last.
+    noun
+        What it calls them.
 
     Returns
     -------
@@ -81,11 +85,11 @@ def run_campaign(
         done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
         left = {key: task for key, task in tasks.items() if key not in done}
         with _Lines(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
+            progress(noun, len(done), len(tasks))
             for key, result in ended:
                 line = json.loads(lines.add(key, result))  # as a later reader will see it
                 done[key] = line["result"]
-                if progress is not None:
-                    progress(key, done[key])
+                progress(noun, len(done), len(tasks), key)
     return {key: done[key] for key in tasks}
 
 
@@ -97,12 +101,8 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
     FileError
         If it is missing, no campaign's, or damaged before its last line.
     """
-    try:
-        lines = Path(path).read_bytes().splitlines(keepends=True)
-    except OSError as error:
-        raise FileError(path, f"cannot be read ({error.strerror})", "a campaign's file") from error
-    if lines and not lines[-1].endswith(b"\n"):
-        lines.pop()
+    # The last is what follows the last line end: nothing, or a line that was torn.
+    *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
     rows = [_parsed(path, number, line) for number, line in enumerate(lines, start=1)]
     if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
         raise FileError(path, "no campaign begins here", f'a first line with "format": "{FORMAT}" and its settings')
@@ -112,16 +112,13 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
         if not (isinstance(key, str) and isinstance(result, dict)):
             raise FileError(path, "not a finished task", '"key" and "result"', row=number)
         if key in results:
-            raise FileError(path, f"task {key!r} a second time", "every task once", row=number)
+            raise FileError(path, f"task {shown(key)} a second time", "every task once", row=number)
         results[key] = result
     return Finished(rows[0]["settings"], results)
 
 
 def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str, Any]:
-    try:
-        row = json.loads(line)
-    except ValueError as error:
-        raise FileError(path, f"not JSON ({error})", "one JSON object a line", row=number) from error
+    row = json_of(path, line, "one JSON object a line", row=number)
     if not isinstance(row, dict):
         raise FileError(path, "not an object", "one JSON object a line", row=number)
     return row

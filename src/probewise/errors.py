@@ -15,9 +15,29 @@ __all__ = [
     "ProbewiseError",
     "ReachError",
     "ShapeError",
+    "shortened",
+    "shown",
 ]
 
-_LONGEST = 160  # characters of a value in a message
+_LONGEST_VALUE = 100  # characters of a bad value that a message repeats
+_LONGEST_PART = 400  # characters of each part of a message
+
+
+def shortened(text: str, most: int = _LONGEST_PART) -> str:
+    """Cut a text after `most` characters, say how long it was, and escape what a terminal would obey."""
+    begun = text[:most]
+    if not begun.isprintable():
+        begun = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in begun)
+    return begun if len(text) <= most else f"{begun}... ({len(text)} characters)"
+
+
+def shown(value: object, most: int = _LONGEST_VALUE) -> str:
+    """Write a value in one line as Python would, cut after `most` characters."""
+    try:
+        text = " ".join(repr(value).split())
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, or a list nested as deep
+        return f"a huge {type(value).__name__}"
+    return shortened(text, most)
 
 
 class ProbewiseError(Exception):
@@ -29,7 +49,7 @@ class ParameterError(ProbewiseError, ValueError):
 
     def __init__(self, name: str, value: object, allowed: str) -> None:
         self.name, self.value, self.allowed = name, value, allowed
-        super().__init__(f"{name} is {_in_one_line(value)}; allowed: {allowed}")
+        super().__init__(f"{shortened(name)} is {shown(value)}; allowed: {shortened(allowed)}")
 
     def __reduce__(self) -> tuple[object, ...]:
         # Exceptions are pickled as type(*args), which would hand the message back as the name.
@@ -51,8 +71,8 @@ class FileError(ProbewiseError, ValueError):
         if row is not None:
             where += f", row {row}"
         if column is not None:
-            where += f", column {column}"
-        super().__init__(f"{where}: {found}; allowed: {allowed}")
+            where += f", column {shortened(column, _LONGEST_VALUE)}"
+        super().__init__(f"{where}: {shortened(found)}; allowed: {shortened(allowed)}")
 
     def __reduce__(self) -> tuple[object, ...]:
         # As for ParameterError; `partial` carries what is keyword-only.
@@ -85,9 +105,3 @@ class NotSavedWarning(UserWarning):
 
 class LowBatteryWarning(UserWarning):
     """Warn of a battery that will not drive the instrument much longer, or not as it should."""
-
-
-def _in_one_line(value: object) -> str:
-    """Show a value in one line of bearable length: a table or a long array would hide what is wrong with it."""
-    shown = " ".join(repr(value).split())
-    return shown if len(shown) <= _LONGEST else f"{shown[: _LONGEST - 3]}... ({type(value).__name__})"

@@ -106,7 +106,7 @@ def _with(value: object, *keys: str | int) -> Callable[[dict[str, Any]], None]:
         (_with("x", "samples", 3, 2), "samples is"),
         (_with([1.0], "samples", 3), "equal dimensions"),
         (_with([[1.0] * 8] * 3, "samples"), "500 or more"),
-        (_with(2, "n_gaussians"), "names"),
+        (_with(2, "n_gaussians"), "n_gaussians is 2; allowed: 1 to 1"),
         (_with(0, "n_gaussians"), "n_gaussians"),
         (_with(1.5, "n_gaussians"), "a whole number"),
         (_with(-1.0, "field", "pixel_mm"), "pixel_mm"),
@@ -143,7 +143,7 @@ def test_what_is_no_sensor_at_all_is_refused(tmp_path: Path, content: bytes) -> 
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"nothing\.json.*cannot be read"):
+    with pytest.raises(FileError, match=r"nothing\.json.*there is no such file"):
         read_sensor(tmp_path / "nothing.json")
 
 

@@ -52,9 +52,9 @@ def test_other_processes_come_to_the_same(study, tmp_path):
 
 
 def test_what_a_file_holds_is_not_done_again(study):
-    seen = []
-    again = run_study({REFERENCE: 1}, path=study[1], max_readings=3, progress=lambda key, _: seen.append(key))
-    assert not seen
+    told = []
+    again = run_study({REFERENCE: 1}, path=study[1], max_readings=3, progress=lambda *words: told.append(words))
+    assert told == [("runs", 1, 1)]
     assert again.trials[REFERENCE] == study[0].trials[REFERENCE][:1]
     assert list(again.table()) == []
     assert read_study(study[1], ROWS).trials == study[0].trials
@@ -83,10 +83,10 @@ def test_a_cluster_that_loses_a_worker_loses_and_counts_twice_nothing(study, tmp
     ):
         victim = cluster.workers[0].process.process
 
-        def kill(key, result):
-            if not killed:
+        def kill(stage, done, total, note=""):
+            if note and not killed:
                 victim._process.kill()
-                killed.append(key)
+                killed.append(note)
 
         found = run_study(ROWS, path=path, executor=client.get_executor(pure=False), progress=kill, **BRIEF)
     assert killed

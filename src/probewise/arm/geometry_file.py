@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from probewise.arm.geometry import JOINTS, Geometry, Joint
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, ParameterError, shown
+from probewise.recordings.text import read_text
 
 __all__ = ["FORMAT", "read_geometry", "shipped_geometry"]
 
@@ -33,13 +34,12 @@ def read_geometry(path: str | Path) -> Geometry:
         it names the file and the entry, what stood there and what is allowed.
     """
     path = Path(path)
+    text = read_text(path, "an arm's geometry, TOML in UTF-8")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(path, f"cannot be read ({error.strerror})", "an arm's geometry, TOML") from error
-    except UnicodeDecodeError as error:
-        raise FileError(path, "not UTF-8", "an arm's geometry, TOML in UTF-8") from error
-    except tomllib.TOMLDecodeError as error:
+        content = tomllib.loads(text)
+    except RecursionError as error:
+        raise FileError(path, "tables or lists nested too deep", "an arm's geometry, TOML") from error
+    except ValueError as error:  # not TOML, or a number of thousands of digits
         raise FileError(path, f"not TOML ({error})", "an arm's geometry, TOML") from error
     top = _Table(path, "", content)
     if top.take("format") != FORMAT:
@@ -75,7 +75,7 @@ def read_geometry(path: str | Path) -> Geometry:
             whole_percent=whole,
         )
     except ParameterError as error:
-        raise FileError(path, f"{error.name} is {error.value!r}", error.allowed) from error
+        raise FileError(path, f"{error.name} is {shown(error.value)}", error.allowed) from error
     for table in (top, field, base, links, sensor, joints, *tables.values()):
         table.finish()
     return geometry
@@ -89,7 +89,7 @@ class _Table:
         self._left = set(content)
 
     def fail(self, name: str, allowed: str) -> FileError:
-        return FileError(self.path, f"{self.where}{name} is {self.content[name]!r}", allowed)
+        return FileError(self.path, f"{self.where}{name} is {shown(self.content[name])}", allowed)
 
     def take(self, name: str) -> Any:
         if name not in self.content:
@@ -126,4 +126,4 @@ def _joint(table: _Table) -> Joint:
     try:
         return Joint("ABC".index(port), ratio, home, low, high, play, stop)
     except ParameterError as error:
-        raise FileError(table.path, f"{table.where}{error.name} is {error.value!r}", error.allowed) from error
+        raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error

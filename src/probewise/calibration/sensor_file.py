@@ -22,8 +22,8 @@ from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 from probewise.effects import EFFECTS, EdgeShadow
-from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
-from probewise.recordings import Instrumentation, strict_json, write_text_atomically
+from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError, shown
+from probewise.recordings import Instrumentation, json_of, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
     AnyEffect,
@@ -55,6 +55,7 @@ T = TypeVar("T")
 
 FORMAT = "sensor/1"
 MIN_SAMPLES = 500
+_ALLOWED = "a sensor.json as `probewise calibrate` writes"
 # Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
 _FOR_A_FREE_FORM = 4  # Gaussians that stand for it where only a mixture will do
@@ -158,6 +159,9 @@ class FittedSensor(ShowsItself):
         for name, without in self.absent.items():
             if name not in self.effects or without.shape != (len(samples),):
                 raise ParameterError("absent", name, f"effects of the model, each with {len(samples)} truth values")
+        if not 1 <= self.n_gaussians <= len(self.names) // 6:
+            allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
+            raise ParameterError("n_gaussians", self.n_gaussians, allowed)
         wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
@@ -338,7 +342,7 @@ class FittedSensor(ShowsItself):
         return f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}"
 
     @classmethod
-    def from_json(cls, text: str, path: object = "sensor.json") -> FittedSensor:
+    def from_json(cls, text: str, path: str | os.PathLike[str] = "sensor.json") -> FittedSensor:
         """Read what `to_json` wrote; `path` is what error messages call it.
 
         Raises
@@ -346,15 +350,12 @@ class FittedSensor(ShowsItself):
         FileError
             If the text is damaged, incomplete, or of another format or version of it.
         """
-        try:
-            document = strict_json(text)
-        except (ValueError, RecursionError) as error:
-            raise FileError(
-                path, f"no strict JSON ({error})", "a sensor.json as `probewise calibrate` writes"
-            ) from error
+        document = json_of(path, text, _ALLOWED)
         found = document.get("format") if isinstance(document, dict) else None
         if found != FORMAT:
-            raise FileError(path, f"format {found!r}", f"{FORMAT!r}; calibrate the recording anew with this version")
+            raise FileError(
+                path, f"format {shown(found)}", f"{FORMAT!r}; calibrate the recording anew with this version"
+            )
         read = _Reader(path, document)
         samples = read.array("samples", ndim=2)
         try:
@@ -410,12 +411,7 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
     FileError
         If the file is missing, damaged, or of another format.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise FileError(path, f"cannot be read ({reason})", "a sensor.json as `probewise calibrate` writes") from error
-    return FittedSensor.from_json(text, path)
+    return FittedSensor.from_json(read_text(Path(path), _ALLOWED), path)
 
 
 def require_sensor(sensor: object, more: str = "") -> None:
@@ -444,7 +440,7 @@ class _Reader:
         return at
 
     def wrong(self, place: str, found: object, allowed: str) -> FileError:
-        return FileError(self.path, f"{place} is {found!r:.60}", allowed)
+        return FileError(self.path, f"{place} is {shown(found)}", allowed)
 
     def text(self, *keys: str) -> str:
         found = self.value(*keys)

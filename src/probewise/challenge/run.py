@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from typing import Any
 
@@ -11,6 +11,7 @@ from probewise._version import __version__
 from probewise.campaign import run_campaign
 from probewise.challenge.case import Task, run_case
 from probewise.errors import ParameterError
+from probewise.progress import Progress, silent
 
 __all__ = ["run_challenge"]
 
@@ -21,7 +22,7 @@ def run_challenge(
     seed: int,
     path: str | os.PathLike[str],
     executor: Executor | None = None,
-    progress: Callable[[str, Mapping[str, Any]], None] | None = None,
+    progress: Progress = silent,
 ) -> tuple[Mapping[str, Any], ...]:
     """Run the first cases of a challenge, or go on with one that was stopped.
 
@@ -36,7 +37,7 @@ def run_challenge(
     executor
         Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
     progress
-        Called with key and result of every case that ends.
+        Told how many cases have ended.
 
     Returns
     -------
@@ -57,5 +58,6 @@ def run_challenge(
         settings={"challenge": __version__, "seed": seed},
         executor=executor,
         progress=progress,
+        noun="cases",
     )
     return tuple(results[task.key] for task in tasks)

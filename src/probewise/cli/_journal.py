@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +49,10 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
         declared = [None if value is None else float(value) for value in (step, low, high)]
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(path, f"unusable options: {_words(error)}", "options as explore writes them", row=1) from error
-    return replace(sensor.instrumentation, step=declared[0], min=declared[1], max=declared[2])
+    step, low, high = declared
+    if not all(value is None or math.isfinite(value) for value in declared) or (step is not None and step <= 0):
+        raise FileError(path, f"unusable options: step {step}, range {low} to {high}", "finite, a step above 0", row=1)
+    return replace(sensor.instrumentation, step=step, min=low, max=high)
 
 
 def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:

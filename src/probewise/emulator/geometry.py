@@ -12,9 +12,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from probewise.errors import FileError
+from probewise.errors import FileError, shown
+from probewise.recordings import read_text
 
 __all__ = ["Geometry", "JointNumbers", "read_geometry", "shipped_geometry"]
+
+LARGEST = 1e6
 
 
 @dataclass(frozen=True)
@@ -57,21 +60,22 @@ def read_geometry(path: Path) -> Geometry:
     FileError
         If it is no TOML file or lacks a number.
     """
+    text = read_text(path, "an arm's file of format arm/1")
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # not TOML, a number of thousands of digits, or nested as deep
         raise FileError(path, f"not TOML: {error}", "an arm's file of format arm/1") from error
 
     def number(*keys: str) -> float:
         value = _value(path, table, keys)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise FileError(path, f"{'.'.join(keys)} is {value!r}", "a number")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            raise FileError(path, f"{'.'.join(keys)} is {shown(value)}", f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
     def joint(name: str) -> JointNumbers:
         port = _value(path, table, ("joints", name, "port"))
         if port not in ("A", "B", "C"):
-            raise FileError(path, f"joints.{name}.port is {port!r}", "A, B or C")
+            raise FileError(path, f"joints.{name}.port is {shown(port)}", "A, B or C")
         ratio = number("joints", name, "gear_ratio")
         if ratio == 0:
             raise FileError(path, f"joints.{name}.gear_ratio is 0", "any other number")
@@ -82,7 +86,7 @@ def read_geometry(path: Path) -> Geometry:
 
     elbow = _value(path, table, ("links", "elbow"))
     if elbow not in ("absolute", "relative"):
-        raise FileError(path, f"links.elbow is {elbow!r}", '"absolute" or "relative"')
+        raise FileError(path, f"links.elbow is {shown(elbow)}", '"absolute" or "relative"')
     joints = (joint("base"), joint("shoulder"), joint("elbow"))
     if len({j.port for j in joints}) < len(joints):
         raise FileError(path, f"the joints' ports are {', '.join(j.port for j in joints)}", "three different ports")

@@ -29,12 +29,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Pose, Reading
-from probewise.errors import FileError
+from probewise.errors import FileError, shown
 from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.locking import locked
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.recordings.strict_json import strict_json
+from probewise.recordings.strict_json import json_of
+from probewise.recordings.text import read_bytes
 
 __all__ = [
     "FORMAT",
@@ -153,22 +154,21 @@ def read_journal(path: str | Path) -> Journal:
     FileError
         If the file is missing, is no journal of this version, or is damaged before its last line.
     """
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise FileError(path, f"cannot be read ({error.strerror})", "a journal written by this package") from error
+    raw = read_bytes(Path(path), "a journal written by this package")
     *lines, tail = raw.split(b"\n")
     if not lines:
         raise FileError(path, "no whole first line", f'a journal, whose first line says "format": "{FORMAT}"', row=1)
     settings = _parse(path, lines[0], 1)
     if settings.get("format") != FORMAT:
         raise FileError(
-            path, f"format {settings.get('format')!r}", f'"{FORMAT}", the version this package writes', row=1
+            path, f"format {shown(settings.get('format'))}", f'"{FORMAT}", the version this package writes', row=1
         )
     entries = [_entry(path, _parse(path, line, row), row) for row, line in enumerate(lines[1:], start=2)]
     for row, entry in enumerate(entries, start=2):
         if entry.index != row - 1:
-            raise FileError(path, f"index {entry.index}", f"{row - 1}: one line a measurement, in order", row=row)
+            raise FileError(
+                path, f"index {shown(entry.index)}", f"{row - 1}: one line a measurement, in order", row=row
+            )
     notes: list[str] = []
     if tail:
         saved = _salvaged(path, tail, len(entries) + 1)
@@ -181,10 +181,7 @@ def read_journal(path: str | Path) -> Journal:
 
 
 def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
-    try:
-        value = strict_json(line.decode())
-    except (ValueError, RecursionError) as error:
-        raise FileError(path, f"no JSON ({error})", "one JSON object a line", row=row) from error
+    value = json_of(path, line, "one JSON object a line", row=row)
     if not isinstance(value, dict):
         raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
     return value
@@ -206,11 +203,11 @@ def _salvaged(path: str | Path, tail: bytes, index: int) -> Entry | None:
 def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
     column = "index"
     try:
-        index = int(line["index"])
+        index = line["index"]
         column = "pose"
         pose = _pose(line["pose"])
         column = "time_s"
-        time_s = float(line["time_s"])
+        time_s = _number(line["time_s"])
         column = "reading"
         value = _or_nan(line["reading"])
         column = "covariates"
@@ -225,7 +222,8 @@ def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
 
 
 def _belief(line: Mapping[str, Any]) -> Belief:
-    return Belief(dict(line["mean"]), dict(line["sd"]), float(line["bits"]), _pose(line["next"]))
+    mean, sd = ({name: _number(value) for name, value in line[key].items()} for key in ("mean", "sd"))
+    return Belief(mean, sd, _number(line["bits"]), _pose(line["next"]))
 
 
 def _or_null(value: float) -> float | None:
@@ -234,13 +232,20 @@ def _or_null(value: float) -> float | None:
 
 
 def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else float(value)
+    return math.nan if value is None else _number(value)
+
+
+def _number(value: object) -> float:
+    """Take a JSON number, not a text that Python could make one of."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{shown(value)} is no number")
+    return float(value)
 
 
 def _pose(line: Mapping[str, Any]) -> Pose:
     height_mm = line.get("height_mm")
-    place = (float(line["x_mm"]), float(line["y_mm"]), float(line["orientation_rad"]))
-    return Pose(*place, None if height_mm is None else float(height_mm))
+    place = (_number(line["x_mm"]), _number(line["y_mm"]), _number(line["orientation_rad"]))
+    return Pose(*place, None if height_mm is None else _number(height_mm))
 
 
 def _pose_line(pose: Pose) -> dict[str, float]:
@@ -255,7 +260,7 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
         name for name in {*there, *here} - {"format", "version", "spawn_key"} if there.get(name) != here.get(name)
     )
     if different:
-        had = "; ".join(f"{name} {there.get(name)!r} there, {here.get(name)!r} here" for name in different)
+        had = "; ".join(f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
         raise FileError(
             journal.path,
             f"a run with other settings: {had}",

@@ -25,7 +25,8 @@ from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
 from probewise.recordings.prediction import Prediction, read_prediction, write_prediction
 from probewise.recordings.shipping import shipped
-from probewise.recordings.strict_json import strict_json
+from probewise.recordings.strict_json import json_of, strict_json
+from probewise.recordings.text import read_bytes, read_text
 
 __all__ = [
     "Disc",
@@ -42,12 +43,15 @@ __all__ = [
     "Stripes",
     "Uniform",
     "fingerprint",
+    "json_of",
     "locked",
     "paper_plan",
+    "read_bytes",
     "read_plan",
     "read_plan_and_readings",
     "read_prediction",
     "read_recording",
+    "read_text",
     "shipped",
     "strict_json",
     "two_way_plan",

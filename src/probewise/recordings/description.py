@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, ParameterError, shortened
 from probewise.recordings.images import read_image
 from probewise.recordings.patterns import (
     Disc,
@@ -25,8 +25,9 @@ from probewise.recordings.patterns import (
     Uniform,
 )
 from probewise.recordings.plan import Instrumentation
-from probewise.recordings.strict_json import strict_json
-from probewise.recordings.table import LARGEST, read_text
+from probewise.recordings.strict_json import json_of
+from probewise.recordings.table import LARGEST
+from probewise.recordings.text import read_text
 
 __all__ = ["Description", "degrees_of", "description_text", "read_description"]
 
@@ -114,8 +115,7 @@ def _is_pair(value: object) -> bool:
 
 
 def _shown(value: object) -> str:
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shortened(json.dumps(value, ensure_ascii=False, default=str), 60)
 
 
 def _uniform(f: _Fields) -> Pattern:
@@ -198,13 +198,7 @@ def read_description(path: Path) -> Description:
         If it is missing, does not parse, or a field is missing or not what it should be.
     """
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
-    try:
-        content = strict_json(text)
-    except json.JSONDecodeError as error:
-        found = f"does not parse as JSON: {error.msg} at character {error.colno}"
-        raise FileError(path, found, "strict JSON", row=error.lineno) from error
-    except (ValueError, RecursionError) as error:
-        raise FileError(path, f"does not parse as JSON: {error}", "strict JSON, each name once") from error
+    content = json_of(path, text, "strict JSON, each name once")
     top = _Fields(path, "", content)
     if top.text("format", f'"{FORMAT}"') != FORMAT:
         raise top.fail("format", content["format"], f'"{FORMAT}"')

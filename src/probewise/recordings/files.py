@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, ParameterError, shown
+from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
 from probewise.recordings.description import Description, degrees_of, description_text, read_description
 from probewise.recordings.images import image_bytes
 from probewise.recordings.patterns import Image
 from probewise.recordings.plan import Plan, Recording, range_in_words
-from probewise.recordings.table import LARGEST, Table, csv_text, is_number, number_text, read_table
+from probewise.recordings.table import LARGEST, MISSING, Table, count_numbers, csv_text, number_text, read_table
 
 __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recording", "write_plan", "write_recording"]
 
@@ -27,18 +29,18 @@ _FAR_AWAY = 100.0  # times as far as nine in ten of all places lie apart
 PathLike = str | os.PathLike[str]
 
 
-def read_recording(path: PathLike) -> Recording:
+def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     """Read a recording, NAME.csv with NAME.json beside it.
 
     Missing readings become NaN, readings outside the declared range keep their value; both are
-    counted in the notes and not `usable`.
+    counted in the notes and not `usable`. `progress` is told as rows come in.
 
     Raises
     ------
     FileError
         If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
     """
-    plan, readings, notes = _read(Path(path))
+    plan, readings, notes = _read(Path(path), progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -51,7 +53,7 @@ def read_recording(path: PathLike) -> Recording:
     return replace(recording, notes=(*notes, *recording.notes_on_what_is_left_out()))
 
 
-def read_plan(path: PathLike) -> Plan:
+def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     """Read a plan; a recording is accepted too, its readings play no part.
 
     Raises
@@ -59,10 +61,10 @@ def read_plan(path: PathLike) -> Plan:
     FileError
         If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
     """
-    return _read(Path(path))[0]
+    return _read(Path(path), progress)[0]
 
 
-def read_plan_and_readings(path: PathLike) -> tuple[Plan, FloatArray | None]:
+def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
     """Read a plan or a recording, whichever it is: the plan, and the readings (n_points,) or None.
 
     Raises
@@ -70,7 +72,7 @@ def read_plan_and_readings(path: PathLike) -> tuple[Plan, FloatArray | None]:
     FileError
         If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
     """
-    plan, readings, _ = _read(Path(path))
+    plan, readings, _ = _read(Path(path), progress)
     return plan, readings
 
 
@@ -125,17 +127,23 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
         "x_mm": _cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
         "y_mm": _cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
-        "orientation_deg": [number_text(degrees_of(float(v))) for v in plan.orientation_rad],
+        "orientation_deg": _in_degrees(plan.orientation_rad),
         "time_s": _cells("time_s", plan.time_s),
     }
     return columns | {name: _cells(name, values) for name, values in plan.covariates.items()}
+
+
+def _in_degrees(angles_rad: FloatArray) -> list[str]:
+    distinct, which = np.unique(angles_rad, return_inverse=True)  # few, and each takes a search
+    cells = [number_text(degrees_of(angle)) for angle in distinct.tolist()]
+    return [cells[k] for k in which.reshape(-1).tolist()]
 
 
 def _cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]:
     bad = np.isinf(values) | (np.abs(values) > largest)
     if bad.any():
         raise ParameterError(name, float(values[bad][0]), f"finite numbers of magnitude up to {largest:g}")
-    return [number_text(value) for value in values]
+    return [number_text(value) for value in values.tolist()]
 
 
 def _distinct_neighbours(plan: Plan) -> dict[int, str]:
@@ -167,10 +175,10 @@ def _write(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
     write_text_atomically(path, csv_text(columns))
 
 
-def _read(path: Path) -> tuple[Plan, FloatArray | None, list[str]]:
+def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
     if path.suffix.lower() == ".json":
         raise FileError(path, "this is a description", "the name of the CSV beside it")
-    table = read_table(path)
+    table = read_table(path, progress=progress)
     table.require("x_mm", "y_mm")
     if not len(table):
         raise FileError(path, "there is no reading at all, only a header", "one row a reading")
@@ -180,12 +188,12 @@ def _read(path: Path) -> tuple[Plan, FloatArray | None, list[str]]:
     time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
-        notes.append(f"time_s runs backwards at row {table.rows[int(back[0]) + 1]}")
+        notes.append(f"time_s runs backwards at row {table.row(int(back[0]) + 1)}")
     orientation_deg = table.numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
     plan = Plan(
         x_mm=table.numbers("x_mm", largest=_LARGEST_PLACE_MM),
         y_mm=table.numbers("y_mm", largest=_LARGEST_PLACE_MM),
-        orientation_rad=np.array([np.radians(v) for v in orientation_deg]),
+        orientation_rad=np.radians(orientation_deg),
         time_s=time_s,
         scan=scan,
         scan_names=scan_names,
@@ -206,9 +214,7 @@ def _far_away(table: Table, name: str, places_mm: FloatArray) -> list[str]:
     k = int(np.argmax(np.abs(places_mm - middle)))
     if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
         return []
-    return [
-        f"row {table.rows[k]}: {name} is {places_mm[k]:g}, nine in ten of the others {low:g} to {high:g}: mistyped?"
-    ]
+    return [f"row {table.row(k)}: {name} is {places_mm[k]:g}, nine in ten of the others {low:g} to {high:g}: mistyped?"]
 
 
 def _readings(table: Table, description: Description) -> FloatArray:
@@ -222,11 +228,10 @@ def _scans(table: Table) -> tuple[IntArray, tuple[str, ...]]:
     """Count scans up at every change of name: one that returns later is a new scan."""
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
-    cells = table.columns["scan"]
-    starts = [k for k in range(len(cells)) if k == 0 or cells[k] != cells[k - 1]]
-    scan = np.zeros(len(cells), dtype=np.int64)
-    scan[starts[1:]] = 1
-    return np.cumsum(scan), tuple(cells[k] for k in starts)
+    cells = table.cells("scan")
+    changes = np.fromiter(map(operator.ne, cells[1:], cells), dtype=np.int64, count=len(cells) - 1)
+    scan = np.concatenate([[0], np.cumsum(changes)])
+    return scan, tuple(cells[k] for k in (0, *(np.flatnonzero(changes) + 1)))
 
 
 def _patterns(table: Table, description: Description) -> IntArray:
@@ -241,29 +246,29 @@ def _patterns(table: Table, description: Description) -> IntArray:
             )  # fmt: skip
         return np.zeros(len(table), dtype=np.int64)
     code = {name: k for k, name in enumerate(names)}
-    cells = table.columns["pattern"]
-    for k, cell in enumerate(cells):
-        if cell not in code:
-            raise FileError(
-                table.path, f"the pattern {cell!r} is not in {json_name}", f"one of {known}",
-                row=table.rows[k], column="pattern",
-            )  # fmt: skip
-    return np.array([code[cell] for cell in cells], dtype=np.int64)
+    cells = table.cells("pattern")
+    unknown = set(cells).difference(code)
+    if unknown:
+        k = next(k for k, cell in enumerate(cells) if cell in unknown)
+        raise FileError(
+            table.path, f"the pattern {shown(cells[k])} is not in {json_name}", f"one of {known}",
+            row=table.row(k), column="pattern",
+        )  # fmt: skip
+    return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
 
 def _covariates(table: Table, notes: list[str]) -> dict[str, FloatArray]:
     """Keep every other numeric column; a column counts as numeric where most of what it holds are numbers."""
     out: dict[str, FloatArray] = {}
-    for name, cells in table.columns.items():
+    for name in table.columns:
         if name in _KNOWN:
             continue
-        filled = [cell for cell in cells if cell and cell.lower() != "nan"]
-        n_numbers = sum(is_number(cell) for cell in filled)
+        filled = [cell for cell in table.cells(name) if cell not in MISSING]
         if not name:
             notes.append("a column without a name, ignored")
         elif not filled:
             notes.append(f"column {name} is empty, ignored")
-        elif 2 * n_numbers <= len(filled):
+        elif 2 * count_numbers(filled) <= len(filled):
             notes.append(f"column {name} is text, ignored")
         else:
             out[name] = table.numbers(name, missing=True)

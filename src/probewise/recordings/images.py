@@ -1,18 +1,20 @@
-"""Pictures as albedo: 8-bit PNG (decoded here, so that reading a recording needs no plotting library) and .npy."""
+"""Pictures as albedo: 8-bit PNG and .npy; headers are judged before anything is unpacked."""
 
 from __future__ import annotations
 
 import io
+import math
 import struct
 import zlib
 from pathlib import Path
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise.errors import FileError, ParameterError
-from probewise.recordings.table import read_bytes
+from probewise.recordings.text import read_bytes
 
 __all__ = ["image_bytes", "read_image"]
 
@@ -20,6 +22,8 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
 _ALLOWED = "a PNG of 8 bits a channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
 _LARGEST_PIXELS = 100_000_000
+# By version; 3.0 is for arrays of records alone.
+_NPY_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 Bytes8 = NDArray[np.uint8]
 
 
@@ -73,13 +77,20 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
 
 
 def _from_npy(path: Path, content: bytes) -> FloatArray:
+    allowed = f"a two-dimensional array of numbers, at most {_LARGEST_PIXELS}"
+    file = io.BytesIO(content)
     try:
-        values = np.load(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, OSError, EOFError, SyntaxError) as error:
-        raise FileError(path, f"not readable as .npy ({error})", "a two-dimensional array of numbers") from error
-    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind not in "uif" or values.size == 0:
-        found = f"{getattr(values, 'dtype', type(values).__name__)} of shape {getattr(values, 'shape', None)}"
-        raise FileError(path, found, "a two-dimensional array of numbers")
+        shape, by_columns, dtype = _NPY_HEADERS[npy.read_magic(file)](file)
+    # numpy parses the header as Python; what a hostile one makes of that is any of a dozen exceptions.
+    except Exception as error:
+        raise FileError(path, f"not readable as .npy ({error})", allowed) from error
+    size = math.prod(shape)
+    if len(shape) != 2 or dtype.kind not in "uif" or min(shape) < 1 or size > _LARGEST_PIXELS:
+        raise FileError(path, f"{dtype} of shape {shape}", allowed)
+    n_bytes = len(content) - file.tell()
+    if n_bytes != size * dtype.itemsize:
+        raise FileError(path, f"{n_bytes} bytes of numbers", f"{size * dtype.itemsize} for {dtype} of shape {shape}")
+    values = np.frombuffer(content, dtype, offset=file.tell()).reshape(shape, order="F" if by_columns else "C")
     albedo = values.astype(np.float64)
     bad = ~((albedo >= 0) & (albedo <= 255))
     if bad.any():
@@ -103,61 +114,37 @@ def _from_png(path: Path, content: bytes) -> FloatArray:
         raise FileError(path, f"the pixel data are damaged ({error})", _ALLOWED) from error
     if len(raw) != expected:
         raise FileError(path, f"{len(raw)} bytes of pixel data", f"{expected} bytes for {width} x {height} pixels")
-    pixels = _unfiltered(path, np.frombuffer(raw, dtype=np.uint8).reshape(height, -1), n_channels)
-    return _albedo(path, pixels.reshape(height, width, n_channels), colour, chunks)
+    filters = np.frombuffer(raw, dtype=np.uint8).reshape(height, -1)[:, 0]
+    if filters.max() > 4:
+        k = int(np.argmax(filters > 4))
+        raise FileError(path, f"line {k} has filter {filters[k]}", "filters 0 to 4")
+    return _albedo(path, _decoded(chunks[b"IDAT"], width, height, n_channels), colour, chunks)
+
+
+def _decoded(packed: bytes, width: int, height: int, n_channels: int) -> Bytes8:
+    """Unpack the pixels and undo the filters of their lines, (height, width, n_channels)."""
+    from PIL import Image as Pillow  # here: most recordings show no picture
+
+    mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[n_channels]
+    decoded = Pillow.frombytes(mode, (width, height), packed, "zip", mode)
+    return np.asarray(decoded).reshape(height, width, n_channels)
 
 
 def _chunks(path: Path, content: bytes) -> dict[bytes, bytes]:
-    chunks: dict[bytes, bytes] = {}
+    parts: dict[bytes, list[bytes]] = {}
     at = len(_SIGNATURE)
     while at < len(content):
         length = int.from_bytes(content[at : at + 4], "big")
         kind, data = content[at + 4 : at + 8], content[at + 8 : at + 8 + length]
         check = content[at + 8 + length : at + 12 + length]
-        if len(check) != 4 or zlib.crc32(kind + data) != int.from_bytes(check, "big"):
+        if len(check) != 4 or zlib.crc32(data, zlib.crc32(kind)) != int.from_bytes(check, "big"):
             raise FileError(path, f"the PNG is damaged or cut short at byte {at}", _ALLOWED)
-        chunks[kind] = chunks.get(kind, b"") + data
+        parts.setdefault(kind, []).append(data)
         at += 12 + length
+    chunks = {kind: b"".join(data) for kind, data in parts.items()}
     if len(chunks.get(b"IHDR", b"")) != 13:
         raise FileError(path, "the PNG has no header", _ALLOWED)
     return chunks
-
-
-def _unfiltered(path: Path, lines: Bytes8, n_channels: int) -> Bytes8:
-    """Undo the PNG line filters (PNG specification, section 9); arithmetic is modulo 256."""
-    out = np.zeros((len(lines), lines.shape[1] - 1), dtype=np.uint8)
-    above = np.zeros(lines.shape[1] - 1, dtype=np.uint8)
-    for k, line in enumerate(lines):
-        kind, data = int(line[0]), line[1:]
-        if kind == 0:
-            row = data
-        elif kind == 1:
-            row = np.cumsum(data.reshape(-1, n_channels), axis=0, dtype=np.uint8).ravel()
-        elif kind == 2:
-            row = data + above
-        elif kind in (3, 4):
-            row = _unfiltered_by_neighbours(kind, data, above, n_channels)
-        else:
-            raise FileError(path, f"line {k} has filter {kind}", "filters 0 to 4")
-        out[k] = above = row
-    return out
-
-
-def _unfiltered_by_neighbours(kind: int, data: Bytes8, above: Bytes8, n_channels: int) -> Bytes8:
-    """Undo the filters Average (3) and Paeth (4), each byte needing the one before it."""
-    row = bytearray(len(data))
-    line, up = data.tobytes(), above.tobytes()
-    for k, byte in enumerate(line):
-        a = row[k - n_channels] if k >= n_channels else 0
-        b = up[k]
-        if kind == 3:
-            guess = (a + b) // 2
-        else:
-            c = up[k - n_channels] if k >= n_channels else 0
-            to_a, to_b, to_c = abs(b - c), abs(a - c), abs(a + b - 2 * c)
-            guess = a if to_a <= to_b and to_a <= to_c else b if to_b <= to_c else c
-        row[k] = (byte + guess) & 255
-    return np.frombuffer(bytes(row), dtype=np.uint8)
 
 
 def _albedo(path: Path, pixels: Bytes8, colour: int, chunks: dict[bytes, bytes]) -> FloatArray:

@@ -229,7 +229,8 @@ class Plan:
 
     def rows_by_scan(self) -> list[IntArray]:
         """Row numbers of each scan, in order of taking."""
-        return [np.flatnonzero(self.scan == k) for k in range(len(self.scan_names))]
+        ends = np.cumsum(np.bincount(self.scan, minlength=len(self.scan_names)))
+        return np.split(np.argsort(self.scan, kind="stable"), ends[:-1]) if len(ends) else []
 
     def rows_by_pattern(self) -> list[tuple[str, IntArray]]:
         """Pattern names that occur, each with its row numbers."""

@@ -99,5 +99,5 @@ def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArra
     mean, sd = table.numbers("mean"), table.numbers("sd")
     if np.any(sd <= 0):
         k = int(np.argmax(sd <= 0))
-        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.rows[k], column="sd")
+        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.row(k), column="sd")
     return mean, sd, table.numbers("log_density", missing=True)

@@ -1,37 +1,93 @@
-"""JSON as the formats mean it: no NaN, no Infinity, each name once."""
+"""JSON as the formats mean it: no NaN, no Infinity, no number that no float can hold, each name once."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 from typing import Any
 
-__all__ = ["strict_json"]
+from probewise.errors import FileError, shown
+
+__all__ = ["json_of", "strict_json"]
+
+_MOST_DIGITS = 400  # more than any finite float has before its point
 
 
-def strict_json(text: str) -> Any:
-    """Parse a JSON text.
+def json_of(path: str | os.PathLike[str], text: str | bytes, allowed: str, *, row: int | None = None) -> Any:
+    """Parse a JSON text, or UTF-8 bytes, that stood in a file.
+
+    Parameters
+    ----------
+    path, row
+        Where it stood; without a row, that of the fault within the text is told.
+    text
+        The text.
+    allowed
+        What should have stood there.
+
+    Raises
+    ------
+    FileError
+        If it is not strict JSON; see `strict_json`.
+    """
+    try:
+        return strict_json(text)
+    except json.JSONDecodeError as error:
+        found = f"does not parse as JSON: {error.msg} at character {error.colno}"
+        raise FileError(path, found, allowed, row=error.lineno if row is None else row) from error
+    except ValueError as error:
+        raise FileError(path, f"does not parse as JSON: {error}", allowed, row=row) from error
+
+
+def strict_json(text: str | bytes) -> Any:
+    """Parse a JSON text, or UTF-8 bytes; a byte-order mark is passed over.
 
     Raises
     ------
     json.JSONDecodeError
         If it does not parse.
     ValueError
-        If a number stands for none (NaN, Infinity), or a name comes twice in one object: which of the two is
-        meant nobody can say.
-    RecursionError
-        If it is nested deeper than Python can follow.
+        If it is nested deeper than Python can follow, bytes are not UTF-8, half of a character is escaped, a number
+        stands for none (NaN, Infinity) or is beyond every float, or a name comes twice in one object: which of the two
+        is meant nobody can say.
     """
-    return json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
+    text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
+    try:
+        value = json.loads(
+            text, object_pairs_hook=_once, parse_constant=_no_constant, parse_int=_whole, parse_float=_number
+        )
+        if "\\u" in text:  # half of an escaped character could be written into no file
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("half of an escaped character, a surrogate, stands alone") from error
+    except RecursionError as error:
+        raise ValueError("lists or objects nested too deep") from error
+    return value
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in out:
-            raise ValueError(f"the name {name!r} comes twice")
-        out[name] = value
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the name {shown(next(n for n in names if names.count(n) > 1))} comes twice")
     return out
 
 
 def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON number")
+
+
+def _whole(digits: str) -> int:
+    # Python turns no text of thousands of digits into a number, nor such a number into a float.
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits, beyond every float")
+    _number(digits)
+    return int(digits)
+
+
+def _number(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {shown(digits)} is beyond every float")
+    return value

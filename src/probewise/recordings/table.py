@@ -4,35 +4,58 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from probewise._arrays import FloatArray
-from probewise.errors import FileError
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import FileError, shown
+from probewise.progress import Progress, silent
+from probewise.recordings.text import read_text
 
-__all__ = ["LARGEST", "Table", "csv_text", "number_text", "read_bytes", "read_table", "read_text"]
+__all__ = ["LARGEST", "MISSING", "Table", "count_numbers", "csv_text", "number_text", "read_table"]
 
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond it squares and differences lose their meaning."""
 
+MISSING = frozenset({"", *map("".join, itertools.product("nN", "aA", "nN"))})
+"""What stands in a cell whose number is missing."""
+
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+# Of these characters float() takes what _NUMBER does, and nothing else ('infinity' and '1_000' have others).
+_OF_NUMBERS = re.compile(r"[-+.0-9eE]*", re.ASCII)
+_CHUNK = 2_000  # rows that are read at a time: few enough to stay in the processor's memory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
-    """Cells by column, stripped of surrounding blanks; `rows` numbers each record (header = row 1)."""
+    """Cells by column, stripped of surrounding blanks; `rows` numbers each record (header = row 1), (n_rows,).
+
+    Each column is one text, its cells joined by a character that the file does not hold: a million small texts take
+    ten times the memory.
+    """
 
     path: Path
-    columns: dict[str, tuple[str, ...]]
-    rows: tuple[int, ...]
+    columns: dict[str, str]
+    separator: str
+    rows: IntArray
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def cells(self, name: str) -> list[str]:
+        """Give the cells of a column."""
+        return self.columns[name].split(self.separator) if len(self) else []
+
+    def row(self, k: int) -> int:
+        """Give the number of a record as a person counts it."""
+        return int(self.rows[k])
 
     def require(self, *names: str) -> None:
         """Raise FileError if one of these columns is missing."""
@@ -61,67 +84,52 @@ class Table:
         FileError
             At the first cell that is not such a number.
         """
-        out = np.empty(len(self))
-        allowed = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
+        cells = self.cells(name)
+        most = np.finfo(np.float64).max if largest is None else largest
+        there = np.ones(len(cells), dtype=np.bool_)
         if missing:
-            allowed += ", or empty or nan where it is missing"
-        for k, cell in enumerate(self.columns[name]):
-            if missing and cell.lower() in ("", "nan"):
-                out[k] = math.nan
-                continue
-            value = float(cell) if is_number(cell) else math.nan
-            if not math.isfinite(value) or (largest is not None and abs(value) > largest):
-                raise FileError(self.path, described(cell), allowed, row=self.rows[k], column=name)
-            out[k] = value
+            there = np.fromiter((cell not in MISSING for cell in cells), dtype=np.bool_, count=len(cells))
+        values = _parsed(list(itertools.compress(cells, there)))
+        if values is None or not (np.abs(values) <= most).all():
+            allowed = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
+            allowed += ", or empty or nan where it is missing" if missing else ""
+            k, cell = next(
+                (k, cell)
+                for k, cell in enumerate(cells)
+                if there[k] and not (_is_number(cell) and abs(float(cell)) <= most)
+            )
+            raise FileError(self.path, _described(cell), allowed, row=self.row(k), column=name)
+        out = np.full(len(cells), math.nan)
+        out[there] = values
         return out
 
 
-def is_number(cell: str) -> bool:
-    """Tell whether a cell is a plain decimal number (float() would take 'infinity' and '1_000' too)."""
+def _parsed(cells: Sequence[str]) -> FloatArray | None:
+    """Turn cells into numbers, all at once; None where one of them is no plain decimal number."""
+    if _OF_NUMBERS.fullmatch("".join(cells)) is None:
+        return None
+    try:
+        return np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
+    except ValueError:
+        return None
+
+
+def _is_number(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None
 
 
-def described(cell: str) -> str:
-    """Say what stands in a cell, briefly."""
-    if not cell:
-        return "the cell is empty"
-    return f"{cell!r}" if len(cell) <= 60 else f"{cell[:57] + '...'!r}"
+def count_numbers(cells: Sequence[str]) -> int:
+    """Count the cells that hold a plain decimal number (float() would take 'infinity' and '1_000' too)."""
+    if _parsed(cells) is not None:
+        return len(cells)
+    return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
 
 
-def read_bytes(path: Path, what: str) -> bytes:
-    """Read a file whole.
-
-    Raises
-    ------
-    FileError
-        If it is missing or cannot be read.
-    """
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise FileError(path, "there is no such file", what) from error
-    except (OSError, ValueError) as error:
-        raise FileError(path, f"cannot be read ({error})", what) from error
+def _described(cell: str) -> str:
+    return shown(cell) if cell else "the cell is empty"
 
 
-def read_text(path: Path, what: str) -> str:
-    """Read a UTF-8 file whole, without its byte-order mark.
-
-    Raises
-    ------
-    FileError
-        If it is missing, cannot be read or is not UTF-8.
-    """
-    content = read_bytes(path, what)
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        row = content.count(b"\n", 0, error.start) + 1
-        found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not UTF-8"
-        raise FileError(path, found, "UTF-8 text (save the file again with that encoding)", row=row) from error
-
-
-def read_table(path: Path) -> Table:
+def read_table(path: Path, *, progress: Progress = silent) -> Table:
     """Read a CSV file with one header row; lines without anything are passed over.
 
     Raises
@@ -130,34 +138,55 @@ def read_table(path: Path) -> Table:
         If there is no header, a column comes twice, a row is short or long, or quotes do not close.
     """
     text = read_text(path, "a CSV file")
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    records: list[list[str]] = []
-    rows: list[int] = []
+    n_lines = text.count("\n")
+    separator = next(c for c in itertools.chain("\x1f\x1e", map(chr, range(0xE000, 0x110000))) if c not in text)
     header: list[str] | None = None
-    row = 0
-    try:
-        for row, record in enumerate(reader, start=1):
-            cells = [cell.strip() for cell in record]
-            if not any(cells) and len(cells) <= 1:
-                continue
-            if header is None:
-                header = cells
-                _check_header(path, header, row)
-                continue
-            if len(cells) != len(header):
-                raise FileError(
-                    path, f"the row has {len(cells)} cells", f"{len(header)} cells as in the header", row=row
-                )
-            records.append(cells)
-            rows.append(row)
-    except csv.Error as error:
-        raise FileError(
-            path, f"not readable as CSV ({error})", "comma-separated cells, quotes closed", row=row + 1
-        ) from error
+    columns: list[list[str]] = []
+    rows: list[IntArray] = []
+    n_read = 0
+    for records, failed in _read_in_chunks(text):
+        lengths = np.fromiter(map(len, records), dtype=np.int64, count=len(records))
+        blank = [k for k in np.flatnonzero(lengths <= 1) if not any(cell.strip() for cell in records[k])]
+        kept = np.delete(np.arange(len(records)), blank)
+        if header is None and len(kept):
+            header = [cell.strip() for cell in records[kept[0]]]
+            _check_header(path, header, n_read + int(kept[0]) + 1)
+            columns = [[] for _ in header]
+            kept = kept[1:]
+        wrong = kept[lengths[kept] != len(columns)]
+        if wrong.size:
+            k = int(wrong[0])
+            found = f"the row has {len(records[k])} cells"
+            raise FileError(path, found, f"{len(columns)} cells as in the header", row=n_read + k + 1)
+        for column, cells in zip(columns, zip(*(records[k] for k in kept), strict=True), strict=False):
+            column.append(separator.join(map(str.strip, cells)))
+        rows.append(n_read + kept + 1)
+        n_read += len(records)
+        if failed is not None:
+            found = f"not readable as CSV ({failed})"
+            raise FileError(path, found, "comma-separated cells, quotes closed", row=n_read + 1) from failed
+        progress(f"reading {path.name}", n_read, max(n_lines, n_read))
     if header is None:
         raise FileError(path, "the file is empty", "a header row and one row a reading")
-    columns = {name: tuple(record[k] for record in records) for k, name in enumerate(header)}
-    return Table(path=path, columns=columns, rows=tuple(rows))
+    joined = {name: separator.join(column) for name, column in zip(header, columns, strict=True)}
+    return Table(path, joined, separator, np.concatenate(rows))
+
+
+def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | None]]:
+    """Yield records, some at a time, and with the last of them what is wrong with the next."""
+    # Not StringIO, which takes four bytes a character.
+    lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8", newline="")
+    reader = csv.reader(lines, strict=True)
+    failed = None
+    while failed is None:
+        records: list[list[str]] = []
+        try:
+            records.extend(itertools.islice(reader, _CHUNK))
+        except csv.Error as error:
+            failed = error
+        if not records and failed is None:
+            return
+        yield records, failed
 
 
 def _check_header(path: Path, header: Sequence[str], row: int) -> None:

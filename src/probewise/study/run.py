@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 from probewise._version import __version__
 from probewise.campaign import read_campaign, run_campaign
 from probewise.errors import FileError, ParameterError
+from probewise.progress import Progress, silent
 from probewise.study.rows import Row
 from probewise.study.table import Summary, summarise
 from probewise.study.trial import Trial, run_trial
@@ -38,7 +39,7 @@ def run_study(
     path: str | os.PathLike[str],
     max_readings: int = 100,
     executor: Executor | None = None,
-    progress: Callable[[str, Mapping[str, Any]], None] | None = None,
+    progress: Progress = silent,
 ) -> Study:
     """Run every row over the first circles of its population, or go on with a study that was stopped.
 
@@ -55,7 +56,7 @@ def run_study(
     executor
         Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
     progress
-        Called with key and result of every run that ends.
+        Told how many runs have ended.
 
     Raises
     ------
@@ -75,6 +76,7 @@ def run_study(
         settings={"study": __version__, "max_readings": max_readings},
         executor=executor,
         progress=progress,
+        noun="runs",
     )
     own = {row: tuple(results[Trial(row, k).key] for k in range(n)) for row, n in wanted.items()}
     return Study(own, max_readings)

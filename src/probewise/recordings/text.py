@@ -1,0 +1,42 @@
+"""Files as bytes and as UTF-8 text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from probewise.errors import FileError
+
+__all__ = ["read_bytes", "read_text"]
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Read a file whole.
+
+    Raises
+    ------
+    FileError
+        If it is missing or cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileError(path, "there is no such file", what) from error
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be read ({error})", what) from error
+
+
+def read_text(path: Path, what: str) -> str:
+    """Read a UTF-8 file whole, without its byte-order mark.
+
+    Raises
+    ------
+    FileError
+        If it is missing, cannot be read or is not UTF-8.
+    """
+    content = read_bytes(path, what)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = content.count(b"\n", 0, error.start) + 1
+        found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not UTF-8"
+        raise FileError(path, found, "UTF-8 text (save the file again with that encoding)", row=row) from error

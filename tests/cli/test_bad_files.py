@@ -1,0 +1,216 @@
+"""Files made to break a reader: exit status 2, one short line, nothing written, and soon."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from probewise.arm import shipped_geometry
+from probewise.cli import main
+from probewise.recordings import paper_plan, write_plan
+
+TEXTS = {
+    "an integer of 400 digits": b'{"format": ' + b"9" * 400 + b"}",
+    "an integer of 5000 digits": b'{"format": ' + b"9" * 5000 + b"}",
+    "a number beyond floats": b'{"format": 1e999}',
+    "lists a million deep": b"[" * 1_000_000,
+    "objects a million deep": b'{"a":' * 1_000_000,
+    "NaN": b'{"format": NaN}',
+    "Infinity": b'{"format": -Infinity}',
+    "a long text": b'{"format": "' + b"a" * 100_000 + b'"}',
+    "a long name twice": b'{"' + b"k" * 100_000 + b'": 1, "' + b"k" * 100_000 + b'": 2}',
+    "half a character": b'{"format": "\\ud800"}',
+    "an escape sequence": b'{"format": "\x1b[31m"}',
+    "UTF-16": '{"format": "sensor/1"}'.encode("utf-16"),
+    "NUL bytes": bytes(1000),
+    "random bytes": np.random.default_rng(0).bytes(4000),
+    "a list": b"[1]",
+    "nothing": b"",
+}
+TABLES = {
+    "a million cells in one line": b",".join([b"a"] * 1_000_000),
+    "ten thousand columns": b",".join(b"c%d" % k for k in range(10_000)) + b"\n" + b",".join([b"1"] * 10_000),
+    "a name twice": b"x_mm,y_mm,reading,x_mm\n1,2,3,4\n",
+    "a name to obey twice": b"\x1b[31m,\x1b[31m,x_mm,y_mm,reading\n",
+    "a name of two lines twice": b'"x\nmm","x\nmm"\n',
+    "nothing": b"",
+    "blanks": b" \n \n",
+    "a header alone": b"x_mm,y_mm,reading\n",
+    "CR line ends, a bad cell": b"x_mm,y_mm,reading\r1,2,abc\r",
+    "a quote that never closes": b'x_mm,y_mm,reading\n1,2,"3\n' + b"1,2,3\n" * 30_000,
+    "UTF-16": "x_mm,y_mm,reading\n1,2,3\n".encode("utf-16"),
+    "a cell of NUL": b"x_mm,y_mm,reading\n1,2,\0\n",
+    "a number of 100,000 digits": b"x_mm,y_mm,reading\n1,2," + b"9" * 100_000 + b"\n",
+    "a text of 100,000 letters": b"x_mm,y_mm,reading\n1,2," + b"a" * 100_000 + b"\n",
+    "random bytes": np.random.default_rng(1).bytes(4000),
+}
+
+
+def npy(header: str, content: bytes = b"", version: bytes = b"\x01\x00") -> bytes:
+    size = struct.pack("<H" if version == b"\x01\x00" else "<I", len(header))
+    return b"\x93NUMPY" + version + size + header.encode() + content
+
+
+def described(shape: str, kind: str = "|u1") -> str:
+    return f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n"
+
+
+ARRAYS = {
+    "a picture of 100,000 x 100,000": npy(described("(100000, 100000)")),
+    "a picture of 10^22 pixels": npy(described(f"({10**11}, {10**11})")),
+    "a negative shape": npy(described("(-1, -4)"), bytes(4)),
+    "two thousand brackets": npy("(" * 2000 + ")" * 2000),
+    "no dictionary": npy("[1, 2]\n"),
+    "Python objects": npy(described("(2, 2)", "|O"), bytes(32)),
+    "a record": npy("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1, 1), }\n", bytes(8)),
+    "cut short": npy(described("(4, 4)"), bytes(15)),
+    "too long": npy(described("(4, 4)"), bytes(17)),
+    "version 3": npy(described("(1, 1)"), bytes(1), b"\x03\x00"),
+    "version 9": npy(described("(1, 1)"), bytes(1), b"\x09\x00"),
+    "another file's first bytes": b"\x89PNG\r\n\x1a\n" + bytes(100),
+    "a header that is cut short": b"\x93NUMPY\x01\x00\xff\xff{",
+    "a header of a gigabyte": b"\x93NUMPY\x02\x00\xff\xff\xff\x3f{",
+}
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    def run(*arguments):
+        """Run, and return the one line of the refusal."""
+        before = sorted(tmp_path.rglob("*"))
+        assert main([str(a) for a in arguments]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1, captured.err
+        assert captured.err[:-1].isprintable()
+        assert len(captured.err) < 600 + 2 * len(str(tmp_path))
+        assert sorted(tmp_path.rglob("*")) == before
+        return captured.err
+
+    return run
+
+
+@pytest.mark.parametrize("what", TEXTS)
+def test_a_sensor_that_is_no_sensor_is_refused(what, refused, recording_file, tmp_path):
+    (tmp_path / "bad.json").write_bytes(TEXTS[what])
+    said = refused("predict", tmp_path / "bad.json", recording_file, "--out", tmp_path / "p.csv")
+    assert "bad.json" in said
+
+
+@pytest.mark.parametrize("what", TEXTS)
+def test_a_description_that_is_none_is_refused(what, refused, recording_file, tmp_path):
+    recording_file.with_suffix(".json").write_bytes(TEXTS[what])
+    assert "small.json" in refused("audit", recording_file)
+
+
+@pytest.mark.parametrize("what", TEXTS)
+@pytest.mark.parametrize("first", [b"", b'{"format": "journal/1"}\n'])
+def test_a_journal_that_is_none_is_refused(what, first, refused, sensor_file, tmp_path):
+    (tmp_path / "bad.jsonl").write_bytes(first + TEXTS[what] + b"\n")
+    said = refused("diagnose", tmp_path / "bad.jsonl", "--sensor", sensor_file, "--out", tmp_path / "out")
+    assert "bad.jsonl" in said
+
+
+@pytest.mark.parametrize("what", TEXTS)
+@pytest.mark.parametrize("first", [b"", b'{"format": "campaign/1", "settings": {}}\n'])
+@pytest.mark.parametrize(("verb", "name"), [("challenge", "cases.jsonl"), ("study", "trials.jsonl")])
+def test_a_campaign_that_is_none_is_refused(verb, name, first, what, refused, tmp_path):
+    (tmp_path / name).write_bytes(first + TEXTS[what] + b"\n")
+    assert name in refused(verb, "--out", tmp_path)
+
+
+@pytest.mark.parametrize("what", [*TEXTS, "a huge number", "deep lists", "a huge text"])
+def test_a_geometry_that_is_none_is_refused(what, refused, tmp_path):
+    shipped = shipped_geometry().read_text().encode()
+    instead = {"a huge number": b"9" * 400, "deep lists": b"[" * 100_000, "a huge text": b'"' + b"a" * 100_000 + b'"'}
+    at = shipped.index(b"= ", shipped.index(b"\nx_mm")) + 2
+    harmed = shipped[:at] + instead[what] + shipped[shipped.index(b"\n", at) :] if what in instead else TEXTS[what]
+    (tmp_path / "bad.toml").write_bytes(harmed)
+    assert "bad.toml" in refused("arm", "check", "--geometry", tmp_path / "bad.toml")
+    assert "bad.toml" in refused("emulate-nxt", "--geometry", tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("what", TABLES)
+def test_a_table_that_is_none_is_refused(what, refused, recording_file, tmp_path):
+    recording_file.write_bytes(TABLES[what])
+    assert "small.csv" in refused("diagnose", recording_file, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("what", ARRAYS)
+def test_an_array_that_is_no_picture_is_refused_by_its_header(what, refused, recording_file, tmp_path):
+    description = json.loads(recording_file.with_suffix(".json").read_text())
+    pattern = {"kind": "image", "file": "bad.npy", "pixel_mm": 1, "origin_mm": [0, 0]}
+    description["patterns"] = dict.fromkeys(description["patterns"], pattern)
+    recording_file.with_suffix(".json").write_text(json.dumps(description))
+    (tmp_path / "bad.npy").write_bytes(ARRAYS[what])
+    assert "bad.npy" in refused("audit", recording_file)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("n_gaussians",), 10**300),
+        (("n_gaussians",), -1),
+        (("samples",), [[]]),
+        (("samples",), "x" * 100_000),
+        (("samples", 0, 3), -(10**300)),
+        (("field", "pixel_mm"), 0),
+        (("field", "origin_mm"), [10**300]),
+        (("noise", "sd", 0), 0),
+        (("effects",), ["x" * 100_000]),
+        (("parameters", 0, "name"), "x" * 100_000),
+        (("instrumentation", "min"), "low"),
+        (("absent",), {"lag": [10**300]}),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_a_sensor_with_one_value_out_of_bounds_is_refused(place, value, refused, sensor_file, recording_file, tmp_path):
+    document = json.loads(sensor_file.read_text())
+    holder = document
+    for key in place[:-1]:
+        holder = holder[key]
+    holder[place[-1]] = value
+    sensor_file.write_text(json.dumps(document))
+    refused("predict", sensor_file, recording_file, "--out", tmp_path / "p.csv")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        {"index": 1, "pose": {"x_mm": "1e999", "y_mm": 0, "orientation_rad": 0}},
+        {"index": 1, "pose": {"x_mm": "nan", "y_mm": 0, "orientation_rad": 0}},
+        {"index": "1"},
+        {"index": 10**300},
+        {"index": 1, "pose": []},
+    ],
+    ids=lambda line: json.dumps(line)[:45],
+)
+def test_a_journal_line_whose_numbers_are_texts_is_refused(line, refused, sensor_file, tmp_path):
+    whole = {"time_s": 0.0, "reading": 30.0, "covariates": {}, "index": 1}
+    whole["pose"] = {"x_mm": 0.0, "y_mm": 0.0, "orientation_rad": 0.0}
+    path = tmp_path / "bad.jsonl"
+    path.write_text('{"format": "journal/1"}\n' + json.dumps(whole | line) + "\n")
+    assert "row 2" in refused("diagnose", path, "--sensor", sensor_file, "--out", tmp_path / "out")
+
+
+def test_a_byte_order_mark_is_taken_wherever_text_is_read(sensor_file, tmp_path, capsys):
+    plan = paper_plan()
+    write_plan(plan.take(np.arange(4)), tmp_path / "plan.csv")
+    geometry = tmp_path / "arm.toml"
+    geometry.write_bytes(shipped_geometry().read_bytes())
+    for path in (sensor_file, tmp_path / "plan.csv", tmp_path / "plan.json", geometry):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert main(["predict", str(sensor_file), str(tmp_path / "plan.csv"), "--out", str(tmp_path / "p.csv")]) == 0
+    assert main(["arm", "jog", "base", "1", "--dry-run", "--geometry", str(geometry)]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_bad_cell_far_down_is_found_with_its_row(refused, recording_file):
+    header, *rows = recording_file.read_text().splitlines()
+    rows = rows * 60
+    cells = rows[5500].split(",")
+    cells[header.split(",").index("x_mm")] = "1_0"
+    rows[5500] = ",".join(cells)
+    recording_file.write_text("\n".join([header, *rows]) + "\n")
+    assert "row 5502, column x_mm: '1_0'" in refused("audit", recording_file)

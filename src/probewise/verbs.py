@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis, PlanAudit
     from probewise.experiment import Exploration, Model, Step, Truth
     from probewise.inquiry import Utility
+    from probewise.progress import Progress
     from probewise.recordings import Plan, Prediction, Recording
     from probewise.scene import Shape
 
@@ -52,7 +53,7 @@ def calibrate(
     orders: Sequence[int] = ORDERS,
     n_live: int = N_LIVE,
     rng: np.random.Generator,
-    progress: bool = True,
+    progress: bool | Progress = True,
 ) -> Calibration:
     """Fit the sensor model of a recording; weigh numbers of Gaussians by their evidence.
 
@@ -67,7 +68,7 @@ def calibrate(
     rng
         Source of randomness; with `np.random.default_rng(seed)` the result of `probewise calibrate --seed`.
     progress
-        Whether to show a progress bar, in a terminal or a notebook.
+        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
 
     Returns
     -------
@@ -94,10 +95,10 @@ def calibrate(
     1
     """
     from probewise import calibration
-    from probewise._progress import nested_progress
+    from probewise._progress import of_nested, progress_or_bar
 
-    with nested_progress(quiet=not progress) as show:
-        return calibration.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=show)
+    with progress_or_bar(progress) as told:
+        return calibration.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=of_nested(told))
 
 
 def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
@@ -152,7 +153,7 @@ def explore(
     max_readings: int = MAX_READINGS,
     journal: str | Path | None = None,
     rng: np.random.Generator,
-    progress: bool = True,
+    progress: bool | Progress = True,
 ) -> Exploration:
     """Let the robot find a shape, choosing each measurement itself.
 
@@ -191,7 +192,7 @@ def explore(
     rng
         Source of randomness; with `np.random.default_rng(seed)` the run of `probewise explore --seed`.
     progress
-        Whether to show a progress bar, in a terminal or a notebook.
+        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
 
     Returns
     -------
@@ -224,11 +225,9 @@ def explore(
     """
     from pathlib import Path
 
-    from tqdm import tqdm
-
     from probewise import experiment as posing
     from probewise._kinds import require_kind, require_rng
-    from probewise._progress import disabled
+    from probewise._progress import progress_or_bar
     from probewise.arm.instrument import require_instrument
     from probewise.errors import ParameterError
     from probewise.inquiry import utility_named
@@ -258,11 +257,12 @@ def explore(
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
     require_instrument(arm, "arm")
-    with arm, tqdm(desc="readings", unit="", disable=disabled(quiet=not progress)) as bar:
+    with arm, progress_or_bar(progress) as told:
+        told("taking the first readings")
 
         def show(step: Step) -> None:
-            bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
-            bar.update()
+            believed = f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits"
+            told(f"reading {step.number} of at most {max_readings}", note=believed)
 
         return posing.run(
             arm,
@@ -318,7 +318,7 @@ def diagnose(
     sensor: FittedSensor | None = None,
     thorough: bool = False,
     rng: np.random.Generator,
-    progress: bool = True,
+    progress: bool | Progress = True,
 ) -> Diagnosis:
     """Find which physics the sensor model leaves out of recordings.
 
@@ -333,7 +333,7 @@ def diagnose(
     rng
         Source of randomness; with `np.random.default_rng(seed)` the result of `probewise diagnose --seed`.
     progress
-        Whether to show a progress bar of the nested sampling, in a terminal or a notebook.
+        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
 
     Returns
     -------
@@ -364,10 +364,10 @@ def diagnose(
 
     from probewise import diagnosis
     from probewise._kinds import require_rng
-    from probewise._progress import nested_progress
+    from probewise._progress import of_nested, progress_or_bar
 
     require_rng(rng)
-    own, of_nested = rng.spawn(2)
-    with nested_progress(quiet=not progress) as show:
-        again = partial(diagnosis.weigh_thoroughly, rng=of_nested, progress=show) if thorough else None
-        return diagnosis.diagnose(recordings, sensor=sensor, thorough=again, rng=own)
+    own, nested_rng = rng.spawn(2)
+    with progress_or_bar(progress) as told:
+        again = partial(diagnosis.weigh_thoroughly, rng=nested_rng, progress=of_nested(told)) if thorough else None
+        return diagnosis.diagnose(recordings, sensor=sensor, thorough=again, rng=own, progress=told)

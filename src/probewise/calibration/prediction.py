@@ -14,6 +14,7 @@ from probewise.calibration.distinct import DistinctRows
 from probewise.calibration.sensor_file import FittedSensor, require_sensor
 from probewise.effects import log_density, variance
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
+from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_described, require_plan
 from probewise.scene import KnownScene
@@ -26,7 +27,11 @@ _BLOCK = 4_000_000
 
 
 def predict(
-    sensor: FittedSensor, plan: Plan | Recording, readings: FloatArray | Sequence[float] | None = None
+    sensor: FittedSensor,
+    plan: Plan | Recording,
+    readings: FloatArray | Sequence[float] | None = None,
+    *,
+    progress: Progress = silent,
 ) -> Prediction:
     """Predict every row of a plan, and score its readings where there are any.
 
@@ -46,6 +51,8 @@ def predict(
         Where, when and over what to read, n_points rows; or a recording, whose readings are then scored.
     readings
         What was read, shape (n_points,), NaN where missing; `None` for a plan, and where a recording is given.
+    progress
+        Told how many posterior samples have predicted.
 
     Returns
     -------
@@ -98,6 +105,7 @@ def predict(
     log_sum = np.full(int(scored.sum()), -np.inf)
     center: FloatArray | None = None
     for first in range(0, n_samples, per_block):
+        progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
         mean = model.predict(theta[block], plan)
         level = chain.noise_level(theta[block], plan, sensor.noise_sd[block, None])

@@ -208,8 +208,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 
 def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    from tqdm import tqdm
-
+    from probewise._progress import progress_shown
     from probewise.arm import carry_out, recorded
     from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
 
@@ -228,13 +227,13 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
     with saying_what_is_kept(kept), _arm(arguments, geometry, start_s=start_s) as arm:
         readings = carry_out(arm, plan, origin_mm=origin, ask=_asker(arguments, arm), first=len(taken))
-        bar = tqdm(
-            readings, desc="readings", total=len(plan), initial=len(taken), disable=True if arguments.quiet else None
-        )
-        for reading in bar:
-            taken.append(reading)
-            if not arguments.dry_run:
-                write_recording(recorded(plan, taken), out)
+        with progress_shown(quiet=arguments.quiet, beat=False) as progress:
+            progress("readings", len(taken), len(plan))
+            for reading in readings:
+                taken.append(reading)
+                progress("readings", len(taken), len(plan))
+                if not arguments.dry_run:
+                    write_recording(recorded(plan, taken), out)
     if not arguments.dry_run:
         say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 

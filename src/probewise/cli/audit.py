@@ -35,22 +35,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Audit, say it on one screen, and write it where asked."""
+    from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
     from probewise.diagnosis import audit_plan
     from probewise.recordings import read_plan
 
     out = None if arguments.out is None else check_out_directory(arguments.out)
-    plan = read_plan(arguments.plan)
-    sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
-    audit = audit_plan(plan, sensor=sensor)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        plan = read_plan(arguments.plan, progress=progress)
+        sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+        audit = audit_plan(plan, sensor=sensor, progress=progress)
+        progress("drawing the figures")
+        notes = [] if out is None else _write(audit, out, arguments.plan)
     say(audit.summary(), quiet=arguments.quiet)
+    for note in notes:
+        say(f"note: {note}", quiet=arguments.quiet)
     if out is not None:
-        _write(audit, out, arguments.plan, quiet=arguments.quiet)
         say(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
-def _write(audit: PlanAudit, out: Path, plan: Path, *, quiet: bool) -> None:
+def _write(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
     import json
 
     from probewise.diagnosis import CURE_PLAN, audit_json
@@ -67,8 +72,7 @@ def _write(audit: PlanAudit, out: Path, plan: Path, *, quiet: bool) -> None:
         write_text_atomically(stage / "report.html", report.write_page(audit, drawn, source=plan.name))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
-    for note in stage.notes:
-        say(f"note: {note}", quiet=quiet)
+    return stage.notes
 
 
 VERB = Verb("audit", "Say before any data what a plan cannot see and cannot tell apart.", add_arguments, run)

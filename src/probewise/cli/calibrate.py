@@ -38,24 +38,27 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from probewise import verbs
-    from probewise.calibration import write_sensor
+    from probewise._progress import progress_shown
+    from probewise.calibration import predict, write_sensor
     from probewise.recordings import read_recording, write_bytes_atomically, write_text_atomically
     from probewise.report import calibration as report
 
     out = check_out_directory(arguments.out)
-    recording = read_recording(arguments.recording)
-    orders = tuple(sorted(set(arguments.orders)))
-    n_live = check_live(arguments.live, 6 * max(orders) + 2)
-    rng = np.random.default_rng(arguments.seed)
-    result = verbs.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=not arguments.quiet)
-    prediction = verbs.predict(result.sensor, recording)
-    drawn = report.figures(result, recording, prediction)
-    with staged(out) as stage:
-        write_sensor(result.sensor, stage / "sensor.json")
-        for name, png in drawn.items():
-            write_bytes_atomically(stage / name, png)
-        page = report.write_page(result, recording, prediction, drawn, seed=arguments.seed)
-        write_text_atomically(stage / "report.html", page)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        recording = read_recording(arguments.recording, progress=progress)
+        orders = tuple(sorted(set(arguments.orders)))
+        n_live = check_live(arguments.live, 6 * max(orders) + 2)
+        rng = np.random.default_rng(arguments.seed)
+        result = verbs.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=progress)
+        prediction = predict(result.sensor, recording, progress=progress)
+        progress("drawing the figures")
+        drawn = report.figures(result, recording, prediction)
+        with staged(out) as stage:
+            write_sensor(result.sensor, stage / "sensor.json")
+            for name, png in drawn.items():
+                write_bytes_atomically(stage / name, png)
+            page = report.write_page(result, recording, prediction, drawn, seed=arguments.seed)
+            write_text_atomically(stage / "report.html", page)
     for note in recording.notes:
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

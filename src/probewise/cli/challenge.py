@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shlex
 from functools import partial
-from typing import Any
 
 from probewise.cli._common import Verb, add_common, add_out_directory, positive_int, say
 from probewise.cli._executor import add_executor, campaign_keeps, executor_of
@@ -31,8 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the challenge and write its table."""
-    from tqdm import tqdm
-
+    from probewise._progress import progress_shown
     from probewise.challenge import run_challenge, score
     from probewise.recordings import write_text_atomically
     from probewise.report import challenge as report
@@ -43,18 +41,15 @@ def run(arguments: argparse.Namespace) -> int:
     kept = partial(campaign_keeps, cases, "case", arguments)
     with (
         saying_what_is_kept(kept),
+        progress_shown(quiet=arguments.quiet) as progress,
         executor_of(arguments) as executor,
-        tqdm(total=arguments.cases, desc="cases", unit="", disable=True if arguments.quiet else None) as bar,
     ):
-
-        def advance(key: str, result: Any) -> None:
-            bar.set_postfix_str(key)
-            bar.update()
-
-        results = run_challenge(arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=advance)
+        results = run_challenge(arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=progress)
     rows = score(results)
     command = shlex.join(["probewise", "challenge", "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
-    with saying_what_is_kept(kept, results=True), staged(out) as stage:
+    drawing = progress_shown(quiet=arguments.quiet)
+    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+        progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
         write_text_atomically(stage / "report.html", report.write_page(results, command=command))
     say(report.answer(rows, len(results)), quiet=arguments.quiet)

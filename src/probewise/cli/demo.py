@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model
+    from probewise.progress import Progress
     from probewise.report.demo import Search
     from probewise.scene import Circle
 
@@ -38,11 +39,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, search, diagnose, report."""
+    from probewise._progress import progress_shown
+
+    with progress_shown(quiet=arguments.quiet) as progress:
+        lines = _demonstrated(arguments, progress)
+    for line in lines:
+        say(line, quiet=arguments.quiet)
+    return 0
+
+
+def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[str, ...]:
+    """Do it all, and give what there is to say of it."""
     import json
     import time
 
     import numpy as np
-    from tqdm import tqdm
 
     from probewise.arm import read_geometry, shipped_geometry
     from probewise.calibration import predict, write_sensor
@@ -57,20 +68,18 @@ def run(arguments: argparse.Namespace) -> int:
     seed = arguments.seed
     out = check_out_directory(arguments.out)
     truth = hidden_circle(seed)
-    with (
-        workers(2) as pool,
-        tqdm(total=6, desc="demo", unit=" part", disable=True if arguments.quiet else None) as bar,
-    ):
+    with workers(2) as pool:
+        progress("calibrating and diagnosing", 0, 6)
         diagnosing = pool.submit(_diagnose, seed)
         calibration = _calibrate(seed, arguments.full, pool)
-        bar.update()
         sensor = calibration.sensor
         starting = [pool.submit(start_alike, sensor, model, truth, seed) for model in MODELS]
         searching = [pool.submit(_search, sensor, model, truth, seed) for model in MODELS]
         parts: tuple[Future[Any], ...] = (diagnosing, *starting, *searching)
-        for future in parts:
+        for done, future in enumerate(parts, start=1):
+            progress("searching and diagnosing", done, 6)
             future.result()
-            bar.update()
+    progress("drawing the report")
     diagnosis, alike = diagnosing.result(), [future.result() for future in starting]
     runs, frames = zip(*(future.result() for future in searching), strict=True)
     recording = read_recording(shipped("paper"))
@@ -108,15 +117,13 @@ def run(arguments: argparse.Namespace) -> int:
         write_text_atomically(stage / "report.html", page)
         answers = report.answers(started_alike, diagnosis, concealed=concealed, seed=seed)
         write_text_atomically(stage / "answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
-    for line in (
+    return (
         *report.comparison_lines(searches),
         report.answer(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
-    ):
-        say(line, quiet=arguments.quiet)
-    return 0
+    )
 
 
 def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[float, ...]) -> list[Search]:

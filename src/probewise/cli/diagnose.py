@@ -51,46 +51,55 @@ def run(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from probewise._progress import nested_progress
+    from probewise._progress import of_nested, progress_shown
     from probewise.calibration import read_sensor
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
     from probewise.recordings import read_recording, write_text_atomically
     from probewise.report import diagnosis as report
 
     out = check_out_directory(arguments.out)
-    sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
-    recordings, shapes = [], []
-    for path in arguments.recordings:
-        if not is_journal(path):
-            recordings.append(read_recording(path))
-            continue
-        if sensor is None:
-            raise CommandError(
-                f"--sensor is missing: {path} needs the sensor.json that its run was made with, or a newer one"
-            )
-        recording, shape = journal_recording(path, sensor)
-        recordings.append(recording)
-        shapes.append(shape)
-    if len(shapes) > 1:
-        raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
-    diagnosis_rng, nested_rng, files_rng = np.random.default_rng(arguments.seed).spawn(3)
-    joined = join(recordings)
-    null = None
-    if sensor is not None and shapes:
-        null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
-    with nested_progress(quiet=arguments.quiet) as show:
-        thorough = partial(weigh_thoroughly, rng=nested_rng, progress=show) if arguments.thorough else None
-        known = None if shapes else sensor
-        diagnosis = diagnose(joined, sensor=known, null=null, thorough=thorough, rng=diagnosis_rng)
-    if null is not None:
-        diagnosis = null.with_described_field(diagnosis)
-    audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
-    drawn = report.figures(diagnosis)
-    source = ", ".join(path.name for path in arguments.recordings)
-    with staged(out, inputs=_to_be_kept(arguments, out), outdated=_OF_ONE_RUN) as stage:
-        write_results(diagnosis, drawn, stage.folder, rng=files_rng)
-        page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
-        write_text_atomically(stage / "report.html", page)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+        recordings, shapes = [], []
+        for path in arguments.recordings:
+            if not is_journal(path):
+                recordings.append(read_recording(path, progress=progress))
+                continue
+            if sensor is None:
+                raise CommandError(
+                    f"--sensor is missing: {path} needs the sensor.json that its run was made with, or a newer one"
+                )
+            recording, shape = journal_recording(path, sensor)
+            recordings.append(recording)
+            shapes.append(shape)
+        if len(shapes) > 1:
+            raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
+        diagnosis_rng, nested_rng, files_rng = np.random.default_rng(arguments.seed).spawn(3)
+        joined = join(recordings)
+        null = None
+        if sensor is not None and shapes:
+            progress("looking for shapes that fit")
+            null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
+        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=of_nested(progress))
+        diagnosis = diagnose(
+            joined,
+            sensor=None if shapes else sensor,
+            null=null,
+            thorough=weigh_again if arguments.thorough else None,
+            rng=diagnosis_rng,
+            progress=progress,
+        )
+        if null is not None:
+            diagnosis = null.with_described_field(diagnosis)
+        progress("auditing the plan")
+        audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
+        progress("drawing the figures")
+        drawn = report.figures(diagnosis)
+        source = ", ".join(path.name for path in arguments.recordings)
+        with staged(out, inputs=_to_be_kept(arguments, out), outdated=_OF_ONE_RUN) as stage:
+            write_results(diagnosis, drawn, stage.folder, rng=files_rng)
+            page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
+            write_text_atomically(stage / "report.html", page)
     for note in (*joined.notes, *stage.notes):
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

@@ -103,9 +103,9 @@ def run(arguments: argparse.Namespace) -> int:
     from functools import partial
 
     import numpy as np
-    from tqdm import tqdm
 
     from probewise import experiment as posing
+    from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
     from probewise.cli._geometry import parse_truth
     from probewise.experiment import Exploration, beside, explore, read_journal
@@ -169,8 +169,9 @@ def run(arguments: argparse.Namespace) -> int:
         closing(
             explore(arm, experiment, rng=streams.run, max_readings=arguments.max_readings, journal=before or journal)
         ) as own,
-        tqdm(desc="readings", unit="", disable=True if arguments.quiet else None) as bar,
+        progress_shown(quiet=arguments.quiet) as progress,
     ):
+        progress("taking the first readings")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if other is not None:
             pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=streams.shadow)
@@ -194,10 +195,12 @@ def run(arguments: argparse.Namespace) -> int:
                 write_text_atomically(out / "live.html", report.live_page(step, frames[-1]))
                 if len(frames) == 1:
                     webbrowser.open((out / "live.html").absolute().as_uri())
-            bar.set_postfix_str(f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits")
-            bar.update()
+            believed = f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits"
+            progress(f"reading {step.number} of at most {arguments.max_readings}", note=believed)
     result = Exploration(experiment, tuple(steps))
-    with saying_what_is_kept(kept, results=True), staged(out) as stage:
+    drawing = progress_shown(quiet=arguments.quiet)
+    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+        progress("drawing the report")
         page = report.write_page(
             result,
             frames,

@@ -22,15 +22,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict every row, and say how well the readings were expected where there are any."""
+    from probewise._progress import progress_shown
     from probewise.calibration import predict, read_sensor
     from probewise.recordings import read_plan_and_readings, write_prediction
 
     out = check_out_file(arguments.out, arguments.sensor, arguments.plan)
-    sensor = read_sensor(arguments.sensor)
-    plan, readings = read_plan_and_readings(arguments.plan)
-    prediction = predict(sensor, plan, readings)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_prediction(prediction, out)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        sensor = read_sensor(arguments.sensor)
+        plan, readings = read_plan_and_readings(arguments.plan, progress=progress)
+        prediction = predict(sensor, plan, readings, progress=progress)
+        progress(f"writing {out.name}")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_prediction(prediction, out)
     say(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_out_directory, add_quiet, positive_int, say
 from probewise.cli._executor import add_executor, campaign_keeps, executor_of
@@ -47,8 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the study and write its table."""
-    from tqdm import tqdm
-
+    from probewise._progress import progress_shown
     from probewise.recordings import write_text_atomically
     from probewise.report import study as report
     from probewise.study import run_study
@@ -64,18 +63,15 @@ def run(arguments: argparse.Namespace) -> int:
     kept = partial(campaign_keeps, trials, "run", arguments)
     with (
         saying_what_is_kept(kept),
+        progress_shown(quiet=arguments.quiet) as progress,
         executor_of(arguments) as executor,
-        tqdm(total=sum(numbers.values()), desc="runs", unit="", disable=True if arguments.quiet else None) as bar,
     ):
-
-        def advance(key: str, result: Any) -> None:
-            bar.set_postfix_str(key)
-            bar.update()
-
         study = run_study(
-            numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=advance
+            numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
         )
-    with saying_what_is_kept(kept, results=True), staged(out) as stage:
+    drawing = progress_shown(quiet=arguments.quiet)
+    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+        progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(study))
         page = report.write_page(study, command=_command(arguments))
         write_text_atomically(stage / "report.html", page)

@@ -35,6 +35,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictRepor
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
 from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
 from probewise.effects import VOCABULARY, NamedEffect
+from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
 __all__ = ["Thorough", "diagnose"]
@@ -51,6 +52,7 @@ def diagnose(
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
     thorough: Thorough | None = None,
     rng: np.random.Generator,
+    progress: Progress = silent,
 ) -> Diagnosis:
     """Tell what physics the sensor model leaves out of these recordings.
 
@@ -71,6 +73,8 @@ def diagnose(
         Weighs what leads a second time: `weigh_thoroughly`, by nested sampling.
     rng
         Source of randomness, for the null laws of the tests and the posterior samples.
+    progress
+        Told of every step, and of the refits within.
 
     Returns
     -------
@@ -87,20 +91,24 @@ def diagnose(
     """
     require_rng(rng)
     prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(effects))
-    searched, weighings = search(prepared), tuple[Weighing, ...]()
+    searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
     if prepared.too_little:
         searched = searched.by_prior_alone()
     elif thorough is not None:
         searched, weighings = thorough(searched)
+    progress("testing what the sensor model leaves")
     test = run_global_test(searched, rng=rng)
+    progress("judging the repair on readings kept back")
     judged, best = best_repair(searched, test, judge(searched, test), rng=rng)
-    drawn = draw_models(searched, test, judged, best, rng=rng)
+    drawn = draw_models(searched, test, judged, best, rng=rng, progress=progress)
     found = effects_found(searched, judged.hypotheses, best, drawn.best, rng=rng)
+    progress("locating what is missing")
     where = locate(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
     change = np.zeros(len(prepared.usable))
     if judged.verdict == "unknown" and not best.out_of_vocabulary:
         improvement, change = corrected(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
+    progress("choosing the next readings")
     asked = next_readings(searched, test.null)
     noise = noise_found(searched, best, drawn.best, rng=rng)
     grounds = _grounds(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)

@@ -21,6 +21,7 @@ from probewise.diagnosis.light_sensor.commands import commands
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.scheduling import Command, behind, put_off
 from probewise.effects import NamedEffect
+from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan
 
 __all__ = ["cures_of"]
@@ -33,7 +34,11 @@ _STRIDES = (1, 4)
 
 
 def cures_of(
-    plan: Plan, expected: Expected, effects: Mapping[str, type[NamedEffect[Any]]], ailing: Sequence[str]
+    plan: Plan,
+    expected: Expected,
+    effects: Mapping[str, type[NamedEffect[Any]]],
+    ailing: Sequence[str],
+    progress: Progress = silent,
 ) -> list[Command]:
     """Choose scans to add, one at a time, each for the trouble of the ailing effects that a reading of it takes away.
 
@@ -47,11 +52,14 @@ def cures_of(
         The vocabulary, by name.
     ailing
         Names of the effects that are not fine under the plan.
+    progress
+        Told of every scan that is chosen.
     """
     every = [*commands(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Command] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
+        progress("looking for readings that cure", len(chosen), _MOST_SCANS)
         taken = {command.plan.scan_names for command in chosen}
         offered = [c for c in every if c.plan.scan_names not in taken]
         options = [put_off(command, current) for command in offered]

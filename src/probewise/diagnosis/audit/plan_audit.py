@@ -28,6 +28,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
+from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
@@ -189,6 +190,7 @@ def audit_plan(
     sensor: SensorPrior | None = None,
     noise_sd: float | None = None,
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    progress: Progress = silent,
 ) -> PlanAudit:
     """Say of each effect whether a plan sees it and tells it from the others, and what readings would cure it.
 
@@ -203,6 +205,8 @@ def audit_plan(
         white.
     effects
         The vocabulary, by name.
+    progress
+        Told of the plan, then of each scan that might cure it.
 
     Raises
     ------
@@ -221,11 +225,13 @@ def audit_plan(
         noise_sd = float(sensor.noise_sd.mean())
     expected, said = _expected(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
+    progress("judging the plan")
     before, cosines = _judged(PlanTemplates.of(expected, plan, effects), effects, unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
-    chosen = cures_of(plan, expected, effects, ailing)
+    chosen = cures_of(plan, expected, effects, ailing, progress)
     steps, current = [before], plan
-    for command in chosen:
+    for k, command in enumerate(chosen):
+        progress("judging the plan with its cures", k, len(chosen))
         current = behind(current, [command.plan])
         steps.append(_judged(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)

@@ -15,6 +15,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, resampled
+from probewise.progress import Progress, silent
 
 __all__ = ["Density", "anneal", "by_weight"]
 
@@ -86,6 +87,7 @@ def anneal(
     n_moves: int,
     n_wanted: int,
     rng: np.random.Generator,
+    progress: Progress = silent,
 ) -> FloatArray:
     """Draw from a density, setting out from samples of another one.
 
@@ -97,6 +99,8 @@ def anneal(
         As in `by_weight`.
     n_moves
         Moves of each sample after a step of beta, and from one harvest to the next.
+    progress
+        Told beta on the way to the density, and there the samples that are harvested.
 
     Returns
     -------
@@ -117,10 +121,12 @@ def anneal(
         after = _next_beta(gain, beta)
         kept = resampled(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
+        progress("carrying samples to the posterior", note=f"beta {beta:.2f} of 1")
         for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
     harvest = [z]
     while len(harvest) * n_walkers < n_wanted:
+        progress("sampling the posterior", len(harvest) * n_walkers, n_wanted)
         for _ in range(n_moves):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
         harvest.append(z)

@@ -17,6 +17,7 @@ from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import EFFECTS
+from probewise.progress import Progress, silent
 
 __all__ = ["Drawn", "Ensemble", "draw_models"]
 
@@ -39,6 +40,7 @@ class Ensemble:
     searched: Searched
     noise: Names
     rng: np.random.Generator
+    progress: Progress = silent
     _known: dict[tuple[Names, bool], ModelSamples] = field(default_factory=dict)
 
     def of(self, candidate: WeighedFit) -> ModelSamples:
@@ -90,7 +92,9 @@ class Ensemble:
 
     def _drawn(self, candidate: WeighedFit) -> ModelSamples:
         evidence, recording = candidate.evidence[self.noise], self.searched.prepared.recording
-        return sample_model(candidate.found, evidence, recording, weights=candidate.weights, rng=self.rng)
+        return sample_model(
+            candidate.found, evidence, recording, weights=candidate.weights, rng=self.rng, progress=self.progress
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +106,21 @@ class Drawn:
     model: ModelSamples
 
 
-def draw_models(searched: Searched, test: GlobalTest, judged: Judged, best: Best, *, rng: np.random.Generator) -> Drawn:
+def draw_models(
+    searched: Searched,
+    test: GlobalTest,
+    judged: Judged,
+    best: Best,
+    *,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> Drawn:
     """Draw from the posterior of the repaired model, with what a verdict leaves open in its share.
 
     The best hypothesis alone would be sure and, at times, wrong: what is unknown may not be what it looks like, and
     what leads but little has rivals.
     """
-    ensemble, fit, null = Ensemble(searched, best.noise, rng), best.fit, test.null
+    ensemble, fit, null = Ensemble(searched, best.noise, rng, progress), best.fit, test.null
     model = samples = ensemble.of(fit)
     if judged.verdict == "unknown":
         doubt = _DOUBT_BESIDE

@@ -24,6 +24,7 @@ from probewise.diagnosis.repair.quadratic import Quadratic
 from probewise.diagnosis.repair.surrogate import Surrogate
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
 from probewise.inference import sd_ceiling, sd_floor
+from probewise.progress import Progress, silent
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
 from probewise.sensor import ACCURATE_NODES
@@ -106,6 +107,7 @@ def sample_model(
     weights: Mapping[str, FloatArray],
     rng: np.random.Generator,
     annealed: bool = True,
+    progress: Progress = silent,
 ) -> ModelSamples:
     """Draw from the posterior about a fit, under the noise model it was weighed with.
 
@@ -125,9 +127,11 @@ def sample_model(
         Source of randomness.
     annealed
         Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
+    progress
+        Told how far they are carried.
     """
     law, n_samples = noise.law, N_SAMPLES
-    z = np.clip(_posterior_draws(found, noise, recording, annealed, rng=rng), -FARTHEST, FARTHEST)
+    z = np.clip(_posterior_draws(found, noise, recording, annealed, progress, rng=rng), -FARTHEST, FARTHEST)
     # What is not annealed is drawn for the effects' sake alone: the noise is then that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
@@ -164,7 +168,13 @@ def sample_model(
 
 
 def _posterior_draws(
-    found: Fit, noise: NoiseEvidence, recording: Recording, annealed: bool, *, rng: np.random.Generator
+    found: Fit,
+    noise: NoiseEvidence,
+    recording: Recording,
+    annealed: bool,
+    progress: Progress,
+    *,
+    rng: np.random.Generator,
 ) -> FloatArray:
     """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then carried to the posterior."""
     law, model = noise.law, found.model
@@ -199,7 +209,7 @@ def _posterior_draws(
         weighed = by_weight(first, log_q, log_p, n_wanted=n, rng=rng)
         if weighed is not None:
             return weighed
-        return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng)
+        return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
 
     e = carried(draws, of_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
     return center + carried(e, near.log_density, of_posterior, _MOVES, N_SAMPLES) @ steps

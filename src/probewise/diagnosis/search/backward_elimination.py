@@ -21,14 +21,15 @@ def eliminate_backward(state: SearchState) -> None:
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.odds(c))
     named = [c for c in several if not out_of_vocabulary(c.names)]
     rest = [c for c in several if out_of_vocabulary(c.names)]
-    for candidate in [*named[:ELIMINATED], *rest[:1]]:
-        for left_out in candidate.names:
-            others = tuple(name for name in candidate.names if name != left_out)
-            if others not in state.refitted | state.undetected:
-                state.reach(others)
-            held = state.of(others)
-            if held:
-                _select_again(state, max(held, key=lambda c: c.log_z), candidate.names)
+    dropped = [(c.names, left_out) for c in [*named[:ELIMINATED], *rest[:1]] for left_out in c.names]
+    for k, (names, left_out) in enumerate(dropped):
+        state.progress("leaving effects out in turn", k, len(dropped))
+        others = tuple(name for name in names if name != left_out)
+        if others not in state.refitted | state.undetected:
+            state.reach(others)
+        held = state.of(others)
+        if held:
+            _select_again(state, max(held, key=lambda c: c.log_z), names)
 
 
 def _select_again(state: SearchState, held: WeighedFit, names: Names) -> None:

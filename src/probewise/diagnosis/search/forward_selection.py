@@ -39,6 +39,7 @@ class Proposal:
 def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
     """Refit the best combinations of each size, each extended from the best of the size before."""
     null = state.null
+    state.progress("screening effects")
     if depth > 1:
         _screen_pairs(state, null)
     freedom = null.degrees_of_freedom
@@ -54,7 +55,10 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
             chosen = _alone(state, null, proposals)
         else:
             chosen = promising(state, proposals, width=beam, behind=STEERING)
-        refitted = [state.refit(proposals[names].parent, proposals[names].added) for names in chosen]
+        refitted = []
+        for k, names in enumerate(chosen):
+            state.progress(f"refitting effects, {size} at a time", k, len(chosen))
+            refitted.append(state.refit(proposals[names].parent, proposals[names].added))
         kept = [c for c in refitted if c is not None]
         if not kept:
             break

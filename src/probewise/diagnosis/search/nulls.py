@@ -23,7 +23,10 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     recording = prepared.recording
     plan, law = recording.plan, white(len(prepared.usable), least=noises.least_sd)
 
+    n_forms = 1 if null is not None or max_order == 1 else max_order + 2
+
     def kept(form: Start, law: NoiseLaw) -> WeighedFit:
+        state.progress("fitting the sensor alone", len(state.sensors), n_forms)
         sensor, starts = form
         state.sensors[sensor.n_gaussians] = sensor
         return state.keep(refits.weighed(Model(sensor, (), plan), starts, law))
@@ -42,5 +45,6 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
                 last = kept(forms.one_more(last.found, n), refits.law_of(last))
                 best = max(best, last.log_z)
     if noises.pair_up(state.null.found, state.null.evidence):
+        state.progress("weighing pairs of noises")
         for candidate in state.nulls:
             state.keep(candidate.with_evidence(noises.weigh(candidate.found)))

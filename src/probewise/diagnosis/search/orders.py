@@ -24,7 +24,8 @@ def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
     """
     known = sum(p for names, p in by_mean.items() if names != ("unknown",))
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
-    for names in leaders[:MOST_AT_OTHER_ORDERS]:
+    for k, names in enumerate(leaders[:MOST_AT_OTHER_ORDERS]):
+        state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), MOST_AT_OTHER_ORDERS))
         held = state.of(names)
         if held and by_mean[names] >= REFITTED_AT_OTHER_ORDERS * known:
             source = max(held, key=lambda c: c.log_z)

@@ -37,6 +37,7 @@ from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import Unknown
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.effects import NoiseEffect
+from probewise.progress import Progress, silent
 
 __all__ = ["search"]
 
@@ -48,6 +49,7 @@ def search(
     max_order: int | None = None,
     beam: int = 8,
     depth: int = 3,
+    progress: Progress = silent,
 ) -> Searched:
     """Weigh every combination of effects.
 
@@ -62,6 +64,8 @@ def search(
         few readings one.
     beam, depth
         How many combinations of each size above one are refitted, and the largest size.
+    progress
+        Told of every refit.
     """
     recording, effects = prepared.recording, prepared.effects
     if max_order is None:
@@ -71,7 +75,7 @@ def search(
     noises = Noises(recording, on_noise, prior)
     templates = TemplateMemory(prepared.usable)
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
-    state = SearchState(on_mean, prior, noises, templates, Refits(prepared.null, noises, templates))
+    state = SearchState(on_mean, prior, noises, templates, Refits(prepared.null, noises, templates), progress)
     fit_nulls(state, prepared, max_order=max_order)
     unknown = _unknown(state, prepared)
     screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)
@@ -86,7 +90,8 @@ def search(
     eliminate_backward(state)
     # Beside a form of the SSF that the readings refute, it is the form that is missing.
     unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
-    for _ in range(MOST_REFITTED_LATE):
+    for k in range(MOST_REFITTED_LATE):
+        progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
         by_mean = posterior().by_mean
         settled = {(), ("unknown",)} | state.undetected | state.refitted
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
@@ -96,6 +101,7 @@ def search(
     if prepared.null is None:
         at_other_orders(state, posterior().by_mean)
     state.candidates, state.pruned = prune(state.candidates, noises)
+    progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
     unknown.prune(state.candidates.values())

@@ -18,6 +18,7 @@ from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.refits import Refits, is_significant
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import NamedEffect
+from probewise.progress import Progress, silent
 
 __all__ = ["SearchState", "rivals_of"]
 
@@ -40,6 +41,8 @@ class SearchState:
         Of effects about fits.
     refits
         How the recording is fitted.
+    progress
+        Told how far the search is.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
@@ -47,6 +50,7 @@ class SearchState:
     noises: Noises
     templates: TemplateMemory
     refits: Refits
+    progress: Progress = silent
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)
     """By SSF order."""

@@ -1,0 +1,132 @@
+"""What a command says while it works: a bar on a terminal, a line now and then elsewhere, nothing where it is quiet."""
+
+import io
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from probewise import _progress
+from probewise._progress import progress_or_bar, progress_shown
+from probewise.progress import silent
+from probewise.recordings import read_recording
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def hurried(monkeypatch):
+    """Let two seconds pass in a hundredth of one."""
+    for name in ("_PATIENCE_S", "_BEAT_S"):
+        monkeypatch.setattr(_progress, name, 0.01)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that goes on when it is told to, and lines on standard error."""
+    now_s = [100.0]
+    monkeypatch.setattr(_progress.time, "monotonic", lambda: now_s[0])
+    return now_s
+
+
+def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):
+    lines = _progress._Lines()
+    for _ in range(13):
+        lines("refitting effects", int(clock[0]) - 100, 20)
+        clock[0] += 1.0
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "refitting effects, 2 of 20 (2 s)",
+        "refitting effects, 7 of 20 (7 s)",
+        "refitting effects, 12 of 20 (12 s)",
+    ]
+
+
+def test_hours_of_work_are_told_of_more_seldom(clock, capsys):
+    lines = _progress._Lines()
+    for _ in range(3600):
+        lines("runs", note="a key")
+        clock[0] += 1.0
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "runs, a key (2 s)"
+    assert 50 < len(said) < 150
+
+
+def test_a_step_that_takes_long_is_heard_of_while_it_lasts(hurried, capsys):
+    with progress_shown(quiet=False) as progress:
+        progress("drawing the figures")
+        time.sleep(0.1)
+    assert "drawing the figures (0 s)" in capsys.readouterr().err
+
+
+def test_a_terminal_shows_the_stage_its_share_and_the_clock(hurried, monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(_progress.sys, "stderr", terminal)
+    with progress_shown(quiet=False) as progress:
+        progress("refitting effects", 3, 12)
+        time.sleep(0.1)
+        progress("drawing the figures", note="slowly")
+        time.sleep(0.1)
+    shown = terminal.getvalue()
+    assert "refitting effects:  25%|" in shown
+    assert "3/12" in shown
+    assert "refitting effects: 100%" in shown
+    assert "drawing the figures [00:00], slowly" in shown
+
+
+def test_what_ends_soon_shows_no_bar(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(_progress.sys, "stderr", terminal)
+    with progress_shown(quiet=False) as progress:
+        for k in range(100):
+            progress("counting", k, 100)
+    assert not terminal.getvalue().strip()
+
+
+def test_a_quiet_command_says_nothing(hurried, capsys):
+    with progress_shown(quiet=True) as progress:
+        assert progress is silent
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+
+
+def test_nothing_beats_on_after_an_error(hurried):
+    before = threading.active_count()
+    with pytest.raises(RuntimeError, match="stop"), progress_shown(quiet=False):
+        raise RuntimeError("stop")
+    assert threading.active_count() == before
+
+
+def test_nothing_beats_where_a_person_is_asked(hurried, capsys):
+    with progress_shown(quiet=False, beat=False) as progress:
+        time.sleep(0.05)
+        assert capsys.readouterr().err == ""
+        progress("readings", 1, 3)
+    assert capsys.readouterr().err == "readings, 1 of 3 (0 s)\n"
+
+
+def test_from_python_nothing_is_written_where_nobody_looks(hurried, capsys):
+    with progress_or_bar(True) as progress:
+        assert progress is silent
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_caller_may_be_told_instead():
+    told = []
+    with progress_or_bar(lambda *words, **more: told.append(words)) as progress:
+        progress("refitting effects", 3, 12)
+    assert told == [("refitting effects", 3, 12)]
+
+
+def test_reading_a_file_tells_of_its_rows(recording_file):
+    told = []
+    recording = read_recording(recording_file, progress=lambda *words: told.append(words))
+    stage, done, total = told[-1]
+    assert stage == "reading small.csv"
+    assert done == len(recording) + 1 <= total
+    assert np.all(np.diff([words[1] for words in told]) > 0)

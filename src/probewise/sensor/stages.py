@@ -36,16 +36,20 @@ __all__ = [
 class Stage(IntEnum):
     """Where in the chain an effect acts."""
 
-    POSE = 0
-    SCENE = 1
-    FOOTPRINT = 2
-    SEEN = 3
-    RESPONSE = 4
-    GAIN = 5
-    OFFSET = 6
-    LAG = 7
-    SATURATION = 8
-    NOISE = 9
+    INPUT = 0
+    PARAMETER = 1
+    RATE = 2
+    POSE = 3
+    SCENE = 4
+    FOOTPRINT = 5
+    SEEN = 6
+    RESPONSE = 7
+    GAIN = 8
+    OFFSET = 9
+    BEND = 10
+    LAG = 11
+    SATURATION = 12
+    NOISE = 13
 
 
 @dataclass(frozen=True, eq=False)

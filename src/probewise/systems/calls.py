@@ -1,0 +1,178 @@
+"""How a person's `simulate` is called: for all samples at once where it broadcasts, else for one after the other."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError, ShapeError
+from probewise.systems.simulator import Simulate
+
+__all__ = ["Caller"]
+
+_N_NODES = 5  # values at which a parameter that cannot vary by row is held, to interpolate between
+_SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
+
+
+@dataclass(eq=False)
+class Caller:
+    """Call `simulate` for many samples; count the calls, and those that failed.
+
+    Parameters
+    ----------
+    simulate
+        A person's function.
+    broadcasts
+        Whether it takes parameters (n_samples, 1) and columns (n_points,) together.
+    by_row
+        Parameters that it takes as arrays (n_points,) when called for one sample; ignored where it broadcasts.
+    """
+
+    simulate: Simulate
+    broadcasts: bool
+    by_row: frozenset[str] = frozenset()
+    n_calls: int = 0
+    n_failed: int = 0
+    interpolated: set[str] = field(default_factory=set)
+
+    @classmethod
+    def probed(
+        cls, simulate: Simulate, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, per_run: tuple[str, ...], broadcasts: bool
+    ) -> Caller:
+        """Find out how a function can be called, at some samples (n_samples, 1 or n_points) of its parameters.
+
+        Raises
+        ------
+        ParameterError
+            If it raises at every sample.
+        ShapeError
+            If what it returns is not one number for each row.
+        """
+        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run))
+        if broadcasts:
+            together = cls(simulate, broadcasts=True)
+            together(samples, columns)
+            return together
+        alone = one(samples, columns, strict=True)
+        if not np.isfinite(alone).any():
+            raise ParameterError("simulate", "NaN at every place of the prior that was tried", "finite readings")
+        together = cls(simulate, broadcasts=True)
+        try:
+            if _alike(together(samples, columns, strict=True), alone):
+                return together
+        except Exception:  # noqa: S110 - it does not broadcast, whatever it says of that
+            pass
+        return cls(simulate, broadcasts=False, by_row=frozenset(per_run) | _taken_by_row(one, samples, columns, alone, per_run))
+
+    def __call__(
+        self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, strict: bool = False
+    ) -> FloatArray:
+        """Simulate parameters (n_samples, 1 or n_points) over columns (n_points,) or (n_samples, n_points).
+
+        A sample at which `simulate` raises gets NaN; `strict`: the first error is raised where all fail.
+        """
+        n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
+        n_points = max(np.shape(v)[-1] for v in columns.values())
+        with np.errstate(all="ignore"):
+            if self.broadcasts:
+                self.n_calls += 1
+                try:
+                    readings = np.asarray(self.simulate(dict(parameters), dict(columns)), dtype=np.float64)
+                except Exception:
+                    if strict:
+                        raise
+                    self.n_failed += n_samples
+                    return np.full((n_samples, n_points), np.nan)
+                return _of_shape(readings, (n_samples, n_points))
+            out, first_error = np.full((n_samples, n_points), np.nan), None
+            for k in range(n_samples):
+                own = {name: _row(values, k) for name, values in parameters.items()}
+                table = {name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values for name, values in columns.items()}
+                try:
+                    out[k] = self._one(own, table, n_points)
+                except (ShapeError, KeyboardInterrupt):
+                    raise
+                except Exception as error:
+                    self.n_failed += 1
+                    first_error = first_error or error
+            if strict and first_error is not None and not np.isfinite(out).any():
+                raise first_error
+        return out
+
+    def _one(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
+        vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
+        if not vary:
+            self.n_calls += 1
+            return _of_shape(np.asarray(self.simulate(dict(own), dict(columns)), dtype=np.float64), (n_points,))
+        self.interpolated.update(vary)
+        nodes = [_nodes(own[name]) for name in vary]
+        out = np.zeros(n_points)
+        for at in itertools.product(*(range(len(each)) for each in nodes)):
+            fixed = {name: float(each[i]) for name, each, i in zip(vary, nodes, at, strict=True)}
+            share = np.ones(n_points)
+            for name, each, i in zip(vary, nodes, at, strict=True):
+                share = share * _lagrange(each, i, own[name])
+            out += share * self._one({**own, **fixed}, columns, n_points)
+        return out
+
+
+def _taken_by_row(
+    one: Caller, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], alone: FloatArray, per_run: tuple[str, ...]
+) -> frozenset[str]:
+    n_points = alone.shape[1]
+    taken = []
+    for name, values in samples.items():
+        if name in per_run:
+            continue
+        trial = Caller(one.simulate, broadcasts=False, by_row=frozenset({*per_run, name}))
+        spread = {**samples, name: np.broadcast_to(values, (len(values), n_points))}
+        try:
+            if _alike(trial(spread, columns, strict=True), alone):
+                taken.append(name)
+        except Exception:  # noqa: S112 - it takes no array here, whatever it says of that
+            continue
+    return frozenset(taken)
+
+
+def _row(values: FloatArray, k: int) -> Any:
+    own = values[min(k, len(values) - 1)]
+    return float(own[0]) if own.shape == (1,) else own
+
+
+def _nodes(values: FloatArray) -> FloatArray:
+    low, high = float(np.min(values)), float(np.max(values))
+    if low == high:
+        return np.array([low])
+    places = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))
+    return low + (high - low) * places
+
+
+def _lagrange(nodes: FloatArray, i: int, at: FloatArray) -> FloatArray:
+    others = np.delete(nodes, i)
+    return np.asarray(np.prod((at[:, None] - others) / (nodes[i] - others), axis=1))
+
+
+def _alike(first: FloatArray, second: FloatArray) -> bool:
+    if first.shape != second.shape or not np.array_equal(np.isfinite(first), np.isfinite(second)):
+        return False
+    there = np.isfinite(first)
+    return bool(np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0))))
+
+
+def _of_shape(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
+    if readings.shape == wanted:
+        return readings
+    try:
+        return np.array(np.broadcast_to(readings, wanted)) if readings.ndim == len(wanted) else _refuse(readings, wanted)
+    except ValueError:
+        return _refuse(readings, wanted)
+
+
+def _refuse(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
+    raise ShapeError(f"simulate returns an array of shape {readings.shape}; allowed: {wanted}, one number for each row")

@@ -1,0 +1,132 @@
+"""FILE.py: a simulator as a person writes it, read and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+from probewise.errors import FileError, ParameterError
+from probewise.recordings.table import read_text
+from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
+
+__all__ = ["read_simulator"]
+
+_NAMES = (
+    "reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise", "simulate", "states",
+    "rates", "observe", "hold", "max_step_s", "vectorized", "extra",
+)  # fmt: skip
+
+
+def read_simulator(path: str | os.PathLike[str]) -> Simulator:
+    """Run a person's file and take the simulator that it describes.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read or run, or what it says does not fit together; it names the line where there is one.
+    """
+    path = Path(path)
+    text = read_text(path, "a Python file that describes a simulator")
+    try:
+        code = compile(text, str(path), "exec")
+    except (SyntaxError, ValueError) as error:
+        raise FileError(path, f"is no Python: {_briefly(error)}", "a file that Python can run", row=getattr(error, "lineno", None)) from error
+    said = _run(code, path)
+    try:
+        return _simulator(said, path, text)
+    except ParameterError as error:
+        raise FileError(path, f"{error.name} is {error.value!r}", error.allowed) from error
+
+
+def _run(code: CodeType, path: Path) -> dict[str, Any]:
+    names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
+    try:
+        exec(code, names)
+    except (KeyboardInterrupt, GeneratorExit):
+        raise
+    except BaseException as error:
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        found = f"stops with {type(error).__name__}: {_briefly(error)}"
+        raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
+    return names
+
+
+def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
+    given = said.get("parameters")
+    if not isinstance(given, Mapping):
+        raise ParameterError("parameters", given, 'a dict from names to priors: {"gain": (0, 10)}')
+    law = None
+    if "rates" in said or "states" in said:
+        states = said.get("states")
+        if not isinstance(states, Mapping):
+            raise ParameterError("states", states, 'a dict from states to where they start: {"temp_c": 20.0}')
+        law = Law(states, _function(said, "rates"), _function(said, "observe") if "observe" in said else None,
+                  said.get("hold", "previous"), said.get("max_step_s"))  # fmt: skip
+    return Simulator(
+        reading=_text(said, "reading"),
+        unit=_text(said, "unit"),
+        parameters={name: marginal_of(name, prior) for name, prior in given.items()},
+        simulate=_function(said, "simulate") if "simulate" in said else None,
+        law=law,
+        time=_text(said, "time") if said.get("time") is not None else None,
+        time_unit=_text(said, "time_unit") if "time_unit" in said else "s",
+        run=_text(said, "run") if said.get("run") is not None else None,
+        per_run=_texts(said, "per_run"),
+        controls=_texts(said, "controls"),
+        noise=_noise(said.get("noise", {})),
+        extra={name: _extra(name, each) for name, each in _mapping(said, "extra").items()},
+        vectorized=bool(said.get("vectorized", False)),
+        source=path.name,
+        fingerprint=hashlib.sha256(text.encode()).hexdigest()[:16],
+    )
+
+
+def _text(said: Mapping[str, Any], name: str) -> str:
+    value = said.get(name)
+    if not isinstance(value, str) or not value:
+        raise ParameterError(name, value, f'a text: {name} = "..."')
+    return value
+
+
+def _texts(said: Mapping[str, Any], name: str) -> tuple[str, ...]:
+    value = said.get(name, ())
+    if isinstance(value, str) or not all(isinstance(each, str) for each in value):
+        raise ParameterError(name, value, f'a list of names: {name} = ["..."]')
+    return tuple(value)
+
+
+def _mapping(said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    value = said.get(name, {})
+    if not isinstance(value, Mapping):
+        raise ParameterError(name, value, "a dict")
+    return value
+
+
+def _function(said: Mapping[str, Any], name: str) -> Any:
+    value = said.get(name)
+    if not callable(value):
+        raise ParameterError(name, value, f"a function: def {name}(...)")
+    return value
+
+
+def _noise(given: object) -> Noise:
+    if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
+        raise ParameterError("noise", given, 'a dict with some of "sd", "step", "range", "zero"')
+    low, high = given.get("range", (None, None))
+    return Noise(given.get("sd"), given.get("step"), (low, high), given.get("zero", 0.0))
+
+
+def _extra(name: str, given: object) -> Extra:
+    if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
+        raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
+    return Extra(marginal_of(name, given["prior"]), float(given["null"]), str(given["says"]))
+
+
+def _briefly(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if len(text) <= 200 else f"{text[:197]}..."

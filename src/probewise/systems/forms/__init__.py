@@ -1,0 +1,18 @@
+"""The vocabulary of forms: what any simulator may leave out, bound to its columns, parameters, states and reading."""
+
+from __future__ import annotations
+
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Form
+from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
+from probewise.systems.forms.parameters import forms_on_parameters
+from probewise.systems.forms.rates import forms_on_rates
+from probewise.systems.forms.readings import forms_on_readings
+
+__all__ = ["About", "Form", "driving_columns", "forms_of"]
+
+
+def forms_of(about: About) -> dict[str, Form]:
+    """Bind every form that this table could show, by name."""
+    found = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
+    return {form.name: form for form in found}

@@ -1,0 +1,112 @@
+"""About which fit forms are bound: what the readings can see there gives each form its scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.priors import LogUniform
+from probewise.sensor import Stage
+from probewise.systems.forms.form import Act, Form
+from probewise.systems.motion import RowsInRuns, integrate_states
+from probewise.systems.system import System, given_columns
+from probewise.systems.table import RunTable
+
+__all__ = ["About"]
+
+_UNSEEN = 1e-7  # of the noise: what changes the readings by less changes nothing
+_TYPICAL = 1.0  # noise sds, rms, that an effect of typical size changes the readings by
+_LEAST, _MOST = 0.05, 1e4  # noise sds, rms, between which sizes without an amplitude are looked for
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """A fit of a system: coordinates z (n_params,), and the sd of a reading.
+
+    Forms are given the size at which the readings here change by one sd: so no span is asked of anything.
+    """
+
+    system: System
+    table: RunTable
+    z: FloatArray
+    sd: float
+
+    @cached_property
+    def theta(self) -> FloatArray:
+        """Parameters of the fit, (1, n_params)."""
+        return self.system.theta(self.z[None, :])
+
+    @cached_property
+    def predicted(self) -> FloatArray:
+        """Predicted readings, (n_points,)."""
+        return self.system.chain(self.table, ()).predict(self.theta, self.table)[0]
+
+    @cached_property
+    def states(self) -> dict[str, FloatArray]:
+        """States at each row, (n_points,); none without a law."""
+        system = self.system
+        if system.simulator.law is None:
+            return {}
+        columns = given_columns(system.simulator, self.table)
+        parameters = system.parameters(self.theta, self.table)
+        found = integrate_states(system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step)
+        return {state: values[0] for state, values in found.items()}
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of time."""
+        return self.system.simulator.time_unit
+
+    @property
+    def unit(self) -> str:
+        """Unit of a reading."""
+        return self.system.simulator.unit
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last, in its unit."""
+        return float(np.ptp(self.table.time_s)) or 1.0
+
+    @cached_property
+    def gap(self) -> float:
+        """Time from a row to the next of its run, the median."""
+        gaps = np.concatenate([np.diff(self.table.time_s[rows]) for rows in self.table.rows_by_scan()])
+        gaps = gaps[gaps > 0]
+        return float(np.median(gaps)) if gaps.size else 1.0
+
+    def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+        """Rms change of the readings by each setting (n_settings, n_params), in sds; NaN where it is not finite."""
+        trial = Form("trial", stage, dict.fromkeys(map(str, range(settings.shape[1]))), (), (), act, settings, (), lambda mean, sd: "")
+        chain = replace(self.system.chain(self.table, ()), effects=(trial,))
+        theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
+        change = chain.predict(theta, self.table) - self.predicted
+        return np.asarray(np.sqrt(np.mean(change**2, axis=1)) / self.sd)
+
+    def typical(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
+        """Find the amplitude at which the readings change by one sd; None where they do not change.
+
+        `entries` (n_entries, n_columns, n_params) are laid out at the amplitude `guess`.
+        """
+        settings = entries.reshape(-1, entries.shape[-1])
+        rms = self.rms(stage, act, settings[:: max(len(settings) // 16, 1)])
+        rms = rms[np.isfinite(rms)]
+        if not rms.size or rms.max() <= _UNSEEN:
+            return None
+        return _TYPICAL * guess / float(np.median(rms[rms > _UNSEEN]))
+
+    def sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
+        """Find between which sizes (n_tried,) the readings change, and not out of all proportion; None if nowhere."""
+        rms = self.rms(stage, act, tried[:, None])
+        there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST))
+        if not there.size:
+            return None
+        low, high = int(there.min()), int(there.max())
+        return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
+
+    def log_uniform(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
+        """Take the prior of such a size as even over its orders of magnitude."""
+        between = self.sizes(stage, act, tried)
+        return None if between is None or not between[0] < between[1] else LogUniform(*between)

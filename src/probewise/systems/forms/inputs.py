@@ -1,0 +1,161 @@
+"""Forms on the inputs: a column that is not what it says, and a clock that is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects import HeavyTailed
+from probewise.priors import LogUniform, Uniform
+from probewise.sensor import Stage
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Act, Form, Say, with_unit
+from probewise.systems.forms.modulations import wave_joined, wave_numbers
+from probewise.systems.forms.readings import earlier
+from probewise.systems.table import RunTable
+
+__all__ = ["driving_columns", "forms_on_inputs"]
+
+_N_SIZES = 9
+_NUDGE = 1e-4  # of a column's spread, to see whether it drives the readings
+_MOST_WAVES_OF_A_LAW = 96
+_MOST_WAVES = 600
+_FORTH_AND_BACK = 0.02
+
+Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
+"""A column (n_points,) or (n_samples, n_points), parameters and the table to the column as it really is."""
+
+
+def driving_columns(about: About) -> list[str]:
+    """List the columns that the simulator's readings depend on, the time left out."""
+    own, table = about.system.simulator, about.table
+    out = []
+    for name, values in table.covariates.items():
+        spread = float(np.nanstd(values))
+        if name == own.reading or name == own.noise.sd or spread == 0:
+            continue
+        rms = about.rms(Stage.INPUT, _on(name, lambda c, theta, _: c + theta[:, :1]), np.array([[_NUDGE * spread]]))
+        wave = about.rms(Stage.INPUT, _on(name, lambda c, theta, _: c * (1 + theta[:, :1])), np.array([[_NUDGE]]))
+        if max(float(rms[0]), float(wave[0])) > 0:
+            out.append(name)
+    return out
+
+
+def forms_on_inputs(about: About) -> Iterator[Form]:
+    """List what may be wrong with each column that drives the simulator, and with the clock."""
+    table, time = about.table, about.table.time
+    for name in driving_columns(about):
+        values = table.covariates[name]
+        spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
+        yield from _linear(about, f"input_offset:{name}", _on(name, lambda c, th, _: c + th[:, :1]), 1e-4 * spread, name,
+                           lambda m, s, c=name: f"{c} is {with_unit(m[0], s[0], '')} more than it says", name)  # fmt: skip
+        yield from _linear(about, f"input_gain:{name}", _on(name, lambda c, th, _: c * (1 + th[:, :1])), 1e-4, "1",
+                           lambda m, s, c=name: f"{c} is {with_unit(1 + m[0], s[0], '')} times what it says", name)  # fmt: skip
+        yield from _ceiling(about, name, low, high)
+        yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name,
+                          lambda m, s, c=name: f"{c} does nothing within {with_unit(m[0], s[0], '')} of 0", name)  # fmt: skip
+        if _turns_back(values, table):
+            yield from _sized(about, f"backlash:{name}", "width", _on(name, play), high - low, name,
+                              lambda m, s, c=name: f"{c} has {with_unit(m[0], s[0], '')} of play", "previous", name)  # fmt: skip
+        yield from _wave(about, name)
+        if table.has_time:
+            yield from _sized(about, f"input_delay:{name}", "tau_s", _on(name, late), about.duration, about.time_unit,
+                              lambda m, s, c=name: f"{c} acts {with_unit(m[0], s[0], about.time_unit)} late", "previous", name)  # fmt: skip
+    if time is not None:
+        yield from _linear(about, "clock_drift", _on(time, lambda c, th, _: c * (1 + th[:, :1])), 1e-5, "1",
+                           lambda m, s: f"the clock runs {with_unit(1 + m[0], s[0], '')} times as fast as it says", "time")  # fmt: skip
+
+
+def _on(name: str, change: Change) -> Act:
+    return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
+
+
+def _linear(about: About, name: str, act: Act, guess: float, unit: str, says: Say, *covariates: str) -> Iterator[Form]:
+    typical = about.typical(Stage.INPUT, act, np.full((1, 1, 1), guess), guess)
+    if typical is not None:
+        yield Form(name, Stage.INPUT, {"a": HeavyTailed(typical)}, (unit,), covariates, act, np.full((1, 1, 1), typical), (0,), says)
+
+
+def _sized(
+    about: About, name: str, parameter: str, act: Act, most: float, unit: str, says: Say, *covariates: str
+) -> Iterator[Form]:
+    prior = about.log_uniform(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
+    if prior is not None:
+        entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
+        yield Form(name, Stage.INPUT, {parameter: prior}, (unit,), covariates, act, entries, (), says, absent={0: 0.0})
+
+
+def _ceiling(about: About, name: str, low: float, high: float) -> Iterator[Form]:
+    act = _on(name, lambda c, theta, _: np.minimum(c, theta[:, :1]))
+    levels = high - (high - low) * np.geomspace(0.003, 0.9, 16)
+    rms = about.rms(Stage.INPUT, act, levels[:, None])
+    if np.nanmax(rms, initial=0.0) > 0.05:
+        yield Form(
+            f"input_saturation:{name}", Stage.INPUT, {"level": Uniform(float(levels[-1]), high)}, (name,), (name,), act,
+            levels[:, None, None], (), lambda m, s: f"{name} goes no further than {with_unit(m[0], s[0], '')}", absent={0: high},
+        )  # fmt: skip
+
+
+def _wave(about: About, name: str) -> Iterator[Form]:
+    values, table = about.table.covariates[name], about.table
+    if len(np.unique(values)) < 12:
+        return
+
+    def change(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
+
+    act = _on(name, change)
+    waves = wave_numbers(np.sort(values), [np.arange(len(values))], _MOST_WAVES if about.system.is_quick else _MOST_WAVES_OF_A_LAW)
+    guess, n = 1e-4 * float(np.nanstd(values)), len(waves)
+
+    def entries(size: float) -> FloatArray:
+        sine = np.stack([np.full(n, size), 1 / waves, np.zeros(n)], axis=-1)
+        return np.stack([sine, sine + np.array([0.0, 0.0, 0.5 * np.pi])], axis=1)
+
+    typical = about.typical(Stage.INPUT, act, entries(guess), guess)
+    if typical is None:
+        return
+    del table
+    marginals = {"a": HeavyTailed(typical, positive=True), "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
+                 "phase": Uniform(-2 * np.pi, 2 * np.pi)}  # fmt: skip
+    yield Form(
+        f"periodic_error:{name}", Stage.INPUT, marginals, (name, name, "rad"), (name,), act, entries(typical), (0,),
+        lambda m, s: f"{name} is off by up to {with_unit(m[0], s[0], '')} again and again, every {with_unit(m[1], s[1], '')}",
+        joined=wave_joined,
+    )  # fmt: skip
+
+
+def _dead(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
+
+
+def late(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Give a column as it was earlier by a dead time, within runs."""
+    values = np.atleast_2d(c)
+    out = np.empty((max(len(values), len(theta)), values.shape[1]))
+    for rows in table.rows_by_scan():
+        out[:, rows] = earlier(table.time_s[rows], values[:, rows], theta[:, 0])
+    return out
+
+
+def play(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Follow a column with play: nothing moves until it is taken up; at the start of a run it is half taken up."""
+    values = np.atleast_2d(c)
+    half = 0.5 * theta[:, 0]
+    out = np.empty((max(len(values), len(theta)), values.shape[1]))
+    for rows in table.rows_by_scan():
+        own = np.broadcast_to(values[:, rows[0]], half.shape).copy()
+        first = np.flatnonzero(np.diff(values[0, rows]))
+        if first.size:  # it came the way it goes on
+            own -= half * np.sign(values[0, rows[first[0] + 1]] - values[0, rows[first[0]]])
+        for row in rows:
+            own = np.clip(own, values[:, row] - half, values[:, row] + half)
+            out[:, row] = own
+    return out
+
+
+def _turns_back(values: FloatArray, table: RunTable) -> bool:
+    moves = np.concatenate([np.diff(values[rows]) for rows in table.rows_by_scan()])
+    return bool((moves > 0).mean() > _FORTH_AND_BACK and (moves < 0).mean() > _FORTH_AND_BACK)

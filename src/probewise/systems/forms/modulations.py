@@ -1,0 +1,163 @@
+"""How something varies over the rows: along time, at a change point, from run to run, as a wave, with a column."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects import HeavyTailed
+from probewise.priors import Uniform
+from probewise.systems.forms.form import Moments, with_unit
+from probewise.systems.table import RunTable
+
+__all__ = ["Modulation", "column", "drift", "per_run", "step", "wave", "wave_joined", "wave_numbers"]
+
+_MOST_MOMENTS = 512
+_MOST_WAVES = 1024
+_PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns: one of a phase's names lies far from both ends
+
+@dataclass(frozen=True, eq=False)
+class Modulation:
+    """A function of the rows: `over(theta, table)` (n_samples, n_points), 0 where the amplitude is 0.
+
+    `marginals` takes the typical amplitude; `units` and `says` the unit of what varies.
+    """
+
+    over: Callable[[FloatArray, RunTable], FloatArray]
+    marginals: Callable[[float], Mapping[str, Any]]
+    entries: Callable[[float], FloatArray]
+    units: Callable[[str], tuple[str, ...]]
+    says: Callable[[str, str, FloatArray, FloatArray], str]
+    covariates: tuple[str, ...]
+    amplitudes: tuple[int, ...] = (0,)
+    moments: Moments | None = None
+    joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+
+def _one(size: float) -> FloatArray:
+    return np.full((1, 1, 1), size)
+
+def drift(table: RunTable, time_unit: str) -> Modulation:
+    """In proportion to time as printed: a t."""
+    return Modulation(
+        over=lambda theta, rows: theta[:, :1] * rows.time_s,
+        marginals=lambda size: {"a": HeavyTailed(size)},
+        entries=_one,
+        units=lambda unit: (f"{unit}/{time_unit}",),
+        says=lambda what, unit, mean, sd: (
+            f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}"
+        ),
+        covariates=("time",),
+    )
+
+def column(name: str, table: RunTable) -> Modulation:
+    """In proportion to a column, counted from its mean over the recording: a (C - mean C)."""
+    values = table.covariates[name]
+    middle = float(np.nanmean(values))
+
+    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle))
+
+    return Modulation(
+        over=over,
+        marginals=lambda size: {"a": HeavyTailed(size)},
+        entries=_one,
+        units=lambda unit: (f"{unit} per {name}",),
+        says=lambda what, unit, mean, sd: f"{what} changes by {with_unit(mean[0], sd[0], unit)} per unit of {name}",
+        covariates=(name,),
+    )
+
+def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
+    """At a change point: a 1(t > t0), by time where it was recorded, else by row."""
+    by_row = not table.has_time
+    along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
+    stride = -(-(len(along) - 1) // _MOST_MOMENTS)
+    at = tuple(np.append(along[:-1:stride], along[-1]).tolist())
+    moments, name = Moments(at, by_row, gated), "at_row" if by_row else "at_s"
+
+    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(theta[:, :1] * (moments.along(rows) > theta[:, 1:2]))
+
+    def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
+        when = f"row {mean[1]:.0f}" if by_row else with_unit(mean[1], sd[1], time_unit)
+        return f"{what} jumps by {with_unit(mean[0], sd[0], unit)} at {when} and stays there"
+
+    return Modulation(
+        over=over,
+        marginals=lambda size: {"a": HeavyTailed(size), name: Uniform(at[0], at[-1])},
+        entries=lambda size: np.array([[[size, 0.5 * (at[0] + at[-1])]]]),
+        units=lambda unit: (unit, "row" if by_row else time_unit),
+        says=says,
+        covariates=("row",) if by_row else ("time",),
+        moments=moments,
+    )
+
+def per_run(table: RunTable) -> Modulation:
+    """From run to run: a_run, in a run that the recording does not hold 0."""
+    names = table.scan_names
+
+    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+        known = {name: k for k, name in enumerate(names)}
+        at = np.array([known.get(name, len(names)) for name in rows.scan_names])
+        values = np.concatenate([theta, np.zeros((len(theta), 1))], axis=1)
+        return np.asarray(values[:, at[rows.scan]])
+
+    def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
+        far = int(np.argmax(np.abs(mean)))
+        return f"{what} differs from run to run, most in run {names[far]}: by {with_unit(mean[far], sd[far], unit)}"
+
+    return Modulation(
+        over=over,
+        marginals=lambda size: {f"values[{name}]": HeavyTailed(size) for name in names},
+        entries=lambda size: size * np.eye(len(names))[None, :, :],
+        units=lambda unit: (unit,) * len(names),
+        says=says,
+        covariates=("run",),
+        amplitudes=tuple(range(len(names))),
+    )
+
+def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES) -> FloatArray:
+    """Lay out waves per unit of a covariate: up to one in two rows, twice for each that the reach tells apart."""
+    reach = float(np.ptp(values))
+    gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
+    gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
+    highest = 0.5 / float(np.median(gaps)) if gaps.size else 1.0 / reach
+    n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
+    return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
+
+def wave_joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
+    """Join the amounts of sine and cosine into amplitude and phase; the number of waves stays."""
+    size = entry[0, 0]
+    sine, cosine = amounts[0] * size, amounts[1] * size
+    return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])
+
+def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation:
+    """One sinusoid in time: a sin(2 pi hz t + phase)."""
+    waves = wave_numbers(table.time_s, table.rows_by_scan(), most)
+
+    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * rows.time_s + theta[:, 2:3]))
+
+    def entries(size: float) -> FloatArray:
+        n = len(waves)
+        sine = np.stack([np.full(n, size), waves, np.zeros(n)], axis=-1)
+        cosine = np.stack([np.full(n, size), waves, np.full(n, 0.5 * np.pi)], axis=-1)
+        return np.stack([sine, cosine], axis=1)
+
+    return Modulation(
+        over=over,
+        marginals=lambda size: {
+            "a": HeavyTailed(size, positive=True), "hz": Uniform(0.5 * waves[0], waves[-1] * 1.02), "phase": _PHASE,
+        },  # fmt: skip
+        entries=entries,
+        units=lambda unit: (unit, f"1/{time_unit}", "rad"),
+        says=lambda what, unit, mean, sd: (
+            f"{what} swings by {with_unit(mean[0], sd[0], unit)} either way, once in {1 / mean[1]:.4g} {time_unit}"
+        ),
+        covariates=("time",),
+        joined=wave_joined,
+    )
+

@@ -1,0 +1,44 @@
+"""Forms on the parameters: constants that are none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from probewise.sensor import Stage
+from probewise.systems.forms import modulations
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Act, Form
+from probewise.systems.forms.modulations import Modulation
+from probewise.systems.forms.readings import modulated
+
+__all__ = ["forms_on_parameters"]
+
+
+def forms_on_parameters(about: About) -> Iterator[Form]:
+    """List how each parameter may vary: along time, at a change point, from run to run, with a column."""
+    system, table = about.system, about.table
+    own = system.simulator
+    values = system.parameters(about.theta, table)
+    over: dict[str, Modulation] = {}
+    if table.has_time:
+        over["drifts"] = modulations.drift(table, about.time_unit)
+    over["steps"] = modulations.step(table, about.time_unit, gated=False)
+    columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and np.nanstd(v) > 0]
+    for name in own.parameters:
+        guess = 1e-4 * (float(np.abs(values[name]).max()) or 1.0)
+        each = dict(over)
+        if name not in own.per_run and len(table.scan_names) > 1:
+            each["differs"] = modulations.per_run(table)
+        for kind, how in each.items():
+            size = guess / (about.duration if kind == "drifts" else 1.0)
+            yield from modulated(about, f"{kind}:{name}", Stage.PARAMETER, how, _shifting(name, how), size, name, "")
+        for column in columns:
+            how = modulations.column(column, table)
+            size = guess / float(np.nanstd(table.covariates[column]))
+            yield from modulated(about, f"depends:{name}:{column}", Stage.PARAMETER, how, _shifting(name, how), size, name, "")
+
+
+def _shifting(name: str, how: Modulation) -> Act:
+    return lambda value, theta, table: {**value, name: value[name] + how.over(theta, table)}

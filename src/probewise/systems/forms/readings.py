@@ -1,0 +1,235 @@
+"""Forms on the reading: what adds to it, scales it, bends it, holds it back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects import HeavyTailed
+from probewise.priors import LogUniform, Uniform
+from probewise.sensor import Stage
+from probewise.systems.forms import modulations
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Act, Form, with_unit
+from probewise.systems.forms.modulations import Modulation
+from probewise.systems.table import RunTable
+
+__all__ = ["forms_on_readings", "modulated"]
+
+_N_SIZES = 9
+
+
+def modulated(
+    about: About, name: str, stage: Stage, how: Modulation, act: Act, guess: float, what: str, unit: str, covariates: tuple[str, ...] = ()
+) -> Iterator[Form]:
+    """Bind a modulation to what `act` adds it to; nothing where the readings do not change."""
+    entries = how.entries(guess)
+    typical = about.typical(stage, act, entries, guess)
+    if typical is not None and np.isfinite(typical) and typical > 0:
+        yield Form(
+            name, stage, how.marginals(typical), how.units(unit), (*how.covariates, *covariates), act, how.entries(typical),
+            how.amplitudes, lambda mean, sd: how.says(what, unit, mean, sd), moments=how.moments, joined=how.joined,
+        )  # fmt: skip
+
+
+def forms_on_readings(about: About) -> Iterator[Form]:
+    """List every form of the reading that this table could show."""
+    table, unit, zero = about.table, about.unit, about.system.simulator.noise.zero
+    reading = about.system.simulator.reading
+    span = float(np.ptp(about.predicted)) or about.sd
+    over: dict[str, Modulation] = {}
+    if table.has_time:
+        over["drift"] = modulations.drift(table, about.time_unit)
+    over["step"] = modulations.step(table, about.time_unit, gated=True)
+    if len(table.scan_names) > 1:
+        over["per_run"] = modulations.per_run(table)
+    for kind, how in over.items():
+        yield from modulated(about, f"offset_{kind}", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
+        yield from modulated(
+            about, f"gain_{kind}", Stage.GAIN, how, _scaling(how, zero), about.sd / span, f"the gain of {reading}", "1", ("level",)
+        )
+    if table.has_time:
+        how = modulations.wave(table, about.time_unit)
+        yield from modulated(about, "interference", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
+        yield from _settling(about)
+        yield from _lag(about)
+        yield from _delay(about)
+    for name, values in table.covariates.items():
+        if name not in (reading, about.system.simulator.noise.sd) and np.nanstd(values) > 0:
+            how = modulations.column(name, table)
+            yield from modulated(about, f"sensitivity:{name}", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
+    yield from _hysteresis(about)
+    yield from _bend(about)
+    yield from _ceiling(about)
+
+
+def _adding(how: Modulation) -> Act:
+    return lambda value, theta, table: value + how.over(theta, table)
+
+
+def _scaling(how: Modulation, zero: float) -> Act:
+    return lambda value, theta, table: zero + (value - zero) * (1 + how.over(theta, table))
+
+
+def since_start_of_run(table: RunTable) -> FloatArray:
+    """Time since the first row of each row's run, (n_points,)."""
+    first = np.array([table.time_s[rows].min() if rows.size else 0.0 for rows in table.rows_by_scan()])
+    return np.asarray(table.time_s - first[table.scan])
+
+
+def _settling(about: About) -> Iterator[Form]:
+    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return np.asarray(value + theta[:, :1] * np.exp(-since_start_of_run(table) / theta[:, 1:2]))
+
+    longest = float(since_start_of_run(about.table).max()) or 1.0
+    shortest = min(0.5 * about.gap, 0.01 * longest)
+    taus = np.geomspace(shortest * 1.5, longest, _N_SIZES)
+    entries = np.stack([np.full(_N_SIZES, 1.0), taus], axis=-1)[:, None, :]
+    typical = about.typical(Stage.OFFSET, act, entries, 1.0)
+    if typical is None:
+        return
+    entries[:, :, 0] = typical
+    unit, time_unit, reading = about.unit, about.time_unit, about.system.simulator.reading
+    yield Form(
+        "settling", Stage.OFFSET, {"a": HeavyTailed(typical), "tau_s": LogUniform(shortest, 2 * longest)}, (unit, time_unit),
+        ("time", "run"), act, entries, (0,),
+        lambda mean, sd: f"{reading} starts each run {with_unit(mean[0], sd[0], unit)} off and settles "
+        f"with a time constant of {with_unit(mean[1], sd[1], time_unit)}",
+    )  # fmt: skip
+
+
+def _lag(about: About) -> Iterator[Form]:
+    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
+        tau = theta[:, 0]
+        for rows in table.rows_by_scan():
+            gaps = np.diff(table.time_s[rows])
+            with np.errstate(divide="ignore"):
+                carry = np.where(tau[:, None] > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)[:, None]), 0.0)
+            for k in range(1, len(rows)):
+                out[:, rows[k]] = carry[:, k - 1] * out[:, rows[k - 1]] + (1 - carry[:, k - 1]) * out[:, rows[k]]
+        return out
+
+    prior = about.log_uniform(Stage.LAG, act, about.gap * np.geomspace(0.02, 200.0, 33))
+    if prior is not None:
+        time_unit = about.time_unit
+        yield Form(
+            "lag", Stage.LAG, {"tau_s": prior}, (time_unit,), ("previous",), act, _between(prior), (),
+            lambda mean, sd: f"{about.system.simulator.reading} follows with a time constant of {with_unit(mean[0], sd[0], time_unit)}",
+            absent={0: 0.0},
+        )  # fmt: skip
+
+
+def _delay(about: About) -> Iterator[Form]:
+    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
+        for rows in table.rows_by_scan():
+            out[:, rows] = earlier(table.time_s[rows], value[:, rows], theta[:, 0])
+        return out
+
+    prior = about.log_uniform(Stage.LAG, act, about.gap * np.geomspace(1e-3, 100.0, 41))
+    if prior is not None:
+        time_unit = about.time_unit
+        yield Form(
+            "delay", Stage.LAG, {"tau_s": prior}, (time_unit,), ("previous",), act, _between(prior), (),
+            lambda mean, sd: f"{about.system.simulator.reading} comes {with_unit(mean[0], sd[0], time_unit)} late",
+            absent={0: 0.0},
+        )  # fmt: skip
+
+
+def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
+    """Look up values (1 or n_samples, n) of times (n,) as they were earlier `by` (n_samples,), on straight lines between.
+
+    Before the first time they are as at the first.
+    """
+    if len(time) < 2:
+        return np.broadcast_to(values, (len(by), len(time)))
+    asked = time[None, :] - by[:, None]
+    after = np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1)
+    gap = time[after] - time[after - 1]
+    share = np.clip((asked - time[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+    values = np.broadcast_to(values, asked.shape)
+    low, high = np.take_along_axis(values, after - 1, axis=1), np.take_along_axis(values, after, axis=1)
+    return np.asarray(low + share * (high - low))
+
+
+def way(values: FloatArray, table: RunTable) -> FloatArray:
+    """Sign of the way values (n_samples, n_points) are moving, within runs; a rest keeps the last, the first the next."""
+    out = np.zeros_like(values)
+    for rows in table.rows_by_scan():
+        if len(rows) < 2:
+            continue
+        signs = np.sign(np.diff(values[:, rows], axis=1))
+        number = np.where(signs != 0, np.arange(signs.shape[1]), -1)
+        last = np.maximum.accumulate(number, axis=1)
+        first = np.argmax(signs != 0, axis=1)
+        last = np.where(last < 0, first[:, None], last)
+        own = np.take_along_axis(signs, last, axis=1)
+        out[:, rows[1:]] = own
+        out[:, rows[0]] = own[:, 0]
+    return out
+
+
+def _hysteresis(about: About) -> Iterator[Form]:
+    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return np.asarray(value + theta[:, :1] * way(value, table))
+
+    if np.ptp(way(about.predicted[None, :], about.table)) == 0:
+        return
+    unit, reading = about.unit, about.system.simulator.reading
+    yield Form(
+        "hysteresis", Stage.OFFSET, {"a": HeavyTailed(about.sd)}, (unit,), ("previous",), act, np.full((1, 1, 1), about.sd), (0,),
+        lambda mean, sd: f"{reading} reads {with_unit(2 * mean[0], 2 * sd[0], unit)} more on its way up than on its way down",
+    )  # fmt: skip
+
+
+def _bend(about: About) -> Iterator[Form]:
+    low, high = float(about.predicted.min()), float(about.predicted.max())
+    if not low < high:
+        return
+
+    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        share = (value - low) / (high - low)
+        bent = np.sign(share) * np.abs(share) ** theta[:, 1:2]
+        return np.asarray(value + theta[:, :1] * (high - low) * (bent - share))
+
+    powers = np.array([0.5, 1.5, 2.0, 3.0, 4.0])
+    entries = np.stack([np.full(len(powers), 1.0), powers], axis=-1)[:, None, :]
+    guess = about.sd / (high - low)
+    entries[:, :, 0] = guess
+    typical = about.typical(Stage.BEND, act, entries, guess)
+    if typical is None:
+        return
+    entries[:, :, 0] = typical
+    unit, reading = about.unit, about.system.simulator.reading
+    yield Form(
+        "nonlinearity", Stage.BEND, {"a": HeavyTailed(typical), "power": LogUniform(0.4, 5.0)}, ("1", "1"), ("level",), act, entries, (0,),
+        lambda mean, sd: f"{reading} is bent: y + a (hi - lo) (z^power - z), z = (y - lo) / (hi - lo) from {low:.4g} to {high:.4g} {unit}, "
+        f"a {with_unit(mean[0], sd[0], '')}, power {with_unit(mean[1], sd[1], '')}",
+    )  # fmt: skip
+
+
+def _ceiling(about: About) -> Iterator[Form]:
+    low, high = float(about.predicted.min()), float(about.predicted.max())
+    if not low < high:
+        return
+    readings = about.table.columns[about.system.simulator.reading]
+    least, most = (float(end(readings[np.isfinite(readings)])) for end in (np.min, np.max))
+
+    def capped(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return np.minimum(value, theta[:, :1])
+
+    top, span = max(high, most), max(high, most) - min(low, least)
+    levels = top - span * np.geomspace(0.005, 0.9, 16)
+    unit, reading = about.unit, about.system.simulator.reading
+    yield Form(
+        "saturation", Stage.SATURATION, {"level": Uniform(float(levels[-1]), float(top + 0.02 * span))}, (unit,), ("level",), capped,
+        levels[:, None, None], (),
+        lambda mean, sd: f"{reading} stops at {with_unit(mean[0], sd[0], unit)}", absent={0: float(top + 1e3 * span)},
+    )  # fmt: skip
+
+
+def _between(prior: LogUniform) -> FloatArray:
+    return np.asarray(np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None])

@@ -1,0 +1,230 @@
+"""Integrate a law of motion between the rows of each run: all samples and all runs at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.systems.simulator import Law
+from probewise.systems.table import RunTable
+
+__all__ = ["Limit", "Motion", "RowsInRuns", "Term", "integrate", "integrate_states"]
+
+Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
+"""A term of a state's rate: states, parameters and columns to an array (n_samples, n_runs)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Limit:
+    """A bound that a state cannot pass: `level` (n_samples, 1), reached from below where `upper`."""
+
+    state: str
+    level: FloatArray
+    upper: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A law with what effects add to it: terms of rates, dry friction, bounds.
+
+    `friction` holds by state the size of a force against its motion, (n_samples, 1): at rest the state sticks until
+    the rest of its rate is larger.
+    """
+
+    law: Law
+    terms: tuple[tuple[str, Term], ...] = ()
+    friction: Mapping[str, FloatArray] = ()  # type: ignore[assignment]
+    limits: tuple[Limit, ...] = ()
+
+    def with_term(self, state: str, term: Term) -> Motion:
+        """Add a term to the rate of a state."""
+        return replace(self, terms=(*self.terms, (state, term)))
+
+    def with_friction(self, state: str, size: FloatArray) -> Motion:
+        """Add dry friction to a state."""
+        known = dict(self.friction)
+        known[state] = known[state] + size if state in known else size
+        return replace(self, friction=known)
+
+    def with_limit(self, limit: Limit) -> Motion:
+        """Add a bound to a state."""
+        return replace(self, limits=(*self.limits, limit))
+
+    def rates(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
+        """Rate of each state, friction and bounds included."""
+        given = self.law.rates(s, p, u)
+        out = {state: given[state] for state in self.law.states}
+        for state, term in self.terms:
+            out[state] = out[state] + term(s, p, u)
+        for state, size in dict(self.friction).items():
+            out[state] = _rubbed(out[state], s[state], size)
+        for limit in self.limits:
+            rate, at = out[limit.state], s[limit.state]
+            stopped = (at >= limit.level) & (rate > 0) if limit.upper else (at <= limit.level) & (rate < 0)
+            out[limit.state] = np.where(stopped, 0.0, rate)
+        return out
+
+    def settled(self, before: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+        """Put states right at the end of a step: none beyond its bound, none through zero against its friction."""
+        for state in dict(self.friction):
+            crossed = before[state] * after[state] < 0
+            after[state] = np.where(crossed, 0.0, after[state])
+        for limit in self.limits:
+            bound = np.minimum if limit.upper else np.maximum
+            after[limit.state] = bound(after[limit.state], limit.level)
+        return after
+
+
+def _rubbed(rate: Any, state: Any, size: FloatArray) -> Any:
+    still = np.where(np.abs(rate) <= np.abs(size), 0.0, rate - size * np.sign(rate))
+    return np.where(state == 0, still, rate - size * np.sign(state))
+
+
+@dataclass(frozen=True, eq=False)
+class RowsInRuns:
+    """The rows of a table by their place in its runs: all runs go on together, the short ones wait at their end.
+
+    Raises
+    ------
+    ParameterError
+        If time falls within a run.
+    """
+
+    table: RunTable
+
+    @cached_property
+    def rows(self) -> IntArray:
+        """Row of the table at each place of each run, (n_places, n_runs)."""
+        table, by_run = self.table, self.table.rows_by_scan()
+        for name, rows in zip(table.scan_names, by_run, strict=True):
+            falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
+            if falls.size:
+                at = int(rows[falls[0] + 1])
+                found = f"{table.time_s[at]:g} after {table.time_s[rows[falls[0]]]:g} in run {name!r}, row {at + 2}"
+                raise ParameterError(f"column {table.time!r}", found, "a time that does not fall within a run")
+        longest = max(len(rows) for rows in by_run)
+        return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
+
+    @cached_property
+    def gaps(self) -> FloatArray:
+        """Time from each place to the next, (n_places - 1, n_runs)."""
+        return np.diff(self.table.time_s[self.rows], axis=0)
+
+    @cached_property
+    def place(self) -> tuple[IntArray, IntArray]:
+        """Place and run of each row, (n_points,) both."""
+        place = np.empty(len(self.table), dtype=np.int64)
+        for rows in self.table.rows_by_scan():
+            place[rows] = np.arange(len(rows))
+        return place, self.table.scan
+
+    def n_steps(self, max_step: float) -> IntArray:
+        """Steps from each place to the next, (n_places - 1,)."""
+        longest = self.gaps.max(axis=1, initial=0.0)
+        return np.maximum(np.ceil(longest / max_step - 1e-9), 1).astype(np.int64)
+
+
+def integrate(
+    motion: Motion,
+    places: RowsInRuns,
+    parameters: Mapping[str, FloatArray],
+    columns: Mapping[str, NDArray[Any]],
+    *,
+    max_step: float,
+) -> FloatArray:
+    """Integrate by the classical Runge-Kutta rule of fourth order, at every row the reading: (n_samples, n_points).
+
+    Parameters
+    ----------
+    motion
+        The law, and what effects add to it.
+    places
+        The rows by their place in runs.
+    parameters
+        (n_samples, 1), or (n_samples, n_points) where they vary by row.
+    columns
+        (n_points,), or (n_samples, n_points) where an effect changes them.
+    max_step
+        Longest step, in the unit of time.
+    """
+    states = integrate_states(motion, places, parameters, columns, max_step=max_step)
+    if motion.law.observe is None:
+        return next(iter(states.values()))
+    with np.errstate(all="ignore"):
+        out = np.asarray(motion.law.observe(states, dict(parameters), dict(columns)), dtype=np.float64)
+    return np.array(np.broadcast_to(out, next(iter(states.values())).shape))
+
+
+def integrate_states(
+    motion: Motion | Law,
+    places: RowsInRuns,
+    parameters: Mapping[str, FloatArray],
+    columns: Mapping[str, NDArray[Any]],
+    *,
+    max_step: float,
+) -> dict[str, FloatArray]:
+    """Integrate as `integrate` does: every state at every row, (n_samples, n_points)."""
+    motion = Motion(motion) if isinstance(motion, Law) else motion
+    table, rows = places.table, places.rows
+    n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
+    by_run = {name: _over_rows(values) for name, values in parameters.items()}
+    inputs = {name: _over_rows(values) for name, values in columns.items()}
+    first = rows[0]
+    start = {}
+    for state, given in motion.law.states.items():
+        at = by_run[given](first) if isinstance(given, str) else np.full((1, 1), float(given))
+        start[state] = np.array(np.broadcast_to(at, (n_samples, rows.shape[1])))
+    kept = {state: np.empty((n_samples, *rows.shape)) for state in start}
+    linear, steps = motion.law.hold == "linear", places.n_steps(max_step)
+    s = motion.settled(start, dict(start))
+    with np.errstate(all="ignore"):
+        for k in range(len(rows)):
+            for state, values in s.items():
+                kept[state][:, k] = values
+            if k == len(rows) - 1:
+                break
+            here, there, n = rows[k], rows[k + 1], int(steps[k])
+            width = places.gaps[k] / n
+            varying = {name: (at(here), at(there)) for name, at in by_run.items()}
+            fixed = {name: pair[0] for name, pair in varying.items() if pair[0].shape[-1] == 1 or np.array_equal(*pair)}
+            held = {name: (at(here), at(there)) for name, at in inputs.items()}
+
+            def at_share(share: float) -> tuple[dict[str, Any], dict[str, Any]]:
+                p = {name: fixed[name] if name in fixed else _between(pair, share) for name, pair in varying.items()}
+                u = {
+                    name: _between(pair, share) if (linear or name == table.time) and pair[0].dtype == np.float64 else pair[0]
+                    for name, pair in held.items()
+                }
+                return p, u
+
+            now = at_share(0.0)
+            for i in range(n):
+                middle, end = at_share((i + 0.5) / n), at_share((i + 1) / n)
+                k1 = motion.rates(s, *now)
+                k2 = motion.rates({j: s[j] + 0.5 * width * k1[j] for j in s}, *middle)
+                k3 = motion.rates({j: s[j] + 0.5 * width * k2[j] for j in s}, *middle)
+                k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *end)
+                after = {j: s[j] + width / 6 * (k1[j] + 2 * k2[j] + 2 * k3[j] + k4[j]) for j in s}
+                s, now = motion.settled(s, after), end
+    place, run = places.place
+    return {state: values[:, place, run] for state, values in kept.items()}
+
+
+def _over_rows(values: NDArray[Any]) -> Callable[[IntArray], NDArray[Any]]:
+    """Look up values at rows, one a run: (n_samples, n_runs), or (n_samples, 1) where they are the same in all rows."""
+    if values.ndim == 1:
+        return lambda rows: values[None, rows]
+    if values.shape[1] == 1:
+        return lambda rows: values
+    return lambda rows: values[:, rows]
+
+
+def _between(pair: tuple[NDArray[Any], NDArray[Any]], share: float) -> NDArray[Any]:
+    return np.asarray(pair[0] + share * (pair[1] - pair[0]))

@@ -1,0 +1,271 @@
+"""A simulator over the runs of a table: a null model like any other, and the chain of its effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from probewise._arrays import FloatArray
+from probewise.effects import NamedEffect
+from probewise.errors import ParameterError
+from probewise.priors import Marginal, Product
+from probewise.sensor import AnyEffect, Stage
+from probewise.systems.calls import Caller
+from probewise.systems.motion import Motion, RowsInRuns, integrate
+from probewise.systems.simulator import Simulator
+from probewise.systems.table import RunTable
+
+__all__ = ["System", "SystemChain"]
+
+_N_STARTS = 8
+_N_TRIED = 3  # places of the prior at which a function is called to find out how it can be called
+_MOST_STEPS = 4096  # of the integration, from one end of the longest run to the other, a row at least one
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A simulator with one value of each `per_run` parameter for every run: a null model.
+
+    Parameters
+    ----------
+    simulator
+        What a person brought.
+    runs
+        Names of the runs.
+    max_step
+        Longest step of the integration, where there is a law.
+    caller
+        How `simulate` is called, where there is none.
+    """
+
+    simulator: Simulator
+    runs: tuple[str, ...]
+    max_step: float = np.inf
+    caller: Caller | None = None
+
+    @classmethod
+    def of(cls, simulator: Simulator, table: RunTable) -> System:
+        """Take the runs of a table, and find out how the simulator can be called.
+
+        Raises
+        ------
+        ParameterError
+            If a column that the simulator names is missing, or it gives no finite reading anywhere in the prior.
+        ShapeError
+            If it does not give one reading for each row.
+        """
+        for what, name in (("reading", simulator.reading), *(("controls", name) for name in simulator.controls)):
+            if name not in table.columns:
+                raise ParameterError(what, name, f"a column of the table: {', '.join(table.columns)}")
+        bare = cls(simulator, table.scan_names)
+        if simulator.simulate is not None:
+            tried = bare.theta(bare.starts[:_N_TRIED])
+            caller = Caller.probed(
+                simulator.simulate,
+                bare.parameters(tried, table),
+                given_columns(simulator, table),
+                per_run=simulator.per_run,
+                broadcasts=simulator.vectorized,
+            )
+            return replace(bare, caller=caller)
+        gaps = RowsInRuns(table).gaps
+        typical = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+        assert simulator.law is not None
+        return replace(bare, max_step=simulator.law.max_step_s or typical)
+
+    @cached_property
+    def marginals(self) -> dict[str, Marginal]:
+        """Prior of each column of theta: shared parameters, then `name[run]` for every run."""
+        own = self.simulator
+        out = {name: prior for name, prior in own.parameters.items() if name not in own.per_run}
+        for name in own.per_run:
+            out |= {f"{name}[{run}]": own.parameters[name] for run in self.runs}
+        return out
+
+    @cached_property
+    def prior(self) -> Product:
+        """Prior of all parameters."""
+        return Product(self.marginals)
+
+    def parameters(self, theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:
+        """Name the columns of theta: (n_samples, 1), or (n_samples, n_points) of what is a run's own."""
+        own, out = self.simulator, {}
+        at = {name: k for k, name in enumerate(self.marginals)}
+        for name in own.parameters:
+            if name in own.per_run:
+                of_run = [at[f"{name}[{run}]"] for run in table.scan_names]
+                out[name] = theta[:, of_run][:, table.scan]
+            else:
+                out[name] = theta[:, at[name] : at[name] + 1]
+        return out | {name: np.full((1, 1), extra.null) for name, extra in own.extra.items()}
+
+    def with_runs(self, table: RunTable) -> System:
+        """Add the runs of another table, each with the prior of what is its own."""
+        return replace(self, runs=tuple(dict.fromkeys((*self.runs, *table.scan_names))))
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return len(self.marginals)
+
+    @property
+    def n_gaussians(self) -> int:
+        """None: it has no SSF."""
+        return 0
+
+    @property
+    def worth(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def form(self) -> str:
+        """Nothing."""
+        return ""
+
+    @property
+    def exchangeable(self) -> bool:
+        """There are no Gaussians."""
+        return False
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """What is a run's own belongs to this table alone."""
+        return tuple(name for name in self.marginals if name not in self.simulator.parameters)
+
+    @cached_property
+    def starts(self) -> FloatArray:
+        """Start from the middle of the prior and from points spread evenly over it, (8, n_params)."""
+        from scipy.stats import qmc  # here, since it takes a second to import
+
+        spread = qmc.Halton(self.n_params, scramble=False).random(_N_STARTS)[1:]
+        return np.concatenate([np.zeros((1, self.n_params)), np.asarray(ndtri(spread), dtype=np.float64)])
+
+    @property
+    def least_readings(self) -> int:
+        """Three for each shared parameter, one more for each of a run's own."""
+        n_own = len(self.simulator.per_run) * len(self.runs)
+        return max(12, 3 * (self.n_params - n_own) + n_own)
+
+    @property
+    def is_quick(self) -> bool:
+        """Whether many samples cost little more than one: `simulate` takes all of them at once."""
+        return self.caller is not None and self.caller.broadcasts
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """Tell whether an effect acts at a stage that this system has."""
+        return effect.stage is not Stage.RATE or self.simulator.law is not None
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map normal scores, (n_samples, n_params), to parameters."""
+        return self.prior.from_unit_cube(ndtr(z))
+
+    def chain(self, plan: RunTable, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
+        """Add effects; `n_nodes` plays no part."""
+        return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
+
+    def standing_still(self, table: RunTable, z: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float) -> System:
+        """Halve the step of the integration until predictions at coordinates z move by less than a tolerance.
+
+        Parameters
+        ----------
+        table
+            The rows.
+        z
+            Coordinates (n_samples, n_params); where predictions are not finite at either step they do not count.
+        effects
+            Added to the law.
+        tolerance
+            In the unit of a reading.
+
+        Raises
+        ------
+        ParameterError
+            If they still move when the longest run takes 4,096 steps more than it has rows.
+        """
+        if self.simulator.law is None:
+            return self
+        places, theta, now = RowsInRuns(table), self.theta(z), self
+        coarse = now.chain(table, effects).predict(theta, table)
+        while True:
+            finer = replace(now, max_step=now.max_step / 2)
+            fine = finer.chain(table, effects).predict(theta, table)
+            there = np.isfinite(coarse) & np.isfinite(fine)
+            if not there.any():
+                moved = np.inf
+            else:
+                moved = float(np.abs(coarse - fine)[there].max())
+            if moved <= tolerance:
+                return now
+            now, coarse = finer, fine
+            if places.n_steps(now.max_step).sum() > _MOST_STEPS + len(places.rows):
+                raise ParameterError(
+                    "rates", f"readings still move by {moved:.3g} {self.simulator.unit} when the step is halved",
+                    "a law that can be integrated in some thousand steps: set max_step_s, or use simulate with an integrator of your own",
+                )  # fmt: skip
+
+
+def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
+    """Columns as `simulate` and `rates` get them: all but the reading, which is what they predict."""
+    return {name: values for name, values in table.columns.items() if name != simulator.reading}
+
+
+@dataclass(frozen=True, eq=False)
+class SystemChain:
+    """A system with effects, in their order: input and clock, parameters, law, reading."""
+
+    system: System
+    effects: tuple[AnyEffect, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The system's parameters, then each effect's as "effect.parameter"."""
+        own = (f"{effect.name}.{name}" for effect in self.effects for name in effect.prior.names)
+        return (*self.system.prior.names, *own)
+
+    def predict(self, theta: FloatArray, plan: RunTable) -> FloatArray:
+        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        return self.read(self.look(theta, plan), theta, plan)
+
+    def look(self, theta: FloatArray, plan: RunTable) -> FloatArray:
+        """Simulate, with the effects on inputs, parameters and rates: (n_samples, n_points)."""
+        system = self.system
+        columns: Mapping[str, NDArray[Any]] = given_columns(system.simulator, plan)
+        columns = self._applied(Stage.INPUT, columns, theta, plan)
+        parameters = self._applied(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
+        if system.caller is not None:
+            readings = system.caller(parameters, columns)
+        else:
+            law = system.simulator.law
+            assert law is not None
+            motion = self._applied(Stage.RATE, Motion(law), theta, plan)
+            readings = integrate(motion, RowsInRuns(plan), parameters, columns, max_step=system.max_step)
+        return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
+
+    def read(self, view: FloatArray, theta: FloatArray, plan: RunTable) -> FloatArray:
+        """Apply the effects on the readings, in the order of their stages."""
+        for effect, columns in self._columns:
+            if Stage.SEEN <= effect.stage <= Stage.SATURATION:
+                view = effect.apply(view, theta[:, columns], plan)
+        return view
+
+    def _applied(self, stage: Stage, value: Any, theta: FloatArray, plan: RunTable) -> Any:
+        for effect, columns in self._columns:
+            if effect.stage is stage:
+                value = effect.apply(value, theta[:, columns], plan)
+        return value
+
+    @cached_property
+    def _columns(self) -> list[tuple[AnyEffect, slice]]:
+        end, pairs = self.system.n_params, []
+        for effect in self.effects:
+            start, end = end, end + len(effect.prior.names)
+            pairs.append((effect, slice(start, end)))
+        return pairs
+

@@ -1,0 +1,163 @@
+"""A person's table: any columns, rows in runs, a time if there is one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
+from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.recordings import Instrumentation
+from probewise.recordings.table import csv_text, is_number, number_text, read_table
+
+__all__ = ["RunTable", "read_run_table", "write_run_table"]
+
+_ONE_RUN = "all"
+
+
+@dataclass(frozen=True, eq=False)
+class RunTable:
+    """Hold the rows of a table in the order in which they stand; all columns have shape (n_points,).
+
+    Parameters
+    ----------
+    columns
+        Every column by name: numbers (NaN where missing) or texts.
+    time
+        Name of the column of time; None where no time was recorded.
+    run
+        Name of the column that says to which run a row belongs; None where there is one run.
+    instrumentation
+        Unit, range and step of a reading.
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+    time: str | None = None
+    run: str | None = None
+    instrumentation: Instrumentation = field(default_factory=Instrumentation)
+
+    def __post_init__(self) -> None:
+        columns = {name: _column(name, values) for name, values in self.columns.items()}
+        if not columns:
+            raise ParameterError("columns", (), "one or more")
+        n_points = len(next(iter(columns.values())))
+        for name, values in columns.items():
+            if values.shape != (n_points,):
+                raise ShapeError(f"column {name!r} has shape {values.shape}; allowed: ({n_points},), as the others")
+        object.__setattr__(self, "columns", columns)
+        for what, column in (("time", self.time), ("run", self.run)):
+            if column is not None and column not in columns:
+                raise ParameterError(what, column, f"a column of the table: {', '.join(columns)}")
+        if self.time is not None:
+            values = columns[self.time]
+            if values.dtype != np.float64 or not np.isfinite(values).all():
+                raise ParameterError(f"column {self.time!r}", "a time that is missing or no number", "a number in each row")
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    @property
+    def has_time(self) -> bool:
+        """Whether a time was recorded."""
+        return self.time is not None
+
+    @cached_property
+    def time_s(self) -> FloatArray:
+        """Time as printed, in its own unit; the row's number where none was recorded, (n_points,)."""
+        return frozen(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
+
+    @cached_property
+    def _runs(self) -> tuple[IntArray, tuple[str, ...]]:
+        if self.run is None:
+            return np.zeros(len(self), dtype=np.int64), (_ONE_RUN,)
+        texts = [number_text(v) if isinstance(v, float) else str(v) for v in self.columns[self.run].tolist()]
+        names = tuple(dict.fromkeys(texts))
+        number = {name: k for k, name in enumerate(names)}
+        return np.array([number[text] for text in texts], dtype=np.int64), names
+
+    @property
+    def scan(self) -> IntArray:
+        """Number of each row's run, from 0 in the order in which they begin, (n_points,)."""
+        return self._runs[0]
+
+    @property
+    def scan_names(self) -> tuple[str, ...]:
+        """Names of the runs."""
+        return self._runs[1]
+
+    @cached_property
+    def covariates(self) -> dict[str, FloatArray]:
+        """Columns of numbers that were logged or set: neither the time nor the run."""
+        kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run)}
+        return {name: values for name, values in kept.items() if values.dtype == np.float64}
+
+    @cached_property
+    def time_begins_anew(self) -> bool:
+        """Whether time falls from one row to the next: it is counted from the start of each run."""
+        return bool((np.diff(self.time_s) < 0).any())
+
+    def rows_by_scan(self) -> list[IntArray]:
+        """Row numbers of each run, in the order of the table."""
+        return [np.flatnonzero(self.scan == k) for k in range(len(self.scan_names))]
+
+    def take(self, rows: IntArray | BoolArray) -> RunTable:
+        """Keep these rows, in their order."""
+        return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
+
+    def with_columns(self, columns: Mapping[str, FloatArray]) -> RunTable:
+        """Replace or add columns."""
+        return replace(self, columns={**self.columns, **columns})
+
+
+def _column(name: str, values: Any) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
+    if array.dtype.kind in "biuf":
+        return frozen(array)
+    texts = np.array([str(value) for value in array.tolist()])
+    texts.flags.writeable = False
+    return texts
+
+
+def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str | None) -> RunTable:
+    """Read a CSV file with one header row; a column in which each cell is a number, empty or nan is one of numbers.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be used or lacks a column; it names row, column, what stood there and what is allowed.
+    """
+    table = read_table(Path(path))
+    if not len(table):
+        raise FileError(path, "there is no row below the header", "one row for each reading")
+    table.require(*(name for name in (time, run) if name is not None))
+    columns: dict[str, NDArray[Any]] = {}
+    for name, cells in table.columns.items():
+        numeric = all(is_number(c) or c.lower() in ("", "nan") for c in cells) and any(is_number(c) for c in cells)
+        if name == time:
+            columns[name] = table.numbers(name)
+        elif numeric and name != run:
+            columns[name] = table.numbers(name, missing=True)
+        else:
+            columns[name] = np.array(cells)
+    if run is not None and all(is_number(c) for c in table.columns[run]):
+        columns[run] = table.numbers(run)
+    return RunTable(columns, time, run)
+
+
+def write_run_table(table: RunTable) -> str:
+    """Write a table out as the text of a CSV file, numbers in full precision."""
+    return csv_text(
+        {
+            name: [number_text(v) if values.dtype == np.float64 else str(v) for v in values.tolist()]
+            for name, values in table.columns.items()
+        }
+    )

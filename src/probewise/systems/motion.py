@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -40,7 +40,7 @@ class Motion:
 
     law: Law
     terms: tuple[tuple[str, Term], ...] = ()
-    friction: Mapping[str, FloatArray] = ()  # type: ignore[assignment]
+    friction: Mapping[str, FloatArray] = field(default_factory=dict)
     limits: tuple[Limit, ...] = ()
 
     def with_term(self, state: str, term: Term) -> Motion:
@@ -57,13 +57,18 @@ class Motion:
         """Add a bound to a state."""
         return replace(self, limits=(*self.limits, limit))
 
+    @property
+    def has_events(self) -> bool:
+        """Whether states can stick or stop."""
+        return bool(self.friction or self.limits)
+
     def rates(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
         """Rate of each state, friction and bounds included."""
         given = self.law.rates(s, p, u)
         out = {state: given[state] for state in self.law.states}
         for state, term in self.terms:
             out[state] = out[state] + term(s, p, u)
-        for state, size in dict(self.friction).items():
+        for state, size in self.friction.items():
             out[state] = _rubbed(out[state], s[state], size)
         for limit in self.limits:
             rate, at = out[limit.state], s[limit.state]
@@ -73,7 +78,7 @@ class Motion:
 
     def settled(self, before: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
         """Put states right at the end of a step: none beyond its bound, none through zero against its friction."""
-        for state in dict(self.friction):
+        for state in self.friction:
             crossed = before[state] * after[state] < 0
             after[state] = np.where(crossed, 0.0, after[state])
         for limit in self.limits:
@@ -172,59 +177,129 @@ def integrate_states(
 ) -> dict[str, FloatArray]:
     """Integrate as `integrate` does: every state at every row, (n_samples, n_points)."""
     motion = Motion(motion) if isinstance(motion, Law) else motion
-    table, rows = places.table, places.rows
+    rows = places.rows
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
-    by_run = {name: _over_rows(values) for name, values in parameters.items()}
-    inputs = {name: _over_rows(values) for name, values in columns.items()}
-    first = rows[0]
     start = {}
     for state, given in motion.law.states.items():
-        at = by_run[given](first) if isinstance(given, str) else np.full((1, 1), float(given))
+        at = _at(parameters[given], rows[:1])[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
         start[state] = np.array(np.broadcast_to(at, (n_samples, rows.shape[1])))
     kept = {state: np.empty((n_samples, *rows.shape)) for state in start}
-    linear, steps = motion.law.hold == "linear", places.n_steps(max_step)
+    steps = places.n_steps(max_step)
     s = motion.settled(start, dict(start))
     with np.errstate(all="ignore"):
+        given = _Given.of(motion, places, parameters, columns, start)
         for k in range(len(rows)):
             for state, values in s.items():
                 kept[state][:, k] = values
             if k == len(rows) - 1:
                 break
-            here, there, n = rows[k], rows[k + 1], int(steps[k])
+            n = int(steps[k])
             width = places.gaps[k] / n
-            varying = {name: (at(here), at(there)) for name, at in by_run.items()}
-            fixed = {name: pair[0] for name, pair in varying.items() if pair[0].shape[-1] == 1 or np.array_equal(*pair)}
-            held = {name: (at(here), at(there)) for name, at in inputs.items()}
-
-            def at_share(share: float) -> tuple[dict[str, Any], dict[str, Any]]:
-                p = {name: fixed[name] if name in fixed else _between(pair, share) for name, pair in varying.items()}
-                u = {
-                    name: _between(pair, share) if (linear or name == table.time) and pair[0].dtype == np.float64 else pair[0]
-                    for name, pair in held.items()
-                }
-                return p, u
-
-            now = at_share(0.0)
+            half, sixth = 0.5 * width, width / 6
+            between = given.between(k)
+            now = between(0.0)
             for i in range(n):
-                middle, end = at_share((i + 0.5) / n), at_share((i + 1) / n)
+                middle, end = between((i + 0.5) / n), between((i + 1) / n)
                 k1 = motion.rates(s, *now)
-                k2 = motion.rates({j: s[j] + 0.5 * width * k1[j] for j in s}, *middle)
-                k3 = motion.rates({j: s[j] + 0.5 * width * k2[j] for j in s}, *middle)
+                k2 = motion.rates({j: s[j] + half * k1[j] for j in s}, *middle)
+                k3 = motion.rates({j: s[j] + half * k2[j] for j in s}, *middle)
                 k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *end)
-                after = {j: s[j] + width / 6 * (k1[j] + 2 * k2[j] + 2 * k3[j] + k4[j]) for j in s}
-                s, now = motion.settled(s, after), end
+                after = {j: s[j] + sixth * (k1[j] + 2 * (k2[j] + k3[j]) + k4[j]) for j in s}
+                s, now = motion.settled(s, after) if motion.has_events else after, end
     place, run = places.place
     return {state: values[:, place, run] for state, values in kept.items()}
 
 
-def _over_rows(values: NDArray[Any]) -> Callable[[IntArray], NDArray[Any]]:
-    """Look up values at rows, one a run: (n_samples, n_runs), or (n_samples, 1) where they are the same in all rows."""
+Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """Parameters and columns at the places of runs: what stays over a gap, and what moves on a straight line.
+
+    Arrays are (1 or n_samples, n_places, n_runs).
+    """
+
+    constant: Mapping[str, Any]  # parameters
+    moving: Mapping[str, FloatArray]  # parameters
+    held: Mapping[str, NDArray[Any]]  # columns
+    sloping: Mapping[str, FloatArray]  # columns
+
+    @classmethod
+    def of(
+        cls,
+        motion: Motion,
+        places: RowsInRuns,
+        parameters: Mapping[str, FloatArray],
+        columns: Mapping[str, NDArray[Any]],
+        start: Mapping[str, FloatArray],
+    ) -> _Given:
+        rows, law, time = places.rows, motion.law, places.table.time
+        constant: dict[str, Any] = {}
+        moving: dict[str, FloatArray] = {}
+        for name, values in parameters.items():
+            own = _at(values, rows)
+            if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
+                constant[name] = own[:, 0]
+            else:
+                moving[name] = own
+        first = {name: _at(values, rows[:1])[:, 0] for name, values in columns.items()}
+        asked = _Asked(first)
+        motion.rates(start, {**constant, **{name: values[:, 0] for name, values in moving.items()}}, asked)
+        sloping, held = {}, {}
+        for name in asked.names:
+            slopes = name == time or (law.hold == "linear" and columns[name].dtype == np.float64)
+            (sloping if slopes else held)[name] = _at(columns[name], rows)
+        return cls(constant, moving, held, sloping)
+
+    def between(self, k: int) -> Callable[[float], Pair]:
+        """Give parameters and columns at a share of the gap from place k to the next."""
+        moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
+        sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
+        held = {name: v[:, k] for name, v in self.held.items()}
+
+        def at(share: float) -> Pair:
+            p = {**self.constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}
+            u = {**held, **{name: low + share * rise for name, (low, rise) in sloping.items()}}
+            return p, u
+
+        return at
+
+
+class _Asked(dict[str, Any]):
+    """Columns that note which of them a law asks for."""
+
+    def __init__(self, columns: Mapping[str, Any]) -> None:
+        super().__init__(columns)
+        self.names: dict[str, None] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self:
+            self.names[name] = None
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
+
+    def __iter__(self) -> Iterator[str]:
+        self.names |= dict.fromkeys(super().keys())
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        self.names |= dict.fromkeys(super().keys())
+        return super().keys()
+
+    def values(self) -> Any:
+        self.names |= dict.fromkeys(super().keys())
+        return super().values()
+
+    def items(self) -> Any:
+        self.names |= dict.fromkeys(super().keys())
+        return super().items()
+
+
+def _at(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
+    """Look up values (n_points,) or (n_samples, 1 or n_points) at rows (n_places, n_runs); constant ones as (n, 1, 1)."""
     if values.ndim == 1:
-        return lambda rows: values[None, rows]
-    if values.shape[1] == 1:
-        return lambda rows: values
-    return lambda rows: values[:, rows]
-
-
-def _between(pair: tuple[NDArray[Any], NDArray[Any]], share: float) -> NDArray[Any]:
-    return np.asarray(pair[0] + share * (pair[1] - pair[0]))
+        return np.asarray(values[rows][None])
+    return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

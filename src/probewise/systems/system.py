@@ -142,9 +142,11 @@ class System:
     @cached_property
     def starts(self) -> FloatArray:
         """Start from the middle of the prior and from points spread evenly over it, (8, n_params)."""
-        from scipy.stats import qmc  # here, since it takes a second to import
-
-        spread = qmc.Halton(self.n_params, scramble=False).random(_N_STARTS)[1:]
+        # Additive recurrence by the roots of x^(d+1) = x + 1 (Roberts's sequence): even in any number of dimensions.
+        root = 2.0
+        for _ in range(32):
+            root = (1 + root) ** (1 / (self.n_params + 1))
+        spread = (0.5 + np.outer(np.arange(1, _N_STARTS), root ** -np.arange(1.0, self.n_params + 1))) % 1.0
         return np.concatenate([np.zeros((1, self.n_params)), np.asarray(ndtri(spread), dtype=np.float64)])
 
     @property

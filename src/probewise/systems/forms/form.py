@@ -77,6 +77,8 @@ class Form:
         Where it has a change point.
     joined
         Turns an entry and its columns' amounts into a setting, where amplitudes do not scale one by one.
+    expression
+        The formula of a proposal, which has no name in the vocabulary; empty for every other form.
     """
 
     name: str
@@ -91,6 +93,7 @@ class Form:
     absent: Mapping[int, float] = field(default_factory=dict)
     moments: Moments | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+    expression: str = ""
 
     @property
     def prior(self) -> Product:

@@ -1,0 +1,166 @@
+"""Proposals: short expressions of columns and states, in the reading or in a rate, for physics that has no name.
+
+Each is one term with one amplitude. They are weighed like every other effect; what wins is out of vocabulary and is
+told as a formula.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects import HeavyTailed
+from probewise.sensor import Stage
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Act, Form, with_unit
+from probewise.systems.motion import Motion
+from probewise.systems.table import RunTable
+
+__all__ = ["proposals"]
+
+_SAME = 0.9999  # cosine of two terms over the rows, beyond which the shorter one speaks for both
+
+
+@dataclass(frozen=True)
+class _Atom:
+    """A column, a state or the level, counted from `middle` in units of `scale`."""
+
+    name: str
+    middle: float
+    scale: float
+    unit: str
+
+    def of(self, values: Any) -> Any:
+        return (values - self.middle) / self.scale
+
+    @property
+    def text(self) -> str:
+        if self.middle == 0.0:
+            return self.name
+        return f"({self.name} {'-' if self.middle > 0 else '+'} {abs(self.middle):.4g})"
+
+
+@dataclass(frozen=True)
+class _Term:
+    """A function of some atoms: `text` with the amplitude left out, `size` what its unit is divided by."""
+
+    text: str
+    atoms: tuple[_Atom, ...]
+    function: Callable[..., Any]
+    scale: float = 1.0
+
+    def of(self, look_up: Callable[[str], Any]) -> Any:
+        return self.function(*(atom.of(look_up(atom.name)) for atom in self.atoms)) / self.scale
+
+
+def proposals(about: About) -> Iterator[Form]:
+    """List the terms that could be added to the reading, and to the rate of each state."""
+    yield from _of_reading(about)
+    for state in about.states:
+        yield from _of_rate(about, state)
+
+
+def _terms(atoms: list[_Atom]) -> Iterator[_Term]:
+    for x in atoms:
+        name, own = x.text, x.scale
+        yield _Term(f"{name}^2", (x,), lambda v: v**2, 1 / own**2)
+        yield _Term(f"{name}^3", (x,), lambda v: v**3, 1 / own**3)
+        yield _Term(f"|{name}|", (x,), np.abs, 1 / own)
+        yield _Term(f"|{name}| {name}", (x,), lambda v: np.abs(v) * v, 1 / own**2)
+        yield _Term(f"sqrt(|{name}|) sign({name})", (x,), lambda v: np.sqrt(np.abs(v)) * np.sign(v), own**-0.5)
+        yield _Term(f"sign({name})", (x,), np.sign)
+        for k in (-1.0, 1.0, 2.0, -2.0):
+            rate = f"{k / own:.4g}"
+            yield _Term(f"exp({rate} {name})", (x,), lambda v, k=k: np.exp(np.clip(k * v, -50, 50)))
+        yield _Term(f"sin({1 / own:.4g} {name})", (x,), np.sin)
+    for x, z in itertools.combinations(atoms, 2):
+        yield _Term(f"{x.text} {z.text}", (x, z), lambda v, w: v * w, 1 / (x.scale * z.scale))
+        yield _Term(f"{x.text}^2 {z.text}", (x, z), lambda v, w: v**2 * w, 1 / (x.scale**2 * z.scale))
+        yield _Term(f"{x.text} {z.text}^2", (x, z), lambda v, w: v * w**2, 1 / (x.scale * z.scale**2))
+        yield _Term(f"|{x.text}| {z.text}", (x, z), lambda v, w: np.abs(v) * w, 1 / (x.scale * z.scale))
+        yield _Term(f"{x.text} |{z.text}|", (x, z), lambda v, w: v * np.abs(w), 1 / (x.scale * z.scale))
+
+
+def _columns(about: About) -> dict[str, FloatArray]:
+    own = about.system.simulator
+    kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
+    return {c: v for c, v in kept.items() if np.isfinite(v).all() and np.ptp(v) > 0}
+
+
+def _atom(name: str, values: FloatArray, unit: str, *, centred: bool) -> _Atom:
+    middle = float(f"{np.mean(values):.6g}") if centred else 0.0
+    return _Atom(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0, unit)
+
+
+def _of_reading(about: About) -> Iterator[Form]:
+    own = about.system.simulator
+    columns = _columns(about)
+    if about.table.has_time and about.table.time is not None:
+        columns[about.table.time] = about.table.time_s
+    atoms = [_atom(name, values, name, centred=True) for name, values in columns.items()]
+    level = _atom(own.reading, about.predicted, own.unit, centred=True)
+    known: list[FloatArray] = []
+    for term in _terms([*atoms, level]):
+        def act(value: FloatArray, theta: FloatArray, table: RunTable, term: _Term = term) -> FloatArray:
+            def look_up(name: str) -> Any:
+                return value if name == own.reading else table.time_s if name == table.time else table.covariates[name]
+            return np.asarray(value + theta[:, :1] * term.of(look_up))
+
+        shape = act(about.predicted[None, :], np.ones((1, 1)), about.table)[0] - about.predicted
+        if _is_new(shape, known):
+            yield from _proposal(about, "reading", own.reading, Stage.OFFSET, act, term, {c: True for c in term_names(term)})
+
+
+def _of_rate(about: About, state: str) -> Iterator[Form]:
+    states = about.states
+    atoms = [_atom(name, values, name, centred=False) for name, values in states.items() if np.ptp(values) > 0]
+    atoms += [_atom(name, values, name, centred=True) for name, values in _columns(about).items()]
+    known: list[FloatArray] = []
+    for term in _terms(atoms):
+        def act(value: Motion, theta: FloatArray, table: RunTable, term: _Term = term) -> Motion:
+            a = theta[:, :1]
+            return value.with_term(state, lambda s, p, u: a * term.of(lambda name: s[name] if name in s else u[name]))
+
+        shape = np.asarray(term.of(lambda name: states.get(name, about.table.covariates.get(name))))
+        if _is_new(shape, known):
+            yield from _proposal(about, "rate", state, Stage.RATE, act, term, {c: True for c in term_names(term)})
+
+
+def term_names(term: _Term) -> tuple[str, ...]:
+    """Names of what a term is made of."""
+    return tuple(dict.fromkeys(atom.name for atom in term.atoms))
+
+
+def _is_new(shape: FloatArray, known: list[FloatArray]) -> bool:
+    """Tell whether a term is no constant and no other term again; keep it in mind."""
+    centred = shape - shape.mean()
+    size = float(np.linalg.norm(centred))
+    if not np.isfinite(size) or size <= 1e-9 * float(np.linalg.norm(shape)):
+        return False
+    own = centred / size
+    if any(abs(float(own @ other)) > _SAME for other in known):
+        return False
+    known.append(own)
+    return True
+
+
+def _proposal(
+    about: About, side: str, target: str, stage: Stage, act: Act, term: _Term, columns: Mapping[str, bool]
+) -> Iterator[Form]:
+    guess = about.sd if stage is Stage.OFFSET else 1e-6
+    typical = about.typical(stage, act, np.full((1, 1, 1), guess), guess)
+    if typical is None or not np.isfinite(typical):
+        return
+    where = tuple(f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c for c in columns)
+    text = f"a {term.text}"
+    what = target if side == "reading" else f"the rate of {target}"
+    yield Form(
+        f"formula:{side}:{target}:{term.text}", stage, {"a": HeavyTailed(typical)}, ("",), where, act, np.full((1, 1, 1), typical), (0,),
+        lambda mean, sd: f"{what} lacks {text}, a = {with_unit(mean[0], sd[0], '')}: a proposal, not a known effect",
+        expression=text,
+    )  # fmt: skip

@@ -57,39 +57,40 @@ class Motion:
         """Add a bound to a state."""
         return replace(self, limits=(*self.limits, limit))
 
-    @property
-    def has_events(self) -> bool:
-        """Whether states can stick or stop."""
-        return bool(self.friction or self.limits)
+    def ways(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
+        """Which way friction holds each state through the step that begins here: 1, -1, or 0 where it sticks."""
+        if not self.friction:
+            return {}
+        free = self.rates(s, p, u, {})
+        return {
+            state: np.where(s[state] != 0, np.sign(s[state]), np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0))
+            for state, size in self.friction.items()
+        }
 
-    def rates(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
-        """Rate of each state, friction and bounds included."""
+    def rates(
+        self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Rate of each state, with bounds, and with the friction of the `ways` it is told; none where it is told none."""
         given = self.law.rates(s, p, u)
         out = {state: given[state] for state in self.law.states}
         for state, term in self.terms:
             out[state] = out[state] + term(s, p, u)
-        for state, size in self.friction.items():
-            out[state] = _rubbed(out[state], s[state], size)
+        for state, way in ways.items():
+            out[state] = np.where(way == 0, 0.0, out[state] - self.friction[state] * way)
         for limit in self.limits:
             rate, at = out[limit.state], s[limit.state]
             stopped = (at >= limit.level) & (rate > 0) if limit.upper else (at <= limit.level) & (rate < 0)
             out[limit.state] = np.where(stopped, 0.0, rate)
         return out
 
-    def settled(self, before: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    def settled(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
         """Put states right at the end of a step: none beyond its bound, none through zero against its friction."""
-        for state in self.friction:
-            crossed = before[state] * after[state] < 0
-            after[state] = np.where(crossed, 0.0, after[state])
+        for state, way in ways.items():
+            after[state] = np.where(way * after[state] < 0, 0.0, after[state])
         for limit in self.limits:
             bound = np.minimum if limit.upper else np.maximum
             after[limit.state] = bound(after[limit.state], limit.level)
         return after
-
-
-def _rubbed(rate: Any, state: Any, size: FloatArray) -> Any:
-    still = np.where(np.abs(rate) <= np.abs(size), 0.0, rate - size * np.sign(rate))
-    return np.where(state == 0, still, rate - size * np.sign(state))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +186,7 @@ def integrate_states(
         start[state] = np.array(np.broadcast_to(at, (n_samples, rows.shape[1])))
     kept = {state: np.empty((n_samples, *rows.shape)) for state in start}
     steps = places.n_steps(max_step)
-    s = motion.settled(start, dict(start))
+    s = motion.settled({}, dict(start))
     with np.errstate(all="ignore"):
         given = _Given.of(motion, places, parameters, columns, start)
         for k in range(len(rows)):
@@ -200,12 +201,13 @@ def integrate_states(
             now = between(0.0)
             for i in range(n):
                 middle, end = between((i + 0.5) / n), between((i + 1) / n)
-                k1 = motion.rates(s, *now)
-                k2 = motion.rates({j: s[j] + half * k1[j] for j in s}, *middle)
-                k3 = motion.rates({j: s[j] + half * k2[j] for j in s}, *middle)
-                k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *end)
+                ways = motion.ways(s, *now)
+                k1 = motion.rates(s, *now, ways)
+                k2 = motion.rates({j: s[j] + half * k1[j] for j in s}, *middle, ways)
+                k3 = motion.rates({j: s[j] + half * k2[j] for j in s}, *middle, ways)
+                k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *end, ways)
                 after = {j: s[j] + sixth * (k1[j] + 2 * (k2[j] + k3[j]) + k4[j]) for j in s}
-                s, now = motion.settled(s, after) if motion.has_events else after, end
+                s, now = motion.settled(ways, after), end
     place, run = places.place
     return {state: values[:, place, run] for state, values in kept.items()}
 
@@ -245,7 +247,7 @@ class _Given:
                 moving[name] = own
         first = {name: _at(values, rows[:1])[:, 0] for name, values in columns.items()}
         asked = _Asked(first)
-        motion.rates(start, {**constant, **{name: values[:, 0] for name, values in moving.items()}}, asked)
+        motion.rates(start, {**constant, **{name: values[:, 0] for name, values in moving.items()}}, asked, {})
         sloping, held = {}, {}
         for name in asked.names:
             slopes = name == time or (law.hold == "linear" and columns[name].dtype == np.float64)

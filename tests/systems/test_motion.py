@@ -1,0 +1,110 @@
+"""The integration of a law, against closed forms and an integrator of another kind."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from probewise.errors import ParameterError
+from probewise.systems import Law, RunTable, Simulator, System
+from probewise.systems.motion import Limit, Motion, RowsInRuns, integrate_states
+
+
+def _pendulum(s, p, u):
+    return {"phi": s["omega"], "omega": -9.81 / p["l_m"] * np.sin(s["phi"]) - p["c"] * s["omega"]}
+
+
+def _table(times, **columns):
+    return RunTable({"t_s": np.asarray(times, dtype=float), "y": np.zeros(len(times)), **columns}, time="t_s")
+
+
+def _states(motion, table, parameters, max_step):
+    own = {name: np.full((1, 1), value) for name, value in parameters.items()}
+    columns = {name: values for name, values in table.columns.items() if name != "y"}
+    return {k: v[0] for k, v in integrate_states(motion, RowsInRuns(table), own, columns, max_step=max_step).items()}
+
+
+def test_a_pendulum_swings_as_an_adaptive_integrator_says():
+    """Route two: DOP853 of SciPy at rtol 1e-10."""
+    times = np.sort(np.random.default_rng(1).uniform(0, 5, 60))
+    table = _table(times)
+    found = _states(Law({"phi": 1.0, "omega": 0.0}, _pendulum), table, {"l_m": 0.7, "c": 0.3}, 0.005)
+
+    def rates(t, y):
+        out = _pendulum({"phi": y[0], "omega": y[1]}, {"l_m": 0.7, "c": 0.3}, {})
+        return [out["phi"], out["omega"]]
+
+    exact = solve_ivp(rates, (times[0], times[-1]), [1.0, 0.0], t_eval=times, method="DOP853", rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found["phi"], exact.y[0], atol=1e-7)
+
+
+@pytest.mark.parametrize(("hold", "expected"), [("previous", 2.0), ("linear", 3.0)])
+def test_an_input_between_rows_is_held_or_runs_straight(hold, expected):
+    """The integral of an input of 1, 3 from t = 0 to 1 and of 1 before: 1 s of 1, then 1 s of 1 or of 1 to 3."""
+    table = _table([0.0, 1.0, 2.0], u=np.array([1.0, 1.0, 3.0]))
+    law = Law({"x": 0.0}, lambda s, p, u: {"x": u["u"] + 0 * s["x"]}, hold=hold)
+    found = _states(law, table, {}, 0.1)["x"]
+    assert found[-1] == pytest.approx(expected, abs=1e-12)
+
+
+def test_runs_go_on_side_by_side_as_each_would_alone():
+    rng = np.random.default_rng(3)
+    law = Law({"phi": 1.0, "omega": 0.0}, _pendulum)
+    times = [np.sort(rng.uniform(0, 3, n)) for n in (20, 7)]
+    both = RunTable(
+        {"t_s": np.concatenate(times), "y": np.zeros(27), "run": np.repeat([1.0, 2.0], [20, 7])}, time="t_s", run="run"
+    )
+    together = _states(law, both, {"l_m": 0.7, "c": 0.3}, 0.01)["phi"]
+    alone = np.concatenate([_states(law, _table(t), {"l_m": 0.7, "c": 0.3}, 0.01)["phi"] for t in times])
+    np.testing.assert_allclose(together, alone, atol=1e-7)
+
+
+def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts():
+    """v = v0 - a t until 0, then it sticks."""
+    motion = Motion(Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]})).with_friction("v", np.full((1, 1), 0.5))
+    table = _table(np.linspace(0, 4, 81))
+    found = _states(motion, table, {}, 0.05)["v"]
+    np.testing.assert_allclose(found, np.maximum(1 - 0.5 * table.time_s, 0), atol=0.03)
+    assert np.all(found[table.time_s > 2.1] == 0)
+
+
+def test_a_body_at_rest_sticks_until_the_force_is_larger_than_its_friction():
+    law = Law({"v": 0.0}, lambda s, p, u: {"v": u["force"] + 0 * s["v"]}, hold="linear")
+    table = _table(np.linspace(0, 4, 401), force=np.linspace(0, 4, 401))
+    found = _states(Motion(law).with_friction("v", np.full((1, 1), 2.0)), table, {}, 0.01)["v"]
+    assert np.all(found[table.time_s < 1.99] == 0)
+    assert found[-1] == pytest.approx(0.5 * 2.0**2, abs=0.05)
+
+
+def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_ends():
+    law = Law({"level": 0.0}, lambda s, p, u: {"level": u["inflow"] - 0.5 * s["level"]})
+    times = np.linspace(0, 10, 201)
+    table = _table(times, inflow=np.where(times < 5, 1.0, 0.0))
+    found = _states(Motion(law).with_limit(Limit("level", np.full((1, 1), 1.2))), table, {}, 0.05)["level"]
+    assert found.max() == pytest.approx(1.2)
+    after = times >= 5
+    np.testing.assert_allclose(found[after], 1.2 * np.exp(-0.5 * (times[after] - 5)), atol=1e-3)
+
+
+def test_time_that_falls_within_a_run_is_refused_with_the_row():
+    with pytest.raises(ParameterError, match=r"row 4.*allowed: a time that does not fall"):
+        _ = RowsInRuns(_table([0.0, 1.0, 0.5])).rows
+
+
+def test_the_step_is_halved_until_readings_stand_still():
+    simulator = Simulator(
+        "y", "V", {"l_m": _uniform(0.1, 1.0), "c": _uniform(0.0, 0.1)}, law=Law({"phi": 1.0, "omega": 0.0}, _pendulum), time="t_s"
+    )
+    table = _table(np.linspace(0, 10, 30))
+    system = System.of(simulator, table)
+    still = system.standing_still(table, system.starts[:1], tolerance=1e-5)
+    finer = System(simulator, system.runs, still.max_step / 16)
+    theta = system.theta(system.starts[:1])
+    far = np.abs(still.chain(table, ()).predict(theta, table) - finer.chain(table, ()).predict(theta, table))
+    assert still.max_step < system.max_step
+    assert far.max() < 2e-5
+
+
+def _uniform(low, high):
+    from probewise.priors import Uniform
+
+    return Uniform(low, high)

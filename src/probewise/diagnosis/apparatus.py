@@ -48,6 +48,10 @@ class Apparatus(Protocol):
         """Build the vocabulary, scaled to a recording: by name, without what could not show there."""
         ...
 
+    def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+        """Name the effects that a person added: named to be tried, however far they lead from the null."""
+        ...
+
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Give the prior odds of these effects, of something unknown, and of their absence."""
         ...

@@ -20,7 +20,7 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
 from probewise.diagnosis.judgement.judged import judge
 from probewise.diagnosis.light_sensor.sensor import LightSensor
-from probewise.diagnosis.prepared import prepare
+from probewise.diagnosis.prepared import Prepared, prepare
 from probewise.diagnosis.repair.best import Best, best_repair
 from probewise.diagnosis.repair.correction import corrected
 from probewise.diagnosis.repair.ensemble import Drawn, draw_models
@@ -38,7 +38,7 @@ from probewise.effects import VOCABULARY, NamedEffect
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
-__all__ = ["Thorough", "diagnose"]
+__all__ = ["Thorough", "diagnose", "diagnose_prepared"]
 
 Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]]
 """Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
@@ -91,6 +91,13 @@ def diagnose(
     """
     require_rng(rng)
     prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(effects))
+    return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
+
+
+def diagnose_prepared(
+    prepared: Prepared, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
+) -> Diagnosis:
+    """Go the road of `diagnose` for any apparatus; what is returned and raised is as there."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
     if prepared.too_little:
         searched = searched.by_prior_alone()

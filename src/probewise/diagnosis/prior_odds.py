@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from probewise.effects import UNNAMED, NamedEffect
+from probewise.effects import UNNAMED, NamedEffect, is_out_of_vocabulary
 from probewise.sensor import Stage
 
 __all__ = ["PriorOdds"]
@@ -45,12 +45,12 @@ class PriorOdds:
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
         """Share the odds out over these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
-        unnamed = len(UNNAMED.keys() & effects)
+        unnamed = sum(is_out_of_vocabulary(name) for name in effects)
         return cls(len(effects) - len(on_noise) - unnamed, unnamed, len(on_noise))
 
     def log_mean(self, names: Names) -> float:
         """Log prior of a combination of effects on the mean."""
-        named = [name for name in names if name not in UNNAMED]
+        named = [name for name in names if not is_out_of_vocabulary(name)]
         log_p = self._log_of_named(len(named))
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside

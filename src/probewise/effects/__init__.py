@@ -88,12 +88,22 @@ UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **UNNAMED})
 """All physics that has a formula here, by name, whether the vocabulary has it or not."""
 
+PROPOSAL = "formula:"
+"""What the names of formulas begin with that are proposed for what has no name."""
+
+
+def is_out_of_vocabulary(name: str) -> bool:
+    """Tell whether an effect has a formula and no name in the vocabulary."""
+    return name in UNNAMED or name.startswith(PROPOSAL)
+
+
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
 """What may be wrong with the noise and has no name in the vocabulary, by a name of our own."""
 
 __all__ = [
     "EFFECTS",
     "NUISANCES",
+    "PROPOSAL",
     "UNNAMED",
     "VOCABULARY",
     "AlbedoGradient",
@@ -146,6 +156,7 @@ __all__ = [
     "draw_readings",
     "edge_distance",
     "in_scans",
+    "is_out_of_vocabulary",
     "lattice_step",
     "lattice_step_sd",
     "log_density",

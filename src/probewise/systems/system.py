@@ -42,12 +42,15 @@ class System:
         Longest step of the integration, where there is a law.
     caller
         How `simulate` is called, where there is none.
+    first
+        Coordinates of an earlier fit, to start from.
     """
 
     simulator: Simulator
     runs: tuple[str, ...]
     max_step: float = np.inf
     caller: Caller | None = None
+    first: FloatArray | None = None
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable) -> System:
@@ -120,8 +123,8 @@ class System:
         return 0
 
     @property
-    def worth(self) -> int:
-        """None."""
+    def degrees_of_freedom(self) -> int:
+        """None beside its parameters."""
         return 0
 
     @property
@@ -141,7 +144,9 @@ class System:
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Start from the middle of the prior and from points spread evenly over it, (8, n_params)."""
+        """Start from an earlier fit, or else the middle of the prior and points spread evenly over it, (n, n_params)."""
+        if self.first is not None:
+            return self.first[None, :]
         # Additive recurrence by the roots of x^(d+1) = x + 1 (Roberts's sequence): even in any number of dimensions.
         root = 2.0
         for _ in range(32):

@@ -21,7 +21,7 @@ from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.scheduling import Command
-from probewise.effects import NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
+from probewise.effects import EFFECTS, NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
 __all__ = ["LightSensor"]
@@ -51,6 +51,10 @@ class LightSensor:
             for name, effect in able.items()
             if (null.admits(effect) if null is not None else not effect.is_of_the_ssf(plan))
         }
+
+    def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+        """Name the effects that are not this library's."""
+        return frozenset(effects.keys() - EFFECTS)
 
     def null_forms(self, recording: Recording) -> SsfForms:
         """Give the forms of its SSF."""

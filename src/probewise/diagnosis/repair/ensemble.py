@@ -16,7 +16,6 @@ from probewise.diagnosis.repair.best import Best, ruins
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
-from probewise.effects import EFFECTS
 from probewise.progress import Progress, silent
 
 __all__ = ["Drawn", "Ensemble", "draw_models"]
@@ -58,10 +57,12 @@ class Ensemble:
     def likely(self, best: WeighedFit) -> dict[Names, float]:
         """Weigh what one model can hold beside the best candidate: under its noise, by the form of its SSF."""
         out: dict[Names, float] = {}
+        prepared = self.searched.prepared
+        own = prepared.apparatus.own_effects(prepared.effects)
         for names in dict.fromkeys(names for _, names in self.searched.evidences.fits):
             log_z = [c.evidence[self.noise].log_z for c in self._of_form(best, names)]
-            # No file holds a user's own effect; a user's own model has it where it is best itself.
-            if log_z and {*names} <= {*EFFECTS, *best.names}:
+            # No file holds a person's own effect; their own model has it where it is best itself.
+            if log_z and not own & ({*names} - {*best.names}):
                 out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_mean(names)
         total = np.logaddexp.reduce(list(out.values()))
         return {names: math.exp(value - total) for names, value in out.items()}

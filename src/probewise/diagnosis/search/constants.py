@@ -34,6 +34,7 @@ MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with so
 # width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off, and screening missed it
 # (495 concealed recordings of seed 9203); the threshold was not varied.
 FAINT = 0.35
+ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no refit shows more
 VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
 
 # Backward elimination.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs
 from probewise.diagnosis.search.constants import (
+    ABSORBED,
     EXTENDED_WITHIN,
     FAINT,
     MOST_OUT_OF_VOCABULARY,
@@ -20,7 +21,6 @@ from probewise.diagnosis.search.constants import (
 )
 from probewise.diagnosis.search.state import SearchState, rivals_of
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
-from probewise.effects import EFFECTS
 
 __all__ = ["Proposal", "promising", "proposals_for", "select_forward"]
 
@@ -126,8 +126,9 @@ def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Propo
     """
     ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
     left = state.bank(null).surviving(Linearised.of(null.found, null.law))
-    faint = {name for name, members in state.bank(null).members.items() if left[members].max() < FAINT}
-    always = (state.effects.keys() - EFFECTS) | faint
+    most = {name: float(left[members].max()) for name, members in state.bank(null).members.items()}
+    faint = {name for name, share in most.items() if ABSORBED < share < FAINT}
+    always = state.tried_always | faint
     chosen = promising(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
 

@@ -75,7 +75,8 @@ def search(
     noises = Noises(recording, on_noise, prior)
     templates = TemplateMemory(prepared.usable)
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
-    state = SearchState(on_mean, prior, noises, templates, Refits(prepared.null, noises, templates), progress)
+    refits, own = Refits(prepared.null, noises, templates), prepared.apparatus.own_effects(on_mean)
+    state = SearchState(on_mean, prior, noises, templates, refits, own, progress)
     fit_nulls(state, prepared, max_order=max_order)
     unknown = _unknown(state, prepared)
     screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)

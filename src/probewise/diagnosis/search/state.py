@@ -41,6 +41,8 @@ class SearchState:
         Of effects about fits.
     refits
         How the recording is fitted.
+    tried_always
+        Effects that are refitted alone whatever screening says of them.
     progress
         Told how far the search is.
     """
@@ -50,6 +52,7 @@ class SearchState:
     noises: Noises
     templates: TemplateMemory
     refits: Refits
+    tried_always: frozenset[str] = frozenset()
     progress: Progress = silent
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)

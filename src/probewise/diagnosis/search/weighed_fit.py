@@ -12,7 +12,7 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.constants import STEERING
-from probewise.effects import NUISANCES, UNNAMED
+from probewise.effects import NUISANCES, is_out_of_vocabulary
 
 __all__ = [
     "WeighedFit",
@@ -107,4 +107,4 @@ def in_vocabulary(noise: Names) -> Names:
 
 def out_of_vocabulary(mean: Names) -> Names:
     """Keep those of a combination on the mean that have a formula and no name in the vocabulary."""
-    return tuple(name for name in mean if name in UNNAMED)
+    return tuple(name for name in mean if is_out_of_vocabulary(name))

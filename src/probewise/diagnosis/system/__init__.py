@@ -1,0 +1,1 @@
+"""A person's simulator over a plain table, as an apparatus: its forms, covariates, held-out runs, words."""

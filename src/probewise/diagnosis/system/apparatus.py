@@ -1,0 +1,158 @@
+"""A person's simulator: what the engine asks of whatever took the readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.apparatus import NullForms, Words
+from probewise.diagnosis.evidence.held_out import LEAST_ROWS, Parts
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.scheduling import Command
+from probewise.effects import (
+    CorrelatedNoise,
+    DriftingNoise,
+    Dropouts,
+    Extent,
+    NamedEffect,
+    Outliers,
+    Quantisation,
+    SignalDependentNoise,
+)
+from probewise.recordings.plan import Plan, Recording
+from probewise.systems import RunTable, System
+from probewise.systems.forms import About, forms_of
+
+__all__ = ["PersonsSystem"]
+
+_ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
+    SignalDependentNoise,
+    CorrelatedNoise,
+    Outliers,
+    Dropouts,
+    Quantisation,
+    DriftingNoise,
+)
+_N_BLOCKS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class PersonsSystem:
+    """A system about a first fit of it: the forms take their scale from there.
+
+    Parameters
+    ----------
+    about
+        The fit, and the sd of a reading.
+    """
+
+    about: About
+
+    @property
+    def system(self) -> System:
+        """The system."""
+        return self.about.system
+
+    @property
+    def words(self) -> Words:
+        """Speak of the simulator."""
+        return Words(
+            null="the simulator",
+            find_signal="record where the reading changes",
+            settles_nothing="no rows like those of this table tell them apart",
+        )
+
+    def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
+        """Bind every form that this table could show, and what may be wrong with its noise."""
+        extent = Extent.of(recording)
+        on_noise = {kind.name: kind.for_extent(extent) for kind in _ON_NOISE}
+        forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
+        return forms | {name: effect for name, effect in on_noise.items() if effect is not None}
+
+    def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+        """Name the extra effects of a person's file."""
+        return frozenset(effects.keys() & self.system.simulator.extra.keys())
+
+    def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
+        """Share the odds out over these effects."""
+        return PriorOdds.over(effects)
+
+    def null_forms(self, recording: Recording) -> NullForms:
+        """There is one: the simulator."""
+        raise NotImplementedError("a simulator is its own null")
+
+    def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+        """List time, columns, level, states, the change since the row before, and runs, as far as they vary."""
+        table = cast(RunTable, recording.plan)
+        usable = np.flatnonzero(recording.usable)
+        level = found.predicted
+        everywhere = found.model.predict(found.z[None, :])[0]
+        pooled: dict[str, FloatArray] = {"time" if table.has_time else "row": table.time_s[usable], "level": level}
+        own = self.system.simulator
+        pooled |= {name: v[usable] for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
+        pooled |= {f"state:{name}": v[usable] for name, v in self.about.states.items()}
+        pooled["previous"] = _change(everywhere, table)[usable]
+        out = []
+        for name, values in pooled.items():
+            there = np.flatnonzero(np.isfinite(values))
+            if there.size and _varies(values[there]):
+                out.append(Covariate(name, values[there], there))
+        if len(table.scan_names) > 1:
+            out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
+        return out, pooled["previous"]
+
+    def covariate_of(
+        self,
+        effect: NamedEffect[Any],
+        change: FloatArray,
+        without: FloatArray,
+        plan: Plan,
+        known: Sequence[Covariate],
+    ) -> Covariate | None:
+        """Choose the first of an effect's covariates that varies; None where none does, or nothing changes."""
+        pooled = {c.name: c for c in known}
+        name = next((name for name in effect.covariates if name in pooled), None)
+        if name is None or not np.any(change):
+            return None
+        return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
+
+    def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
+        """A simulator has none."""
+        return np.zeros((len(usable), 0))
+
+    def held_out_parts(self, recording: Recording) -> Parts:
+        """Hold out runs; of one run, blocks of rows that follow each other."""
+        table, usable = cast(RunTable, recording.plan), recording.usable
+        run = table.scan[usable]
+        if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:
+            return run, table.scan_names
+        n = int(usable.sum())
+        part = np.minimum(np.arange(n) * _N_BLOCKS // max(n, 1), _N_BLOCKS - 1)
+        return part, tuple(f"part {k + 1} of {_N_BLOCKS}" for k in range(_N_BLOCKS))
+
+    def commands(
+        self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
+    ) -> Sequence[Command]:
+        """Nothing yet."""
+        return ()
+
+
+def _change(values: FloatArray, table: RunTable) -> FloatArray:
+    """Change since the row before of the run, 0 at its first, (n_points,)."""
+    out = np.zeros(len(table))
+    for rows in table.rows_by_scan():
+        out[rows[1:]] = np.diff(values[rows])
+    return out
+
+
+def _varies(values: FloatArray) -> bool:
+    return values.size > 1 and float(np.ptp(values)) > 1e-12 * max(1e-300, float(np.abs(values).max()))
+
+

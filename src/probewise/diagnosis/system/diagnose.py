@@ -1,0 +1,129 @@
+"""Diagnose a person's simulator against their table: fit it, bind the forms about the fit, go the engine's road."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.engine import Thorough, diagnose_prepared
+from probewise.diagnosis.fitting.fit import Fit, Model, fit
+from probewise.diagnosis.noise.law import NoiseLaw, white
+from probewise.diagnosis.noise.models import rough_sd
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.errors import ParameterError
+from probewise.recordings import Instrumentation
+from probewise.recordings.plan import Plan, Recording
+from probewise.systems import RunTable, Simulator, System
+from probewise.systems.forms import About
+
+__all__ = ["diagnose_system", "fit_system", "prepare_system"]
+
+_STANDS_STILL = 0.02  # noise sds that predictions may move by when the step of the integration is halved
+_MOST_COMPARED = 2400
+
+
+def diagnose_system(
+    simulator: Simulator, table: RunTable, *, thorough: Thorough | None = None, rng: np.random.Generator
+) -> Diagnosis:
+    """Tell what physics a simulator leaves out of a table of readings.
+
+    Parameters
+    ----------
+    simulator
+        What predicts the readings.
+    table
+        What was recorded, with the column that is predicted.
+    thorough
+        Weighs what leads a second time.
+    rng
+        Source of randomness.
+
+    Raises
+    ------
+    ParameterError
+        If the simulator and the table do not fit together.
+    NotConvergedError
+        If the fit of the simulator did not arrive anywhere.
+    """
+    return diagnose_prepared(prepare_system(simulator, table), thorough=thorough, rng=rng)
+
+
+def prepare_system(simulator: Simulator, table: RunTable) -> Prepared:
+    """Fit the simulator, and bind the forms about the fit."""
+    recording = recording_of(simulator, table)
+    system, found, sd = fit_system(System.of(simulator, table), recording)
+    apparatus = PersonsSystem(About(system, table, found.z, sd))
+    begun = replace(system, first=found.z)
+    effects = apparatus.effects(recording, begun)
+    return Prepared(recording, effects, begun, apparatus, recording)
+
+
+def recording_of(simulator: Simulator, table: RunTable) -> Recording:
+    """Take the predicted column as readings; the simulator gets every row, at most 2,400 readings are compared.
+
+    Raises
+    ------
+    ParameterError
+        If the column is missing, or holds no number.
+    """
+    readings = table.columns.get(simulator.reading)
+    if readings is None or readings.dtype != np.float64:
+        raise ParameterError("reading", simulator.reading, f"a column of numbers: {', '.join(table.covariates)}")
+    low, high = simulator.noise.range
+    own = replace(
+        table,
+        instrumentation=Instrumentation(
+            unit=simulator.unit, min=low, max=high, step=simulator.noise.step, controls=simulator.controls
+        ),
+    )
+    whole = Recording(cast(Plan, own), np.array(readings), simulator.source)
+    usable = np.flatnonzero(whole.usable)
+    if len(usable) <= _MOST_COMPARED:
+        return whole
+    stretch, every = 6, round(6 * len(usable) / _MOST_COMPARED)
+    kept = np.full(len(readings), np.nan)
+    chosen = usable[np.arange(len(usable)) % every < stretch]
+    kept[chosen] = readings[chosen]
+    return Recording(cast(Plan, own), kept, simulator.source)
+
+
+def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:
+    """Fit a system to readings, with a step of its integration at which predictions there stand still.
+
+    Returns
+    -------
+    The system with that step, the fit, and the sd of a reading: as declared, or else the least of what the fit and
+    neighbouring readings show.
+    """
+    table = cast(RunTable, recording.plan)
+    law = white(int(recording.usable.sum()))
+    found = min((fit(Model(system, (), recording.plan), recording, z, law) for z in system.starts), key=_height)
+    sd = _sd(system.simulator, table, recording, found)
+    for _ in range(4):
+        finer = system.standing_still(table, found.z[None, :], tolerance=_STANDS_STILL * sd)
+        if finer is system:
+            break
+        system = finer
+        found = fit(Model(system, (), recording.plan), recording, found.z, law)
+        sd = _sd(system.simulator, table, recording, found)
+    return system, found, sd
+
+
+def _height(found: Fit) -> float:
+    return found.objective if np.isfinite(found.objective) else np.inf
+
+
+def _sd(simulator: Simulator, table: RunTable, recording: Recording, found: Fit) -> float:
+    declared = simulator.noise.sd
+    if isinstance(declared, str):
+        values: FloatArray = table.covariates[declared]
+        return float(np.median(values[np.isfinite(values)]))
+    if declared is not None:
+        return float(declared)
+    rough = rough_sd(recording)
+    return min(found.sd, rough) if rough > 0 else found.sd

@@ -195,21 +195,50 @@ def integrate_states(
             if k == len(rows) - 1:
                 break
             n = int(steps[k])
-            width = places.gaps[k] / n
-            half, sixth = 0.5 * width, width / 6
-            between = given.between(k)
-            now = between(0.0)
+            between, gap = given.between(k), places.gaps[k]
             for i in range(n):
-                middle, end = between((i + 0.5) / n), between((i + 1) / n)
-                ways = motion.ways(s, *now)
-                k1 = motion.rates(s, *now, ways)
-                k2 = motion.rates({j: s[j] + half * k1[j] for j in s}, *middle, ways)
-                k3 = motion.rates({j: s[j] + half * k2[j] for j in s}, *middle, ways)
-                k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *end, ways)
-                after = {j: s[j] + sixth * (k1[j] + 2 * (k2[j] + k3[j]) + k4[j]) for j in s}
-                s, now = motion.settled(ways, after), end
+                s = _stepped(motion, s, between, gap, i / n, 1 / n)
     place, run = places.place
     return {state: values[:, place, run] for state, values in kept.items()}
+
+
+def _stepped(
+    motion: Motion, s: dict[str, Any], between: Callable[[Any], Pair], gap: FloatArray, begin: float, length: float
+) -> dict[str, Any]:
+    """Step on by a share `length` of a gap, in two where friction brings a state to rest on the way."""
+    ways = motion.ways(s, *between(begin))
+    after = _runge_kutta(motion, s, between, gap, begin, length, ways)
+    for state, way in ways.items():
+        crossed = way * after[state] < 0
+        if not crossed.any():
+            continue
+        ran_out = np.where(crossed, s[state] / np.where(crossed, s[state] - after[state], 1.0), 1.0) * length
+        at_rest = _runge_kutta(motion, s, between, gap, begin, ran_out, ways)
+        at_rest[state] = np.where(crossed, 0.0, at_rest[state])
+        anew = motion.ways(at_rest, *between(begin + ran_out))
+        after = _runge_kutta(motion, at_rest, between, gap, begin + ran_out, length - ran_out, anew)
+        ways = anew
+    return motion.settled(ways, after)
+
+
+def _runge_kutta(
+    motion: Motion,
+    s: Mapping[str, Any],
+    between: Callable[[Any], Pair],
+    gap: FloatArray,
+    begin: Any,
+    length: Any,
+    ways: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Step by the classical rule of fourth order; `begin` and `length` are shares of a gap, of all runs or of each."""
+    width = gap * length
+    half, sixth = 0.5 * width, width / 6
+    middle = between(begin + 0.5 * length)
+    k1 = motion.rates(s, *between(begin), ways)
+    k2 = motion.rates({j: s[j] + half * k1[j] for j in s}, *middle, ways)
+    k3 = motion.rates({j: s[j] + half * k2[j] for j in s}, *middle, ways)
+    k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *between(begin + length), ways)
+    return {j: s[j] + sixth * (k1[j] + 2 * (k2[j] + k3[j]) + k4[j]) for j in s}
 
 
 Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
@@ -254,13 +283,13 @@ class _Given:
             (sloping if slopes else held)[name] = _at(columns[name], rows)
         return cls(constant, moving, held, sloping)
 
-    def between(self, k: int) -> Callable[[float], Pair]:
+    def between(self, k: int) -> Callable[[Any], Pair]:
         """Give parameters and columns at a share of the gap from place k to the next."""
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
         held = {name: v[:, k] for name, v in self.held.items()}
 
-        def at(share: float) -> Pair:
+        def at(share: Any) -> Pair:
             p = {**self.constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}
             u = {**held, **{name: low + share * rise for name, (low, rise) in sloping.items()}}
             return p, u

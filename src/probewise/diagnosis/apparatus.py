@@ -48,6 +48,10 @@ class Apparatus(Protocol):
         """Build the vocabulary, scaled to a recording: by name, without what could not show there."""
         ...
 
+    def proposals(self) -> Mapping[str, NamedEffect[Any]]:
+        """Propose formulas for what has no name, by names that begin with `effects.PROPOSAL`."""
+        ...
+
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Name the effects that a person added: named to be tried, however far they lead from the null."""
         ...

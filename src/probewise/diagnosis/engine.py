@@ -31,6 +31,7 @@ from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.diagnosis.search.weighed_twice import Weighing, with_agreement
+from probewise.diagnosis.verdict_report.beyond import formula_of, remainder_of
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
 from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
@@ -39,6 +40,8 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
 __all__ = ["Thorough", "diagnose", "diagnose_prepared"]
+
+_PROPOSED_FROM = 0.1  # probability of something unknown, from which formulas are proposed for it
 
 Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]]
 """Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
@@ -99,6 +102,11 @@ def diagnose_prepared(
 ) -> Diagnosis:
     """Go the road of `diagnose` for any apparatus; what is returned and raised is as there."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
+    if searched.posterior.by_mean.get(("unknown",), 0.0) > _PROPOSED_FROM:
+        proposals = prepared.apparatus.proposals()
+        if proposals:
+            prepared = replace(prepared, effects={**prepared.effects, **proposals})
+            searched = search(prepared, progress=progress)
     if prepared.too_little:
         searched = searched.by_prior_alone()
     elif thorough is not None:
@@ -118,6 +126,8 @@ def diagnose_prepared(
     progress("choosing the next readings")
     asked = next_readings(searched, test.null)
     noise = noise_found(searched, best, drawn.best, rng=rng)
+    remainder = remainder_of(searched, judged, best, rng=rng)
+    formula = formula_of(searched, judged, best, drawn.best)
     grounds = _grounds(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
     reason = with_agreement(reason_of(judged, grounds), weighings)
     if prepared.thinned:
@@ -128,7 +138,7 @@ def diagnose_prepared(
         repair=repair_of(prepared, test, best, drawn, change),
         where=where,
         next_measurement=asked,
-        report=VerdictReport(reason, found, noise, weighings),
+        report=VerdictReport(reason, found, noise, weighings, remainder, formula),
     )
 
 

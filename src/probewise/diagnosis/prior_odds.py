@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from probewise.effects import UNNAMED, NamedEffect, is_out_of_vocabulary
+from probewise.effects import UNNAMED, NamedEffect, first_of, is_out_of_vocabulary
 from probewise.sensor import Stage
 
 __all__ = ["PriorOdds"]
@@ -46,7 +46,8 @@ class PriorOdds:
         """Share the odds out over these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)
-        return cls(len(effects) - len(on_noise) - unnamed, unnamed, len(on_noise))
+        again = sum(first_of(name) is not None for name in effects)
+        return cls(len(effects) - len(on_noise) - unnamed - again, unnamed, len(on_noise))
 
     def log_mean(self, names: Names) -> float:
         """Log prior of a combination of effects on the mean."""

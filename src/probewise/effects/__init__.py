@@ -97,10 +97,25 @@ def is_out_of_vocabulary(name: str) -> bool:
     return name in UNNAMED or name.startswith(PROPOSAL)
 
 
+AGAIN = "~again"
+"""What the name of an effect ends with that may be there a second time, beside the first."""
+
+
+def public_name(name: str) -> str:
+    """Name an effect as a person knows it, be it the first of its kind or the second."""
+    return name.removesuffix(AGAIN)
+
+
+def first_of(name: str) -> str | None:
+    """Name the effect that has to be there before this one; None where it can stand alone."""
+    return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
+
+
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
 """What may be wrong with the noise and has no name in the vocabulary, by a name of our own."""
 
 __all__ = [
+    "AGAIN",
     "EFFECTS",
     "NUISANCES",
     "PROPOSAL",
@@ -155,11 +170,13 @@ __all__ = [
     "StickSlip",
     "draw_readings",
     "edge_distance",
+    "first_of",
     "in_scans",
     "is_out_of_vocabulary",
     "lattice_step",
     "lattice_step_sd",
     "log_density",
+    "public_name",
     "sign_of_move",
     "variance",
 ]

@@ -11,6 +11,7 @@ from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import in_vocabulary, out_of_vocabulary
+from probewise.effects import public_name
 
 __all__ = ["Hypothesis", "Judged", "Verdict", "credible_set", "decide", "hypotheses_of", "judge", "verdict_on"]
 
@@ -31,7 +32,7 @@ class Hypothesis:
     @property
     def label(self) -> str:
         """Its name in a credible set."""
-        return "+".join(self.effects) or "clean"
+        return "+".join(sorted(map(public_name, self.effects))) or "clean"
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class Judged:
 def judge(searched: Searched, test: GlobalTest) -> Judged:
     """Reach a verdict on what was searched and tested."""
     prepared, posterior = searched.prepared, searched.posterior
-    hypotheses = hypotheses_of(posterior.probabilities)
+    hypotheses = hypotheses_of(posterior.probabilities, searched.evidences.known_as)
     pairs = tuple(aliased_pairs(searched, test.problem, test.null.found))
 
     def aliased_with(combination: Names) -> frozenset[Names]:
@@ -129,12 +130,21 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
     )
 
 
-def hypotheses_of(probabilities: Mapping[tuple[Names, Names], float]) -> tuple[Hypothesis, ...]:
-    """Join mean and noise into combinations; unknown is one hypothesis under any noise."""
+def _without_formulas(mean: Names) -> Names:
+    return ("unknown",) if out_of_vocabulary(mean) else mean
+
+
+def hypotheses_of(
+    probabilities: Mapping[tuple[Names, Names], float], known_as: Callable[[Names], Names] = _without_formulas
+) -> tuple[Hypothesis, ...]:
+    """Join mean and noise into combinations; unknown is one hypothesis under any noise.
+
+    `known_as` gives the name under which a combination on the mean counts.
+    """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
-        unknown = mean == ("unknown",) or out_of_vocabulary(mean)
-        key = ("unknown",) if unknown else tuple(sorted((*mean, *in_vocabulary(noise))))
+        known = known_as(mean)
+        key = known if known == ("unknown",) else tuple(sorted((*known, *in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])

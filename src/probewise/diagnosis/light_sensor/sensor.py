@@ -52,6 +52,10 @@ class LightSensor:
             if (null.admits(effect) if null is not None else not effect.is_of_the_ssf(plan))
         }
 
+    def proposals(self) -> dict[str, NamedEffect[Any]]:
+        """Propose none: what has a formula here is among the effects."""
+        return {}
+
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Name the effects that are not this library's."""
         return frozenset(effects.keys() - EFFECTS)

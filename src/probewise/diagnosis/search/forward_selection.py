@@ -21,6 +21,7 @@ from probewise.diagnosis.search.constants import (
 )
 from probewise.diagnosis.search.state import SearchState, rivals_of
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
+from probewise.effects import AGAIN, first_of
 
 __all__ = ["Proposal", "promising", "proposals_for", "select_forward"]
 
@@ -70,7 +71,8 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     for noise, evidence in null.steering():
         problem = Linearised.of(null.found, evidence.law)
         singles = score_effects(problem, state.bank(null))
-        ranked = sorted(singles, key=lambda name: -float(singles[name].max()))[:PAIRED]
+        alone = [name for name in singles if first_of(name) is None]
+        ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:PAIRED]
         if not ranked or log_mean(singles[ranked[0]]) < PAIRED_FROM:
             continue
         singles = {name: singles[name] for name in ranked}
@@ -92,7 +94,8 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     out = dict(proposals)
     for noise, evidence in parent.steering():
         for name, own in score_effects(Linearised.of(parent.found, evidence.law), bank).items():
-            if name in parent.names:
+            first = first_of(name)
+            if name in parent.names or (first is not None and first not in parent.names):
                 continue
             names = tuple(sorted((*parent.names, name)))
             score = evidence.log_z + log_mean(own) - against
@@ -128,7 +131,9 @@ def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Propo
     left = state.bank(null).surviving(Linearised.of(null.found, null.law))
     most = {name: float(left[members].max()) for name, members in state.bank(null).members.items()}
     faint = {name for name, share in most.items() if ABSORBED < share < FAINT}
-    always = state.tried_always | faint
+    # One of two waves alone explains little: the other is noise to it.
+    twice = {name for name in state.effects if name + AGAIN in state.effects}
+    always = state.tried_always | faint | twice
     chosen = promising(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
 

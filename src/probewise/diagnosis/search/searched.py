@@ -19,6 +19,7 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, in_vocabulary, out_of_vocabulary
+from probewise.effects import is_out_of_vocabulary
 from probewise.sensor import Stage
 
 __all__ = ["Evidences", "Posterior", "Screening", "Searched", "posterior_of"]
@@ -48,6 +49,25 @@ class Evidences:
     screened: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
     unknown: Mapping[tuple[int, Names, Names], float] = field(default_factory=dict)
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
+
+    def names_more(self, order: int, names: Names, noise: Names) -> bool:
+        """Tell whether a combination explains more than something unknown does beside it."""
+        if not names or (order, ()) not in self.fits:
+            return False
+        named = self.fits[order, names].evidence[noise].log_z
+        return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
+
+    def known_as(self, mean: Names) -> Names:
+        """Name a combination as a person is told it: what has no name is unknown, unless what has one explains more."""
+        named = tuple(name for name in mean if not is_out_of_vocabulary(name))
+        if mean == ("unknown",) or named == mean:
+            return mean
+        log_z = {names: self._log_z(names) for names in (mean, named, ())}
+        return named if named and log_z[named] - log_z[()] > log_z[mean] - log_z[named] else ("unknown",)
+
+    def _log_z(self, names: Names) -> float:
+        """Give the most evidence of a refitted combination; minus infinity where it was not refitted."""
+        return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
     def moved(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
         """Move the evidence of fits, and of what is unknown beside them, under every noise model alike."""
@@ -99,8 +119,9 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         for noise, evidence in fit.evidence.items():
             log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
     log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
-    for (_, names, noise), value in evidences.unknown.items():
-        key = ("unknown",), noise
+    for (n, names, noise), value in evidences.unknown.items():
+        # What is named stays named when something smaller is left.
+        key = (names if evidences.names_more(n, names, noise) else ("unknown",)), noise
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
     for (names, noise), value in evidences.screened.items():
         log_p[names, noise] = value + prior.log_mean(names)

@@ -29,6 +29,7 @@ from probewise.effects import (
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, System
 from probewise.systems.forms import About, forms_of
+from probewise.systems.forms.proposals import proposals
 
 __all__ = ["PersonsSystem"]
 
@@ -75,6 +76,10 @@ class PersonsSystem:
         on_noise = {kind.name: kind.for_extent(extent) for kind in _ON_NOISE}
         forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
         return forms | {name: effect for name, effect in on_noise.items() if effect is not None}
+
+    def proposals(self) -> dict[str, NamedEffect[Any]]:
+        """Propose short expressions of columns and states."""
+        return cast(dict[str, NamedEffect[Any]], {form.name: form for form in proposals(self.about)})
 
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Name the extra effects of a person's file."""

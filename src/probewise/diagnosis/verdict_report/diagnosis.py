@@ -15,6 +15,7 @@ from probewise.diagnosis.repair.repair import Repair
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.residuals.locate import Place
 from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
 from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.recordings.plan import Recording
@@ -51,6 +52,8 @@ class VerdictReport:
     effects: tuple[EffectFound, ...]
     noise: NoiseFound
     weighings: tuple[Weighing, ...] = ()
+    remainder: Remainder | None = None
+    formula: Formula | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
+from dataclasses import asdict
 from importlib.resources import files
 from typing import Any
 
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.findings import ParameterFound
+from probewise.effects import public_name
 
 __all__ = ["NEXT_PLAN", "diagnosis_json", "diagnosis_schema"]
 
@@ -29,16 +32,16 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     command line.
     """
     gain, plan = diagnosis.improvement, diagnosis.next_measurement
-    document = {
+    document: dict[str, Any] = {
         "format": "diagnosis/1",
         "verdict": diagnosis.verdict,
         "reason": diagnosis.reason,
         "p_value": diagnosis.p_value,
-        "combination": list(diagnosis.combination),
-        "hypotheses": [{"effects": list(h.effects), "probability": h.probability} for h in diagnosis.hypotheses],
+        "combination": _names(diagnosis.combination),
+        "hypotheses": [{"effects": _names(h.effects), "probability": h.probability} for h in diagnosis.hypotheses],
         "effects": [
             {
-                "name": e.name,
+                "name": public_name(e.name),
                 "probability": e.probability,
                 "size_lambda": e.size_lambda,
                 "sentence": e.sentence,
@@ -89,9 +92,19 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,
         },
     }
+    remainder, formula = diagnosis.report.remainder, diagnosis.report.formula
+    if remainder is not None:
+        document["remainder"] = asdict(remainder)
+    if formula is not None:
+        document["formula"] = asdict(formula) | {"parameters": [_parameter(p) for p in formula.parameters]}
     return document | (
         {"thorough": [_weighing(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
     )
+
+
+def _names(effects: Iterable[str]) -> list[str]:
+    """Name effects as a person knows them; one that is there twice is listed twice."""
+    return sorted(map(public_name, effects))
 
 
 def _weighing(twice: Weighing) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found"]
+__all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
 
 Names = tuple[str, ...]
 
@@ -106,7 +106,7 @@ def effects_found(
                 min(p, 1.0),
                 size,
                 effect.sentence(values.mean(axis=0), values.std(axis=0)),
-                (*_parameters(effect, values, unit), *_scans(effect, plan)),
+                (*parameters_of(effect, values, unit), *_scans(effect, plan)),
                 effect.scans,
             )
         )
@@ -187,11 +187,12 @@ def noise_found(searched: Searched, best: Best, samples: ModelSamples, *, rng: n
     unit = prepared.recording.plan.instrumentation.unit
     parameters = [_parameter("sd", unit, samples.noise_sd)]
     for name in in_vocabulary(best.noise):
-        parameters += _parameters(prepared.effects[name], samples.columns(name), unit)
+        parameters += parameters_of(prepared.effects[name], samples.columns(name), unit)
     return NoiseFound("+".join(best.noise) or "white", p_value, tuple(parameters))
 
 
-def _parameters(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
+def parameters_of(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
+    """Describe samples of an effect's parameters, (n_samples, n_params); `unit` is that of a reading."""
     return tuple(
         _parameter(name, unit_in_words(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from probewise.effects import AGAIN
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Form
 from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
@@ -15,4 +18,5 @@ __all__ = ["About", "Form", "driving_columns", "forms_of"]
 def forms_of(about: About) -> dict[str, Form]:
     """Bind every form that this table could show, by name."""
     found = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
-    return {form.name: form for form in found}
+    waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
+    return {form.name: form for form in [*found, *waves]}

@@ -22,7 +22,8 @@ _N_SIZES = 9
 _NUDGE = 1e-4  # of a column's spread, to see whether it drives the readings
 _MOST_WAVES_OF_A_LAW = 96
 _MOST_WAVES = 600
-_FORTH_AND_BACK = 0.02
+_ROWS_OF_A_WAVE = 4  # distinct values to a period on the average: with fewer any readings lie on some wave
+_FORTH_AND_BACK = 0.02  # of the rows that go each way
 
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
 """A column (n_points,) or (n_samples, n_points), parameters and the table to the column as it really is."""
@@ -99,15 +100,16 @@ def _ceiling(about: About, name: str, low: float, high: float) -> Iterator[Form]
 
 
 def _wave(about: About, name: str) -> Iterator[Form]:
-    values, table = about.table.covariates[name], about.table
-    if len(np.unique(values)) < 12:
+    values = about.table.covariates[name]
+    if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
         return
 
     def change(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
 
     act = _on(name, change)
-    waves = wave_numbers(np.sort(values), [np.arange(len(values))], _MOST_WAVES if about.system.is_quick else _MOST_WAVES_OF_A_LAW)
+    most = _MOST_WAVES if about.system.is_quick else _MOST_WAVES_OF_A_LAW
+    waves = wave_numbers(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE)
     guess, n = 1e-4 * float(np.nanstd(values)), len(waves)
 
     def entries(size: float) -> FloatArray:
@@ -117,7 +119,6 @@ def _wave(about: About, name: str) -> Iterator[Form]:
     typical = about.typical(Stage.INPUT, act, entries(guess), guess)
     if typical is None:
         return
-    del table
     marginals = {"a": HeavyTailed(typical, positive=True), "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
                  "phase": Uniform(-2 * np.pi, 2 * np.pi)}  # fmt: skip
     yield Form(

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailed
-from probewise.priors import Uniform
+from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import Moments, with_unit
 from probewise.systems.table import RunTable
 
@@ -119,12 +119,13 @@ def per_run(table: RunTable) -> Modulation:
         amplitudes=tuple(range(len(names))),
     )
 
-def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES) -> FloatArray:
-    """Lay out waves per unit of a covariate: up to one in two rows, twice for each that the reach tells apart."""
+def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES, rows_each: int = 2) -> FloatArray:
+    """Lay out waves per unit of a covariate: up to one in `rows_each` rows, twice for each that the reach tells apart."""
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
     gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
-    highest = 0.5 / float(np.median(gaps)) if gaps.size else 1.0 / reach
+    highest = 1 / (rows_each * float(np.median(gaps))) if gaps.size else 1.0 / reach
+    highest = min(highest, len(np.unique(values)) / (rows_each * reach))
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
     return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
 
@@ -150,7 +151,7 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
     return Modulation(
         over=over,
         marginals=lambda size: {
-            "a": HeavyTailed(size, positive=True), "hz": Uniform(0.5 * waves[0], waves[-1] * 1.02), "phase": _PHASE,
+            "a": HeavyTailed(size, positive=True), "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)), "phase": _PHASE,
         },  # fmt: skip
         entries=entries,
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailed
-from probewise.priors import Uniform
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Act, Form, with_unit
@@ -94,7 +94,7 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
     typical = about.typical(Stage.RATE, act, entries(guess), guess)
     if typical is None:
         return
-    marginals = {"a": HeavyTailed(typical, positive=True), "hz": Uniform(0.5 * waves[0], waves[-1] * 1.02),
+    marginals = {"a": HeavyTailed(typical, positive=True), "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
                  "phase": Uniform(-2 * np.pi, 2 * np.pi)}  # fmt: skip
     yield Form(
         f"periodic_forcing:{state}", Stage.RATE, marginals, (unit, f"1/{about.time_unit}", "rad"), ("time",), act, entries(typical), (0,),

@@ -1,0 +1,79 @@
+"""What is said beyond the verdict: what a repair leaves, and the formula of what has no name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.repair.samples import ModelSamples
+from probewise.diagnosis.residuals.locate import ALARM, places
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.verdict_report.findings import ParameterFound, parameters_of
+from probewise.diagnosis.verdict_report.words import p_in_words
+from probewise.effects import is_out_of_vocabulary
+
+__all__ = ["Formula", "Remainder", "formula_of", "remainder_of"]
+
+_N_DRAWS = 199
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What is left when everything named is in the model.
+
+    `share_of_gain` is its share of the log evidence that the named and what is left gain together; `where` the
+    covariate in which it shows most, None where in none.
+    """
+
+    p_value: float
+    share_of_gain: float
+    where: str | None
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A short expression proposed for what has no name: on which side, of what, and what it gains."""
+
+    expression: str
+    side: str
+    target: str
+    parameters: tuple[ParameterFound, ...]
+    log_evidence: float
+
+
+def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.random.Generator) -> Remainder | None:
+    """Describe what the repair leaves; None where nothing is named, or nothing is left."""
+    p_value, names = best.improvement.p_value_after, best.fit.names
+    if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
+        return None
+    own = best.fit.found.model.sensor.n_gaussians
+    value = searched.evidences.unknown.get((own, names, best.noise))
+    log_z = best.fit.evidence[best.noise].log_z
+    more = 0.0 if value is None else max(value - log_z, 0.0)
+    named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
+    prepared, covariates = searched.prepared, searched.screening.covariates
+    draws = best.problem.draws(_N_DRAWS, rng=rng)
+    found = places(best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws)
+    where = found[0].covariate if found else None
+    shows = "" if where is None else f"; it shows most in {where}"
+    share = more / (named + more) if named + more > 0 else 0.0
+    sentence = f"Something smaller is left ({p_in_words(p_value)}, {share:.0%} of what is gained){shows}."
+    return Remainder(p_value, share, where, sentence)
+
+
+def formula_of(searched: Searched, judged: Judged, best: Best, samples: ModelSamples) -> Formula | None:
+    """Give the formula that a repair of something unknown holds; None where there is none."""
+    if judged.verdict != "unknown":
+        return None
+    unit = searched.prepared.recording.plan.instrumentation.unit
+    for effect in best.fit.found.model.effects:
+        expression = getattr(effect, "expression", "")
+        if expression and is_out_of_vocabulary(effect.name):
+            _, side, target, _ = effect.name.split(":", 3)
+            parameters = parameters_of(effect, samples.columns(effect.name), unit)
+            return Formula(expression, side, target, parameters, best.improvement.log_evidence)
+    return None

@@ -84,6 +84,11 @@ class SensorAndShape:
         return self.sensor.form
 
     @property
+    def in_bulk(self) -> bool:
+        """Each sample has its own cost."""
+        return False
+
+    @property
     def exchangeable(self) -> bool:
         """Whether the sensor's can."""
         return self.sensor.exchangeable

@@ -57,6 +57,10 @@ class Motion:
         """Add a bound to a state."""
         return replace(self, limits=(*self.limits, limit))
 
+    @cached_property
+    def _is_bare(self) -> bool:
+        return not (self.terms or self.friction or self.limits)
+
     def ways(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
         """Which way friction holds each state through the step that begins here: 1, -1, or 0 where it sticks."""
         if not self.friction:
@@ -69,9 +73,11 @@ class Motion:
 
     def rates(
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    ) -> Mapping[str, Any]:
         """Rate of each state, with bounds, and with the friction of the `ways` it is told; none where it is told none."""
         given = self.law.rates(s, p, u)
+        if self._is_bare:
+            return given
         out = {state: given[state] for state in self.law.states}
         for state, term in self.terms:
             out[state] = out[state] + term(s, p, u)
@@ -218,7 +224,7 @@ def _stepped(
         anew = motion.ways(at_rest, *between(begin + ran_out))
         after = _runge_kutta(motion, at_rest, between, gap, begin + ran_out, length - ran_out, anew)
         ways = anew
-    return motion.settled(ways, after)
+    return motion.settled(ways, after) if ways or motion.limits else after
 
 
 def _runge_kutta(
@@ -288,6 +294,9 @@ class _Given:
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
         held = {name: v[:, k] for name, v in self.held.items()}
+        if not (moving or sloping):
+            throughout = self.constant, held
+            return lambda share: throughout
 
         def at(share: Any) -> Pair:
             p = {**self.constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}

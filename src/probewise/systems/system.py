@@ -161,9 +161,9 @@ class System:
         return max(12, 3 * (self.n_params - n_own) + n_own)
 
     @property
-    def is_quick(self) -> bool:
-        """Whether many samples cost little more than one: `simulate` takes all of them at once."""
-        return self.caller is not None and self.caller.broadcasts
+    def in_bulk(self) -> bool:
+        """Whether many samples cost little more than one: a law, or a `simulate` that takes all of them at once."""
+        return self.caller is None or self.caller.broadcasts
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Tell whether an effect acts at a stage that this system has."""
@@ -178,7 +178,7 @@ class System:
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
     def standing_still(self, table: RunTable, z: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float) -> System:
-        """Halve the step of the integration until predictions at coordinates z move by less than a tolerance.
+        """Halve the step of the integration until predictions at coordinates z move by less than a tolerance, rms.
 
         Parameters
         ----------
@@ -207,13 +207,13 @@ class System:
             if not there.any():
                 moved = np.inf
             else:
-                moved = float(np.abs(coarse - fine)[there].max())
+                moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2)))
             if moved <= tolerance:
                 return now
             now, coarse = finer, fine
             if places.n_steps(now.max_step).sum() > _MOST_STEPS + len(places.rows):
                 raise ParameterError(
-                    "rates", f"readings still move by {moved:.3g} {self.simulator.unit} when the step is halved",
+                    "rates", f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
                     "a law that can be integrated in some thousand steps: set max_step_s, or use simulate with an integrator of your own",
                 )  # fmt: skip
 

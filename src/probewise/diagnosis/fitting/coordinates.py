@@ -81,6 +81,11 @@ class CalibratedSensor(ABC):
         """What its SSF is, in words."""
 
     @property
+    def in_bulk(self) -> bool:
+        """Each sample has its own cost."""
+        return False
+
+    @property
     def exchangeable(self) -> bool:
         """Whether its Gaussians can trade names."""
         return False

@@ -76,6 +76,11 @@ class Null(Protocol):
         return False
 
     @property
+    def in_bulk(self) -> bool:
+        """Whether predictions of many samples cost little more than one; by default they do not."""
+        return False
+
+    @property
     def starts(self) -> FloatArray:
         """Coordinates to fit from, (n_starts, n_params)."""
         ...

@@ -23,7 +23,7 @@ from probewise.systems.forms import About
 
 __all__ = ["diagnose_system", "fit_system", "prepare_system"]
 
-_STANDS_STILL = 0.02  # noise sds that predictions may move by when the step of the integration is halved
+_STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 _MOST_COMPARED = 2400
 
 

@@ -108,7 +108,7 @@ def _wave(about: About, name: str) -> Iterator[Form]:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
 
     act = _on(name, change)
-    most = _MOST_WAVES if about.system.is_quick else _MOST_WAVES_OF_A_LAW
+    most = _MOST_WAVES if about.system.caller is not None and about.system.in_bulk else _MOST_WAVES_OF_A_LAW
     waves = wave_numbers(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE)
     guess, n = 1e-4 * float(np.nanstd(values)), len(waves)
 

@@ -92,7 +92,11 @@ def test_time_that_falls_within_a_run_is_refused_with_the_row():
 
 def test_the_step_is_halved_until_readings_stand_still():
     simulator = Simulator(
-        "y", "V", {"l_m": _uniform(0.1, 1.0), "c": _uniform(0.0, 0.1)}, law=Law({"phi": 1.0, "omega": 0.0}, _pendulum), time="t_s"
+        "y",
+        "V",
+        {"l_m": _uniform(0.1, 1.0), "c": _uniform(0.0, 0.1)},
+        law=Law({"phi": 1.0, "omega": 0.0}, _pendulum),
+        time="t_s",
     )
     table = _table(np.linspace(0, 10, 30))
     system = System.of(simulator, table)

@@ -32,8 +32,8 @@ def sd_floor(recording: Recording) -> float:
     """Least sd a reading can have: that of rounding to the declared step, or to the lattice on which all readings lie.
 
     Without the lattice's, levels that happen to be on it too would leave no residual, and a law with a tail would take
-    that for the noise. Where there is no lattice the floor is that of the numbers themselves, never a share of the span:
-    a good instrument's noise may be a millionth of it.
+    that for the noise. Where there is no lattice the floor is that of the numbers themselves, never a share of the
+    span: a good instrument's noise may be a millionth of it.
     """
     readings = recording.readings[recording.usable]
     step = recording.plan.instrumentation.step or lattice_step(readings)

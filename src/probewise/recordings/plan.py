@@ -270,11 +270,14 @@ class Recording(ShowsItself):
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        require_plan(self.plan)
+        self._require_plan()
         readings = frozen(self.readings, "readings")
         if readings.shape != (len(self.plan),):
             raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), as the plan")
         object.__setattr__(self, "readings", readings)
+
+    def _require_plan(self) -> None:
+        require_plan(self.plan)
 
     @classmethod
     def from_arrays(
@@ -449,14 +452,18 @@ class Recording(ShowsItself):
         why = {"missing": n_missing, f"outside {range_in_words(inst.min, inst.max)}": n_outside}
         return tuple(f"{n} reading{'s' if n > 1 else ''} {reason}, left out" for reason, n in why.items() if n)
 
-    def unlimited(self) -> Recording:
+    def with_readings(self, readings: FloatArray) -> Self:
+        """Take other readings of the same plan, (n_points,), NaN where one is left out."""
+        return replace(self, readings=readings, notes=())
+
+    def unlimited(self) -> Self:
         """Declare no range: what was calculated without noise may lie beyond it by a little, and counts too."""
         instrumentation = replace(self.plan.instrumentation, min=None, max=None)
-        return Recording(replace(self.plan, instrumentation=instrumentation), self.readings, self.source)
+        return replace(self, plan=replace(self.plan, instrumentation=instrumentation), notes=())
 
-    def take(self, rows: IntArray | BoolArray) -> Recording:
+    def take(self, rows: IntArray | BoolArray) -> Self:
         """Keep these rows, in their order."""
-        return Recording(self.plan.take(rows), self.readings[rows], self.source, self.notes)
+        return replace(self, plan=self.plan.take(rows), readings=self.readings[rows])
 
 
 def require_plan(plan: object) -> None:

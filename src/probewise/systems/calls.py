@@ -43,7 +43,13 @@ class Caller:
 
     @classmethod
     def probed(
-        cls, simulate: Simulate, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, per_run: tuple[str, ...], broadcasts: bool
+        cls,
+        simulate: Simulate,
+        samples: Mapping[str, FloatArray],
+        columns: Mapping[str, NDArray[Any]],
+        *,
+        per_run: tuple[str, ...],
+        broadcasts: bool,
     ) -> Caller:
         """Find out how a function can be called, at some samples (n_samples, 1 or n_points) of its parameters.
 
@@ -66,9 +72,11 @@ class Caller:
         try:
             if _alike(together(samples, columns, strict=True), alone):
                 return together
-        except Exception:  # noqa: S110 - it does not broadcast, whatever it says of that
+        except Exception:
             pass
-        return cls(simulate, broadcasts=False, by_row=frozenset(per_run) | _taken_by_row(one, samples, columns, alone, per_run))
+        return cls(
+            simulate, broadcasts=False, by_row=frozenset(per_run) | _taken_by_row(one, samples, columns, alone, per_run)
+        )
 
     def __call__(
         self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, strict: bool = False
@@ -93,7 +101,10 @@ class Caller:
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
                 own = {name: _row(values, k) for name, values in parameters.items()}
-                table = {name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values for name, values in columns.items()}
+                table = {
+                    name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values
+                    for name, values in columns.items()
+                }
                 try:
                     out[k] = self._one(own, table, n_points)
                 except (ShapeError, KeyboardInterrupt):
@@ -123,7 +134,11 @@ class Caller:
 
 
 def _taken_by_row(
-    one: Caller, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], alone: FloatArray, per_run: tuple[str, ...]
+    one: Caller,
+    samples: Mapping[str, FloatArray],
+    columns: Mapping[str, NDArray[Any]],
+    alone: FloatArray,
+    per_run: tuple[str, ...],
 ) -> frozenset[str]:
     n_points = alone.shape[1]
     taken = []
@@ -135,7 +150,7 @@ def _taken_by_row(
         try:
             if _alike(trial(spread, columns, strict=True), alone):
                 taken.append(name)
-        except Exception:  # noqa: S112 - it takes no array here, whatever it says of that
+        except Exception:
             continue
     return frozenset(taken)
 
@@ -162,14 +177,18 @@ def _alike(first: FloatArray, second: FloatArray) -> bool:
     if first.shape != second.shape or not np.array_equal(np.isfinite(first), np.isfinite(second)):
         return False
     there = np.isfinite(first)
-    return bool(np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0))))
+    return bool(
+        np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0)))
+    )
 
 
 def _of_shape(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
     if readings.shape == wanted:
         return readings
     try:
-        return np.array(np.broadcast_to(readings, wanted)) if readings.ndim == len(wanted) else _refuse(readings, wanted)
+        return (
+            np.array(np.broadcast_to(readings, wanted)) if readings.ndim == len(wanted) else _refuse(readings, wanted)
+        )
     except ValueError:
         return _refuse(readings, wanted)
 

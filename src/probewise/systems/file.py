@@ -17,9 +17,24 @@ from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_o
 __all__ = ["read_simulator"]
 
 _NAMES = (
-    "reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise", "simulate", "states",
-    "rates", "observe", "hold", "max_step_s", "vectorized", "extra",
-)  # fmt: skip
+    "reading",
+    "unit",
+    "time",
+    "time_unit",
+    "run",
+    "parameters",
+    "per_run",
+    "controls",
+    "noise",
+    "simulate",
+    "states",
+    "rates",
+    "observe",
+    "hold",
+    "max_step_s",
+    "vectorized",
+    "extra",
+)
 
 
 def read_simulator(path: str | os.PathLike[str]) -> Simulator:
@@ -35,7 +50,9 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     try:
         code = compile(text, str(path), "exec")
     except (SyntaxError, ValueError) as error:
-        raise FileError(path, f"is no Python: {_briefly(error)}", "a file that Python can run", row=getattr(error, "lineno", None)) from error
+        raise FileError(
+            path, f"is no Python: {_briefly(error)}", "a file that Python can run", row=getattr(error, "lineno", None)
+        ) from error
     said = _run(code, path)
     try:
         return _simulator(said, path, text)
@@ -65,8 +82,13 @@ def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
         states = said.get("states")
         if not isinstance(states, Mapping):
             raise ParameterError("states", states, 'a dict from states to where they start: {"temp_c": 20.0}')
-        law = Law(states, _function(said, "rates"), _function(said, "observe") if "observe" in said else None,
-                  said.get("hold", "previous"), said.get("max_step_s"))  # fmt: skip
+        law = Law(
+            states,
+            _function(said, "rates"),
+            _function(said, "observe") if "observe" in said else None,
+            said.get("hold", "previous"),
+            said.get("max_step_s"),
+        )
     return Simulator(
         reading=_text(said, "reading"),
         unit=_text(said, "unit"),

@@ -67,14 +67,16 @@ class Motion:
             return {}
         free = self.rates(s, p, u, {})
         return {
-            state: np.where(s[state] != 0, np.sign(s[state]), np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0))
+            state: np.where(
+                s[state] != 0, np.sign(s[state]), np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0)
+            )
             for state, size in self.friction.items()
         }
 
     def rates(
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """Rate of each state, with bounds, and with the friction of the `ways` it is told; none where it is told none."""
+        """Rate of each state, with bounds, and with the friction of the `ways` that are given."""
         given = self.law.rates(s, p, u)
         if self._is_bare:
             return given
@@ -138,9 +140,9 @@ class RowsInRuns:
         return place, self.table.scan
 
     def n_steps(self, max_step: float) -> IntArray:
-        """Steps from each place to the next, (n_places - 1,)."""
+        """Count the steps from each place to the next, (n_places - 1,)."""
         longest = self.gaps.max(axis=1, initial=0.0)
-        return np.maximum(np.ceil(longest / max_step - 1e-9), 1).astype(np.int64)
+        return np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
 
 
 def integrate(
@@ -194,14 +196,14 @@ def integrate_states(
     steps = places.n_steps(max_step)
     s = motion.settled({}, dict(start))
     with np.errstate(all="ignore"):
-        given = _Given.of(motion, places, parameters, columns, start)
+        given_there = _Given.of(motion, places, parameters, columns, start)
         for k in range(len(rows)):
             for state, values in s.items():
                 kept[state][:, k] = values
             if k == len(rows) - 1:
                 break
             n = int(steps[k])
-            between, gap = given.between(k), places.gaps[k]
+            between, gap = given_there.between(k), places.gaps[k]
             for i in range(n):
                 s = _stepped(motion, s, between, gap, i / n, 1 / n)
     place, run = places.place
@@ -283,7 +285,8 @@ class _Given:
         first = {name: _at(values, rows[:1])[:, 0] for name, values in columns.items()}
         asked = _Asked(first)
         motion.rates(start, {**constant, **{name: values[:, 0] for name, values in moving.items()}}, asked, {})
-        sloping, held = {}, {}
+        sloping: dict[str, FloatArray] = {}
+        held: dict[str, NDArray[Any]] = {}
         for name in asked.names:
             slopes = name == time or (law.hold == "linear" and columns[name].dtype == np.float64)
             (sloping if slopes else held)[name] = _at(columns[name], rows)
@@ -319,7 +322,9 @@ class _Asked(dict[str, Any]):
         return super().__getitem__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self else default
+        if name in self:
+            self.names[name] = None
+        return super().get(name, default)
 
     def __iter__(self) -> Iterator[str]:
         self.names |= dict.fromkeys(super().keys())
@@ -339,7 +344,7 @@ class _Asked(dict[str, Any]):
 
 
 def _at(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
-    """Look up values (n_points,) or (n_samples, 1 or n_points) at rows (n_places, n_runs); constant ones as (n, 1, 1)."""
+    """Look values up at rows (n_places, n_runs): (n_points,) or (n_samples, n_points); constant ones as (n, 1, 1)."""
     if values.ndim == 1:
         return np.asarray(values[rows][None])
     return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

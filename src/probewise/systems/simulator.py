@@ -160,20 +160,26 @@ class Simulator:
     def __post_init__(self) -> None:
         if (self.simulate is None) == (self.law is None):
             found = "neither" if self.simulate is None else "both"
-            raise ParameterError("simulate, rates", found, "one of them: def simulate(p, data), or states and def rates(s, p, u)")
+            raise ParameterError(
+                "simulate, rates", found, "one of them: def simulate(p, data), or states and def rates(s, p, u)"
+            )
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
         for name in self.per_run:
             if name not in self.parameters:
                 raise ParameterError("per_run", name, f"a parameter: {', '.join(self.parameters)}")
         if self.per_run and self.run is None:
-            raise ParameterError("per_run", list(self.per_run), 'nothing, or run = "..." with the column that names the runs')
+            raise ParameterError(
+                "per_run", list(self.per_run), 'nothing, or run = "..." with the column that names the runs'
+            )
         if self.law is not None:
             if self.time is None:
                 raise ParameterError("time", None, "the column of time, which rates are integrated over")
             for state, start in self.law.states.items():
                 if isinstance(start, str) and start not in self.parameters:
-                    raise ParameterError(f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}")
+                    raise ParameterError(
+                        f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}"
+                    )
         for name in self.extra:
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")

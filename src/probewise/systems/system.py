@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -144,7 +144,7 @@ class System:
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Start from an earlier fit, or else the middle of the prior and points spread evenly over it, (n, n_params)."""
+        """Start from an earlier fit, or else the prior's middle and points spread evenly over it, (n, n_params)."""
         if self.first is not None:
             return self.first[None, :]
         # Additive recurrence by the roots of x^(d+1) = x + 1 (Roberts's sequence): even in any number of dimensions.
@@ -173,11 +173,13 @@ class System:
         """Map normal scores, (n_samples, n_params), to parameters."""
         return self.prior.from_unit_cube(ndtr(z))
 
-    def chain(self, plan: RunTable, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
-        """Add effects; `n_nodes` plays no part."""
+    def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
+        """Add effects; the table and `n_nodes` play no part."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
-    def standing_still(self, table: RunTable, z: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float) -> System:
+    def standing_still(
+        self, table: RunTable, z: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float
+    ) -> System:
         """Halve the step of the integration until predictions at coordinates z move by less than a tolerance, rms.
 
         Parameters
@@ -204,18 +206,16 @@ class System:
             finer = replace(now, max_step=now.max_step / 2)
             fine = finer.chain(table, effects).predict(theta, table)
             there = np.isfinite(coarse) & np.isfinite(fine)
-            if not there.any():
-                moved = np.inf
-            else:
-                moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2)))
+            moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2))) if there.any() else np.inf
             if moved <= tolerance:
                 return now
             now, coarse = finer, fine
             if places.n_steps(now.max_step).sum() > _MOST_STEPS + len(places.rows):
                 raise ParameterError(
-                    "rates", f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
-                    "a law that can be integrated in some thousand steps: set max_step_s, or use simulate with an integrator of your own",
-                )  # fmt: skip
+                    "rates",
+                    f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
+                    "a law that some thousand steps integrate: set max_step_s, or bring simulate with an integrator",
+                )
 
 
 def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
@@ -236,11 +236,11 @@ class SystemChain:
         own = (f"{effect.name}.{name}" for effect in self.effects for name in effect.prior.names)
         return (*self.system.prior.names, *own)
 
-    def predict(self, theta: FloatArray, plan: RunTable) -> FloatArray:
+    def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         return self.read(self.look(theta, plan), theta, plan)
 
-    def look(self, theta: FloatArray, plan: RunTable) -> FloatArray:
+    def look(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate, with the effects on inputs, parameters and rates: (n_samples, n_points)."""
         system = self.system
         columns: Mapping[str, NDArray[Any]] = given_columns(system.simulator, plan)
@@ -255,14 +255,14 @@ class SystemChain:
             readings = integrate(motion, RowsInRuns(plan), parameters, columns, max_step=system.max_step)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
-    def read(self, view: FloatArray, theta: FloatArray, plan: RunTable) -> FloatArray:
+    def read(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
         for effect, columns in self._columns:
             if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
 
-    def _applied(self, stage: Stage, value: Any, theta: FloatArray, plan: RunTable) -> Any:
+    def _applied(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._columns:
             if effect.stage is stage:
                 value = effect.apply(value, theta[:, columns], plan)
@@ -275,4 +275,3 @@ class SystemChain:
             start, end = end, end + len(effect.prior.names)
             pairs.append((effect, slice(start, end)))
         return pairs
-

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
 from probewise.errors import FileError, ParameterError, ShapeError
-from probewise.recordings import Instrumentation
+from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.table import csv_text, is_number, number_text, read_table
 
-__all__ = ["RunTable", "read_run_table", "write_run_table"]
+__all__ = ["RunRecording", "RunTable", "read_run_table", "write_run_table"]
 
 _ONE_RUN = "all"
 
@@ -58,7 +58,9 @@ class RunTable:
         if self.time is not None:
             values = columns[self.time]
             if values.dtype != np.float64 or not np.isfinite(values).all():
-                raise ParameterError(f"column {self.time!r}", "a time that is missing or no number", "a number in each row")
+                raise ParameterError(
+                    f"column {self.time!r}", "a time that is missing or no number", "a number in each row"
+                )
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -114,6 +116,15 @@ class RunTable:
     def with_columns(self, columns: Mapping[str, FloatArray]) -> RunTable:
         """Replace or add columns."""
         return replace(self, columns={**self.columns, **columns})
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecording(Recording):
+    """A table and its readings, in the place of a plan and its readings: it offers what the diagnosis asks of both."""
+
+    def _require_plan(self) -> None:
+        if not isinstance(self.plan, RunTable):
+            raise ParameterError("plan", self.plan, "a RunTable")
 
 
 def _column(name: str, values: Any) -> NDArray[Any]:

@@ -96,7 +96,7 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     `rows` (n_points,) and `out` (n_usable,) are the same readings. What a law says of lost readings is the
     same for every model of the mean, and left out.
     """
-    kept = Recording(recording.plan, np.where(rows, np.nan, recording.readings), recording.source)
+    kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest, own = law.take(~out), law.take(out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     asked = np.flatnonzero(rows & recording.usable)

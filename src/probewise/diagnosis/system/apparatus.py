@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import NullForms, Words
+from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.evidence.held_out import LEAST_ROWS, Parts
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
@@ -73,9 +73,9 @@ class PersonsSystem:
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Bind every form that this table could show, and what may be wrong with its noise."""
         extent = Extent.of(recording)
-        on_noise = {kind.name: kind.for_extent(extent) for kind in _ON_NOISE}
+        on_noise = [effect for kind in _ON_NOISE if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
-        return forms | {name: effect for name, effect in on_noise.items() if effect is not None}
+        return forms | {effect.name: effect for effect in on_noise}
 
     def proposals(self) -> dict[str, NamedEffect[Any]]:
         """Propose short expressions of columns and states."""
@@ -89,7 +89,7 @@ class PersonsSystem:
         """Share the odds out over these effects."""
         return PriorOdds.over(effects)
 
-    def null_forms(self, recording: Recording) -> NullForms:
+    def null_forms(self, recording: Recording) -> Any:
         """There is one: the simulator."""
         raise NotImplementedError("a simulator is its own null")
 
@@ -129,7 +129,7 @@ class PersonsSystem:
         return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
-        """A simulator has none."""
+        """Give no columns: a simulator has no structure finer than itself."""
         return np.zeros((len(usable), 0))
 
     def held_out_parts(self, recording: Recording) -> Parts:
@@ -159,5 +159,3 @@ def _change(values: FloatArray, table: RunTable) -> FloatArray:
 
 def _varies(values: FloatArray) -> bool:
     return values.size > 1 and float(np.ptp(values)) > 1e-12 * max(1e-300, float(np.abs(values).max()))
-
-

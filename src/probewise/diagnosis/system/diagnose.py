@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.engine import Thorough, diagnose_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.noise.law import NoiseLaw, white
+from probewise.diagnosis.noise.law import white
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import PersonsSystem
@@ -18,7 +18,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.recordings import Instrumentation
 from probewise.recordings.plan import Plan, Recording
-from probewise.systems import RunTable, Simulator, System
+from probewise.systems import RunRecording, RunTable, Simulator, System
 from probewise.systems.forms import About
 
 __all__ = ["diagnose_system", "fit_system", "prepare_system"]
@@ -63,7 +63,7 @@ def prepare_system(simulator: Simulator, table: RunTable) -> Prepared:
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
-def recording_of(simulator: Simulator, table: RunTable) -> Recording:
+def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     """Take the predicted column as readings; the simulator gets every row, at most 2,400 readings are compared.
 
     Raises
@@ -81,7 +81,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> Recording:
             unit=simulator.unit, min=low, max=high, step=simulator.noise.step, controls=simulator.controls
         ),
     )
-    whole = Recording(cast(Plan, own), np.array(readings), simulator.source)
+    whole = RunRecording(cast(Plan, own), np.array(readings), simulator.source)
     usable = np.flatnonzero(whole.usable)
     if len(usable) <= _MOST_COMPARED:
         return whole
@@ -89,7 +89,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> Recording:
     kept = np.full(len(readings), np.nan)
     chosen = usable[np.arange(len(usable)) % every < stretch]
     kept[chosen] = readings[chosen]
-    return Recording(cast(Plan, own), kept, simulator.source)
+    return RunRecording(cast(Plan, own), kept, simulator.source)
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:

@@ -19,7 +19,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary, out_of_vocabulary
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import NamedEffect
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plan import Plan
 
 __all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
 
@@ -167,7 +167,7 @@ def _size(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> fl
         gain = holder.evidence[noise].log_z - holder.evidence[tuple(n for n in noise if n != name)].log_z
         return math.sqrt(2 * max(gain, 0.0))
     model, stay = found.model.without(name)
-    noise_free = Recording(prepared.recording.plan, prepared.spread(found.predicted)).unlimited()
+    noise_free = prepared.recording.with_readings(prepared.spread(found.predicted)).unlimited()
     # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
     sigma = float(law.scale(law(found.residuals)[:, None])[0])
     refit = fit(model, noise_free, found.z[stay], law.at_least(sigma), max_steps=12, tolerance=0.02)

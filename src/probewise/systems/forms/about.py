@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.priors import LogUniform
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.motion import RowsInRuns, integrate_states
@@ -17,6 +17,7 @@ from probewise.systems.table import RunTable
 
 __all__ = ["About"]
 
+_ANY = Uniform(0.0, 1.0)  # prior of a trial, which no one asks for
 _UNSEEN = 1e-7  # of the noise: what changes the readings by less changes nothing
 _TYPICAL = 1.0  # noise sds, rms, that an effect of typical size changes the readings by
 _LEAST, _MOST = 0.05, 1e4  # noise sds, rms, between which sizes without an amplitude are looked for
@@ -42,7 +43,8 @@ class About:
     @cached_property
     def predicted(self) -> FloatArray:
         """Predicted readings, (n_points,)."""
-        return self.system.chain(self.table, ()).predict(self.theta, self.table)[0]
+        predicted: FloatArray = self.system.chain(self.table, ()).predict(self.theta, self.table)[0]
+        return predicted
 
     @cached_property
     def states(self) -> dict[str, FloatArray]:
@@ -52,7 +54,9 @@ class About:
             return {}
         columns = given_columns(system.simulator, self.table)
         parameters = system.parameters(self.theta, self.table)
-        found = integrate_states(system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step)
+        found = integrate_states(
+            system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step
+        )
         return {state: values[0] for state, values in found.items()}
 
     @property
@@ -79,7 +83,17 @@ class About:
 
     def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Rms change of the readings by each setting (n_settings, n_params), in sds; NaN where it is not finite."""
-        trial = Form("trial", stage, dict.fromkeys(map(str, range(settings.shape[1]))), (), (), act, settings, (), lambda mean, sd: "")
+        trial = Form(
+            "trial",
+            stage,
+            dict.fromkeys(map(str, range(settings.shape[1])), _ANY),
+            (),
+            (),
+            act,
+            settings,
+            (),
+            lambda mean, sd: "",
+        )
         chain = replace(self.system.chain(self.table, ()), effects=(trial,))
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         change = chain.predict(theta, self.table) - self.predicted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -95,7 +96,7 @@ class Form:
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     expression: str = ""
 
-    @property
+    @cached_property
     def prior(self) -> Product:
         """Prior of its parameters."""
         return Product(self.marginals)
@@ -110,7 +111,7 @@ class Form:
         return self.act(value, theta, plan)
 
     def bank(self) -> FloatArray:
-        """Settings to look for it with, (n_entries, n_columns, n_params)."""
+        """Lay out settings to look for it with, (n_entries, n_columns, n_params)."""
         return self.entries
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

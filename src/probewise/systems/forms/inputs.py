@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
@@ -37,8 +38,8 @@ def driving_columns(about: About) -> list[str]:
         spread = float(np.nanstd(values))
         if name == own.reading or name == own.noise.sd or spread == 0:
             continue
-        rms = about.rms(Stage.INPUT, _on(name, lambda c, theta, _: c + theta[:, :1]), np.array([[_NUDGE * spread]]))
-        wave = about.rms(Stage.INPUT, _on(name, lambda c, theta, _: c * (1 + theta[:, :1])), np.array([[_NUDGE]]))
+        rms = about.rms(Stage.INPUT, _on(name, _raised), np.array([[_NUDGE * spread]]))
+        wave = about.rms(Stage.INPUT, _on(name, _scaled), np.array([[_NUDGE]]))
         if max(float(rms[0]), float(wave[0])) > 0:
             out.append(name)
     return out
@@ -50,23 +51,47 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
     for name in driving_columns(about):
         values = table.covariates[name]
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
-        yield from _linear(about, f"input_offset:{name}", _on(name, lambda c, th, _: c + th[:, :1]), 1e-4 * spread, name,
-                           lambda m, s, c=name: f"{c} is {with_unit(m[0], s[0], '')} more than it says", name)  # fmt: skip
-        yield from _linear(about, f"input_gain:{name}", _on(name, lambda c, th, _: c * (1 + th[:, :1])), 1e-4, "1",
-                           lambda m, s, c=name: f"{c} is {with_unit(1 + m[0], s[0], '')} times what it says", name)  # fmt: skip
+        says = partial(_said, f"{name} is {{}} more than it says")
+        yield from _linear(about, f"input_offset:{name}", _on(name, _raised), 1e-4 * spread, name, says, name)
+        says = partial(_said, f"{name} is {{}} more than it says, for each unit of it")
+        yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
         yield from _ceiling(about, name, low, high)
-        yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name,
-                          lambda m, s, c=name: f"{c} does nothing within {with_unit(m[0], s[0], '')} of 0", name)  # fmt: skip
+        says = partial(_said, f"{name} does nothing within {{}} of 0")
+        yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
         if _turns_back(values, table):
-            yield from _sized(about, f"backlash:{name}", "width", _on(name, play), high - low, name,
-                              lambda m, s, c=name: f"{c} has {with_unit(m[0], s[0], '')} of play", "previous", name)  # fmt: skip
+            says = partial(_said, f"{name} has {{}} of play")
+            yield from _sized(
+                about, f"backlash:{name}", "width", _on(name, play), high - low, name, says, "previous", name
+            )
         yield from _wave(about, name)
         if table.has_time:
-            yield from _sized(about, f"input_delay:{name}", "tau_s", _on(name, late), about.duration, about.time_unit,
-                              lambda m, s, c=name: f"{c} acts {with_unit(m[0], s[0], about.time_unit)} late", "previous", name)  # fmt: skip
+            says = partial(_said, f"{name} acts {{}} {about.time_unit} late")
+            yield from _sized(
+                about,
+                f"input_delay:{name}",
+                "tau_s",
+                _on(name, late),
+                about.duration,
+                about.time_unit,
+                says,
+                "previous",
+                name,
+            )
     if time is not None:
-        yield from _linear(about, "clock_drift", _on(time, lambda c, th, _: c * (1 + th[:, :1])), 1e-5, "1",
-                           lambda m, s: f"the clock runs {with_unit(1 + m[0], s[0], '')} times as fast as it says", "time")  # fmt: skip
+        says = partial(_said, "the clock gains {} for each unit of time that it says")
+        yield from _linear(about, "clock_drift", _on(time, _scaled), 1e-5, "1", says, "time")
+
+
+def _said(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
+    return sentence.format(with_unit(mean[0], sd[0], ""))
+
+
+def _raised(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    return np.asarray(c + theta[:, :1])
+
+
+def _scaled(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    return np.asarray(c * (1 + theta[:, :1]))
 
 
 def _on(name: str, change: Change) -> Act:
@@ -76,7 +101,17 @@ def _on(name: str, change: Change) -> Act:
 def _linear(about: About, name: str, act: Act, guess: float, unit: str, says: Say, *covariates: str) -> Iterator[Form]:
     typical = about.typical(Stage.INPUT, act, np.full((1, 1, 1), guess), guess)
     if typical is not None:
-        yield Form(name, Stage.INPUT, {"a": HeavyTailed(typical)}, (unit,), covariates, act, np.full((1, 1, 1), typical), (0,), says)
+        yield Form(
+            name,
+            Stage.INPUT,
+            {"a": HeavyTailed(typical)},
+            (unit,),
+            covariates,
+            act,
+            np.full((1, 1, 1), typical),
+            (0,),
+            says,
+        )
 
 
 def _sized(
@@ -94,9 +129,17 @@ def _ceiling(about: About, name: str, low: float, high: float) -> Iterator[Form]
     rms = about.rms(Stage.INPUT, act, levels[:, None])
     if np.nanmax(rms, initial=0.0) > 0.05:
         yield Form(
-            f"input_saturation:{name}", Stage.INPUT, {"level": Uniform(float(levels[-1]), high)}, (name,), (name,), act,
-            levels[:, None, None], (), lambda m, s: f"{name} goes no further than {with_unit(m[0], s[0], '')}", absent={0: high},
-        )  # fmt: skip
+            f"input_saturation:{name}",
+            Stage.INPUT,
+            {"level": Uniform(float(levels[-1]), high)},
+            (name,),
+            (name,),
+            act,
+            levels[:, None, None],
+            (),
+            lambda m, s: f"{name} goes no further than {with_unit(m[0], s[0], '')}",
+            absent={0: high},
+        )
 
 
 def _wave(about: About, name: str) -> Iterator[Form]:
@@ -119,13 +162,25 @@ def _wave(about: About, name: str) -> Iterator[Form]:
     typical = about.typical(Stage.INPUT, act, entries(guess), guess)
     if typical is None:
         return
-    marginals = {"a": HeavyTailed(typical, positive=True), "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
-                 "phase": Uniform(-2 * np.pi, 2 * np.pi)}  # fmt: skip
+    marginals = {
+        "a": HeavyTailed(typical, positive=True),
+        "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
+        "phase": Uniform(-2 * np.pi, 2 * np.pi),
+    }
     yield Form(
-        f"periodic_error:{name}", Stage.INPUT, marginals, (name, name, "rad"), (name,), act, entries(typical), (0,),
-        lambda m, s: f"{name} is off by up to {with_unit(m[0], s[0], '')} again and again, every {with_unit(m[1], s[1], '')}",
+        f"periodic_error:{name}",
+        Stage.INPUT,
+        marginals,
+        (name, name, "rad"),
+        (name,),
+        act,
+        entries(typical),
+        (0,),
+        lambda m, s: (
+            f"{name} is off by up to {with_unit(m[0], s[0], '')} again and again, every {with_unit(m[1], s[1], '')}"
+        ),
         joined=wave_joined,
-    )  # fmt: skip
+    )
 
 
 def _dead(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -20,6 +20,7 @@ _MOST_MOMENTS = 512
 _MOST_WAVES = 1024
 _PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns: one of a phase's names lies far from both ends
 
+
 @dataclass(frozen=True, eq=False)
 class Modulation:
     """A function of the rows: `over(theta, table)` (n_samples, n_points), 0 where the amplitude is 0.
@@ -37,8 +38,10 @@ class Modulation:
     moments: Moments | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
+
 def _one(size: float) -> FloatArray:
     return np.full((1, 1, 1), size)
+
 
 def drift(table: RunTable, time_unit: str) -> Modulation:
     """In proportion to time as printed: a t."""
@@ -47,11 +50,10 @@ def drift(table: RunTable, time_unit: str) -> Modulation:
         marginals=lambda size: {"a": HeavyTailed(size)},
         entries=_one,
         units=lambda unit: (f"{unit}/{time_unit}",),
-        says=lambda what, unit, mean, sd: (
-            f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}"
-        ),
+        says=lambda what, unit, mean, sd: f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
     )
+
 
 def column(name: str, table: RunTable) -> Modulation:
     """In proportion to a column, counted from its mean over the recording: a (C - mean C)."""
@@ -69,6 +71,7 @@ def column(name: str, table: RunTable) -> Modulation:
         says=lambda what, unit, mean, sd: f"{what} changes by {with_unit(mean[0], sd[0], unit)} per unit of {name}",
         covariates=(name,),
     )
+
 
 def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
     """At a change point: a 1(t > t0), by time where it was recorded, else by row."""
@@ -95,6 +98,7 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
         moments=moments,
     )
 
+
 def per_run(table: RunTable) -> Modulation:
     """From run to run: a_run, in a run that the recording does not hold 0."""
     names = table.scan_names
@@ -119,8 +123,9 @@ def per_run(table: RunTable) -> Modulation:
         amplitudes=tuple(range(len(names))),
     )
 
+
 def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES, rows_each: int = 2) -> FloatArray:
-    """Lay out waves per unit of a covariate: up to one in `rows_each` rows, twice for each that the reach tells apart."""
+    """Lay out waves per unit of a covariate: up to one in `rows_each` rows, twice as many as its reach tells apart."""
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
     gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
@@ -129,11 +134,13 @@ def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES,
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
     return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
 
+
 def wave_joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
     """Join the amounts of sine and cosine into amplitude and phase; the number of waves stays."""
     size = entry[0, 0]
     sine, cosine = amounts[0] * size, amounts[1] * size
     return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])
+
 
 def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation:
     """One sinusoid in time: a sin(2 pi hz t + phase)."""
@@ -151,8 +158,10 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
     return Modulation(
         over=over,
         marginals=lambda size: {
-            "a": HeavyTailed(size, positive=True), "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)), "phase": _PHASE,
-        },  # fmt: skip
+            "a": HeavyTailed(size, positive=True),
+            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "phase": _PHASE,
+        },
         entries=entries,
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
@@ -161,4 +170,3 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
         covariates=("time",),
         joined=wave_joined,
     )
-

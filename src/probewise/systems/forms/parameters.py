@@ -37,7 +37,9 @@ def forms_on_parameters(about: About) -> Iterator[Form]:
         for column in columns:
             how = modulations.column(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
-            yield from modulated(about, f"depends:{name}:{column}", Stage.PARAMETER, how, _shifting(name, how), size, name, "")
+            yield from modulated(
+                about, f"depends:{name}:{column}", Stage.PARAMETER, how, _shifting(name, how), size, name, ""
+            )
 
 
 def _shifting(name: str, how: Modulation) -> Act:

@@ -106,14 +106,18 @@ def _of_reading(about: About) -> Iterator[Form]:
     level = _atom(own.reading, about.predicted, own.unit, centred=True)
     known: list[FloatArray] = []
     for term in _terms([*atoms, level]):
+
         def act(value: FloatArray, theta: FloatArray, table: RunTable, term: _Term = term) -> FloatArray:
             def look_up(name: str) -> Any:
                 return value if name == own.reading else table.time_s if name == table.time else table.covariates[name]
+
             return np.asarray(value + theta[:, :1] * term.of(look_up))
 
         shape = act(about.predicted[None, :], np.ones((1, 1)), about.table)[0] - about.predicted
         if _is_new(shape, known):
-            yield from _proposal(about, "reading", own.reading, Stage.OFFSET, act, term, {c: True for c in term_names(term)})
+            yield from _proposal(
+                about, "reading", own.reading, Stage.OFFSET, act, term, {c: True for c in term_names(term)}
+            )
 
 
 def _of_rate(about: About, state: str) -> Iterator[Form]:
@@ -122,6 +126,7 @@ def _of_rate(about: About, state: str) -> Iterator[Form]:
     atoms += [_atom(name, values, name, centred=True) for name, values in _columns(about).items()]
     known: list[FloatArray] = []
     for term in _terms(atoms):
+
         def act(value: Motion, theta: FloatArray, table: RunTable, term: _Term = term) -> Motion:
             a = theta[:, :1]
             return value.with_term(state, lambda s, p, u: a * term.of(lambda name: s[name] if name in s else u[name]))
@@ -156,11 +161,20 @@ def _proposal(
     typical = about.typical(stage, act, np.full((1, 1, 1), guess), guess)
     if typical is None or not np.isfinite(typical):
         return
-    where = tuple(f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c for c in columns)
+    where = tuple(
+        f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c for c in columns
+    )
     text = f"a {term.text}"
     what = target if side == "reading" else f"the rate of {target}"
     yield Form(
-        f"formula:{side}:{target}:{term.text}", stage, {"a": HeavyTailed(typical)}, ("",), where, act, np.full((1, 1, 1), typical), (0,),
+        f"formula:{side}:{target}:{term.text}",
+        stage,
+        {"a": HeavyTailed(typical)},
+        ("",),
+        where,
+        act,
+        np.full((1, 1, 1), typical),
+        (0,),
         lambda mean, sd: f"{what} lacks {text}, a = {with_unit(mean[0], sd[0], '')}: a proposal, not a known effect",
         expression=text,
-    )  # fmt: skip
+    )

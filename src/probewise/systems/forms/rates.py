@@ -12,7 +12,7 @@ from probewise.effects import HeavyTailed
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Act, Form, with_unit
+from probewise.systems.forms.form import Form, with_unit
 from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.motion import Limit, Motion
 
@@ -31,21 +31,38 @@ def forms_on_rates(about: About) -> Iterator[Form]:
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"
         yield from _term(about, f"damping:{state}", state, state, lambda r: -r, size, f"a force -a {state}")
-        yield from _term(about, f"drag:{state}", state, state, lambda r: -np.abs(r) * r, size**2, f"a drag -a |{state}| {state}")
-        yield from _term(about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant force a", unit=own)
+        yield from _term(
+            about, f"drag:{state}", state, state, lambda r: -np.abs(r) * r, size**2, f"a drag -a |{state}| {state}"
+        )
+        yield from _term(
+            about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant force a", unit=own
+        )
         yield from _friction(about, state, own)
         yield from _wave(about, state, own)
         yield from _limit(about, state, values)
         for other, there in about.states.items():
             scale = float(np.nanmax(np.abs(there))) or 1.0
-            yield from _term(about, f"cubic:{state}:{other}", state, other, lambda r: -(r**3), scale**3, f"a term -a {other}^3")
-            yield from _term(about, f"quadratic:{state}:{other}", state, other, lambda r: -(r**2), scale**2, f"a term -a {other}^2")
+            yield from _term(
+                about, f"cubic:{state}:{other}", state, other, lambda r: -(r**3), scale**3, f"a term -a {other}^3"
+            )
+            yield from _term(
+                about, f"quadratic:{state}:{other}", state, other, lambda r: -(r**2), scale**2, f"a term -a {other}^2"
+            )
             if other != state:
-                yield from _term(about, f"coupling:{state}:{other}", state, other, lambda r: -r, scale, f"a term -a {other}")
+                yield from _term(
+                    about, f"coupling:{state}:{other}", state, other, lambda r: -r, scale, f"a term -a {other}"
+                )
 
 
 def _term(
-    about: About, name: str, state: str, other: str, term: Callable[[Any], Any], scale: float, what: str, unit: str | None = None
+    about: About,
+    name: str,
+    state: str,
+    other: str,
+    term: Callable[[Any], Any],
+    scale: float,
+    what: str,
+    unit: str | None = None,
 ) -> Iterator[Form]:
     def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
         a = theta[:, :1]
@@ -57,9 +74,16 @@ def _term(
         return
     unit = f"rate of {state}" if unit is None else unit
     yield Form(
-        name, Stage.RATE, {"a": HeavyTailed(typical)}, (unit,), (f"state:{other}", "time"), act, np.full((1, 1, 1), typical), (0,),
+        name,
+        Stage.RATE,
+        {"a": HeavyTailed(typical)},
+        (unit,),
+        (f"state:{other}", "time"),
+        act,
+        np.full((1, 1, 1), typical),
+        (0,),
         lambda mean, sd: f"the rate of {state} lacks {what}, a = {with_unit(mean[0], sd[0], '')}",
-    )  # fmt: skip
+    )
 
 
 def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
@@ -70,10 +94,19 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(
-            f"friction:{state}", Stage.RATE, {"a": prior}, (unit,), (f"state:{state}", "level"), act, entries, (),
-            lambda mean, sd: f"dry friction of {with_unit(mean[0], sd[0], '')} slows {state} down, and holds it where it rests",
+            f"friction:{state}",
+            Stage.RATE,
+            {"a": prior},
+            (unit,),
+            (f"state:{state}", "level"),
+            act,
+            entries,
+            (),
+            lambda mean, sd: (
+                f"dry friction of {with_unit(mean[0], sd[0], '')} slows {state} down, and holds it where it rests"
+            ),
             absent={0: 0.0},
-        )  # fmt: skip
+        )
 
 
 def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
@@ -82,7 +115,7 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
 
     def act(value: Motion, theta: FloatArray, rows: Any) -> Motion:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
-        return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[time] + phase))
+        return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[str(time)] + phase))
 
     n = len(waves)
 
@@ -94,14 +127,26 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
     typical = about.typical(Stage.RATE, act, entries(guess), guess)
     if typical is None:
         return
-    marginals = {"a": HeavyTailed(typical, positive=True), "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
-                 "phase": Uniform(-2 * np.pi, 2 * np.pi)}  # fmt: skip
+    marginals = {
+        "a": HeavyTailed(typical, positive=True),
+        "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+        "phase": Uniform(-2 * np.pi, 2 * np.pi),
+    }
     yield Form(
-        f"periodic_forcing:{state}", Stage.RATE, marginals, (unit, f"1/{about.time_unit}", "rad"), ("time",), act, entries(typical), (0,),
-        lambda mean, sd: f"the rate of {state} lacks a force that swings by {with_unit(mean[0], sd[0], '')}, "
-        f"once in {1 / mean[1]:.4g} {about.time_unit}",
+        f"periodic_forcing:{state}",
+        Stage.RATE,
+        marginals,
+        (unit, f"1/{about.time_unit}", "rad"),
+        ("time",),
+        act,
+        entries(typical),
+        (0,),
+        lambda mean, sd: (
+            f"the rate of {state} lacks a force that swings by {with_unit(mean[0], sd[0], '')}, "
+            f"once in {1 / mean[1]:.4g} {about.time_unit}"
+        ),
         joined=wave_joined,
-    )  # fmt: skip
+    )
 
 
 def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
@@ -115,9 +160,17 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
     rms = about.rms(Stage.RATE, act, levels[:, None])
     if np.nanmax(rms, initial=0.0) > 0.05:
         yield Form(
-            f"limit:{state}", Stage.RATE, {"level": Uniform(float(levels[-1]), high)}, (state,), (f"state:{state}", "level"), act,
-            levels[:, None, None], (), lambda mean, sd: f"{state} stops at {with_unit(mean[0], sd[0], '')}", absent={0: high + (high - low)},
-        )  # fmt: skip
+            f"limit:{state}",
+            Stage.RATE,
+            {"level": Uniform(float(levels[-1]), high)},
+            (state,),
+            (f"state:{state}", "level"),
+            act,
+            levels[:, None, None],
+            (),
+            lambda mean, sd: f"{state} stops at {with_unit(mean[0], sd[0], '')}",
+            absent={0: high + (high - low)},
+        )
 
 
 def _rate_scale(about: About, state: str) -> float:
@@ -130,5 +183,3 @@ def _rate_scale(about: About, state: str) -> float:
         rates.append(np.diff(values[rows])[there] / gaps[there])
     joined = np.concatenate(rates)
     return float(np.sqrt(np.mean(joined**2))) or 1.0
-
-

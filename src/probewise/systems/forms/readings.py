@@ -22,16 +22,33 @@ _N_SIZES = 9
 
 
 def modulated(
-    about: About, name: str, stage: Stage, how: Modulation, act: Act, guess: float, what: str, unit: str, covariates: tuple[str, ...] = ()
+    about: About,
+    name: str,
+    stage: Stage,
+    how: Modulation,
+    act: Act,
+    guess: float,
+    what: str,
+    unit: str,
+    covariates: tuple[str, ...] = (),
 ) -> Iterator[Form]:
     """Bind a modulation to what `act` adds it to; nothing where the readings do not change."""
     entries = how.entries(guess)
     typical = about.typical(stage, act, entries, guess)
     if typical is not None and np.isfinite(typical) and typical > 0:
         yield Form(
-            name, stage, how.marginals(typical), how.units(unit), (*how.covariates, *covariates), act, how.entries(typical),
-            how.amplitudes, lambda mean, sd: how.says(what, unit, mean, sd), moments=how.moments, joined=how.joined,
-        )  # fmt: skip
+            name,
+            stage,
+            how.marginals(typical),
+            how.units(unit),
+            (*how.covariates, *covariates),
+            act,
+            how.entries(typical),
+            how.amplitudes,
+            lambda mean, sd: how.says(what, unit, mean, sd),
+            moments=how.moments,
+            joined=how.joined,
+        )
 
 
 def forms_on_readings(about: About) -> Iterator[Form]:
@@ -48,7 +65,15 @@ def forms_on_readings(about: About) -> Iterator[Form]:
     for kind, how in over.items():
         yield from modulated(about, f"offset_{kind}", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
         yield from modulated(
-            about, f"gain_{kind}", Stage.GAIN, how, _scaling(how, zero), about.sd / span, f"the gain of {reading}", "1", ("level",)
+            about,
+            f"gain_{kind}",
+            Stage.GAIN,
+            how,
+            _scaling(how, zero),
+            about.sd / span,
+            f"the gain of {reading}",
+            "1",
+            ("level",),
         )
     if table.has_time:
         how = modulations.wave(table, about.time_unit)
@@ -93,11 +118,19 @@ def _settling(about: About) -> Iterator[Form]:
     entries[:, :, 0] = typical
     unit, time_unit, reading = about.unit, about.time_unit, about.system.simulator.reading
     yield Form(
-        "settling", Stage.OFFSET, {"a": HeavyTailed(typical), "tau_s": LogUniform(shortest, 2 * longest)}, (unit, time_unit),
-        ("time", "run"), act, entries, (0,),
-        lambda mean, sd: f"{reading} starts each run {with_unit(mean[0], sd[0], unit)} off and settles "
-        f"with a time constant of {with_unit(mean[1], sd[1], time_unit)}",
-    )  # fmt: skip
+        "settling",
+        Stage.OFFSET,
+        {"a": HeavyTailed(typical), "tau_s": LogUniform(shortest, 2 * longest)},
+        (unit, time_unit),
+        ("time", "run"),
+        act,
+        entries,
+        (0,),
+        lambda mean, sd: (
+            f"{reading} starts each run {with_unit(mean[0], sd[0], unit)} off and settles "
+            f"with a time constant of {with_unit(mean[1], sd[1], time_unit)}"
+        ),
+    )
 
 
 def _lag(about: About) -> Iterator[Form]:
@@ -116,10 +149,19 @@ def _lag(about: About) -> Iterator[Form]:
     if prior is not None:
         time_unit = about.time_unit
         yield Form(
-            "lag", Stage.LAG, {"tau_s": prior}, (time_unit,), ("previous",), act, _between(prior), (),
-            lambda mean, sd: f"{about.system.simulator.reading} follows with a time constant of {with_unit(mean[0], sd[0], time_unit)}",
+            "lag",
+            Stage.LAG,
+            {"tau_s": prior},
+            (time_unit,),
+            ("previous",),
+            act,
+            _between(prior),
+            (),
+            lambda mean, sd: (
+                f"{about.system.simulator.reading} follows with a lag of {with_unit(mean[0], sd[0], time_unit)}"
+            ),
             absent={0: 0.0},
-        )  # fmt: skip
+        )
 
 
 def _delay(about: About) -> Iterator[Form]:
@@ -133,14 +175,21 @@ def _delay(about: About) -> Iterator[Form]:
     if prior is not None:
         time_unit = about.time_unit
         yield Form(
-            "delay", Stage.LAG, {"tau_s": prior}, (time_unit,), ("previous",), act, _between(prior), (),
+            "delay",
+            Stage.LAG,
+            {"tau_s": prior},
+            (time_unit,),
+            ("previous",),
+            act,
+            _between(prior),
+            (),
             lambda mean, sd: f"{about.system.simulator.reading} comes {with_unit(mean[0], sd[0], time_unit)} late",
             absent={0: 0.0},
-        )  # fmt: skip
+        )
 
 
 def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
-    """Look up values (1 or n_samples, n) of times (n,) as they were earlier `by` (n_samples,), on straight lines between.
+    """Look values (1 or n_samples, n) of times (n,) up as they were earlier `by` (n_samples,), on straight lines.
 
     Before the first time they are as at the first.
     """
@@ -156,7 +205,7 @@ def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
 
 
 def way(values: FloatArray, table: RunTable) -> FloatArray:
-    """Sign of the way values (n_samples, n_points) are moving, within runs; a rest keeps the last, the first the next."""
+    """Give the sign of motion of values (n_samples, n_points) within runs; a rest keeps the last, the first the next."""
     out = np.zeros_like(values)
     for rows in table.rows_by_scan():
         if len(rows) < 2:
@@ -180,9 +229,18 @@ def _hysteresis(about: About) -> Iterator[Form]:
         return
     unit, reading = about.unit, about.system.simulator.reading
     yield Form(
-        "hysteresis", Stage.OFFSET, {"a": HeavyTailed(about.sd)}, (unit,), ("previous",), act, np.full((1, 1, 1), about.sd), (0,),
-        lambda mean, sd: f"{reading} reads {with_unit(2 * mean[0], 2 * sd[0], unit)} more on its way up than on its way down",
-    )  # fmt: skip
+        "hysteresis",
+        Stage.OFFSET,
+        {"a": HeavyTailed(about.sd)},
+        (unit,),
+        ("previous",),
+        act,
+        np.full((1, 1, 1), about.sd),
+        (0,),
+        lambda mean, sd: (
+            f"{reading} reads {with_unit(2 * mean[0], 2 * sd[0], unit)} more on its way up than on its way down"
+        ),
+    )
 
 
 def _bend(about: About) -> Iterator[Form]:
@@ -205,10 +263,19 @@ def _bend(about: About) -> Iterator[Form]:
     entries[:, :, 0] = typical
     unit, reading = about.unit, about.system.simulator.reading
     yield Form(
-        "nonlinearity", Stage.BEND, {"a": HeavyTailed(typical), "power": LogUniform(0.4, 5.0)}, ("1", "1"), ("level",), act, entries, (0,),
-        lambda mean, sd: f"{reading} is bent: y + a (hi - lo) (z^power - z), z = (y - lo) / (hi - lo) from {low:.4g} to {high:.4g} {unit}, "
-        f"a {with_unit(mean[0], sd[0], '')}, power {with_unit(mean[1], sd[1], '')}",
-    )  # fmt: skip
+        "nonlinearity",
+        Stage.BEND,
+        {"a": HeavyTailed(typical), "power": LogUniform(0.4, 5.0)},
+        ("1", "1"),
+        ("level",),
+        act,
+        entries,
+        (0,),
+        lambda mean, sd: (
+            f"{reading} is bent: y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at {high:.4g} {unit}, "
+            f"a {with_unit(mean[0], sd[0], '')}, power {with_unit(mean[1], sd[1], '')}"
+        ),
+    )
 
 
 def _ceiling(about: About) -> Iterator[Form]:
@@ -225,10 +292,17 @@ def _ceiling(about: About) -> Iterator[Form]:
     levels = top - span * np.geomspace(0.005, 0.9, 16)
     unit, reading = about.unit, about.system.simulator.reading
     yield Form(
-        "saturation", Stage.SATURATION, {"level": Uniform(float(levels[-1]), float(top + 0.02 * span))}, (unit,), ("level",), capped,
-        levels[:, None, None], (),
-        lambda mean, sd: f"{reading} stops at {with_unit(mean[0], sd[0], unit)}", absent={0: float(top + 1e3 * span)},
-    )  # fmt: skip
+        "saturation",
+        Stage.SATURATION,
+        {"level": Uniform(float(levels[-1]), float(top + 0.02 * span))},
+        (unit,),
+        ("level",),
+        capped,
+        levels[:, None, None],
+        (),
+        lambda mean, sd: f"{reading} stops at {with_unit(mean[0], sd[0], unit)}",
+        absent={0: float(top + 1e3 * span)},
+    )
 
 
 def _between(prior: LogUniform) -> FloatArray:

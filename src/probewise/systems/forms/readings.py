@@ -205,7 +205,7 @@ def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
 
 
 def way(values: FloatArray, table: RunTable) -> FloatArray:
-    """Give the sign of motion of values (n_samples, n_points) within runs; a rest keeps the last, the first the next."""
+    """Give the sign of motion of values (n_samples, n_points) within runs; a rest keeps the last, a start the next."""
     out = np.zeros_like(values)
     for rows in table.rows_by_scan():
         if len(rows) < 2:

@@ -11,7 +11,7 @@ from types import CodeType
 from typing import Any
 
 from probewise.errors import FileError, ParameterError
-from probewise.recordings.table import read_text
+from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
 
 __all__ = ["read_simulator"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
-from probewise.recordings.table import csv_text, is_number, number_text, read_table
+from probewise.recordings.table import csv_text, number_text, read_table
 
 __all__ = ["RunRecording", "RunTable", "read_run_table", "write_run_table"]
 
@@ -151,16 +151,15 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
         raise FileError(path, "there is no row below the header", "one row for each reading")
     table.require(*(name for name in (time, run) if name is not None))
     columns: dict[str, NDArray[Any]] = {}
-    for name, cells in table.columns.items():
-        numeric = all(is_number(c) or c.lower() in ("", "nan") for c in cells) and any(is_number(c) for c in cells)
+    for name in table.columns:
         if name == time:
             columns[name] = table.numbers(name)
-        elif numeric and name != run:
-            columns[name] = table.numbers(name, missing=True)
-        else:
-            columns[name] = np.array(cells)
-    if run is not None and all(is_number(c) for c in table.columns[run]):
-        columns[run] = table.numbers(run)
+            continue
+        try:
+            values = table.numbers(name, missing=name != run)
+            columns[name] = values if np.isfinite(values).any() else np.array(table.cells(name))
+        except FileError:
+            columns[name] = np.array(table.cells(name))
     return RunTable(columns, time, run)
 
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, floats
+from probewise._arrays import FloatArray, floats
 from probewise.calibration.distinct import DistinctRows
 from probewise.calibration.sensor_file import FittedSensor, require_sensor
-from probewise.effects import log_density, variance
+from probewise.effects import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_described, require_plan
 from probewise.scene import KnownScene
-from probewise.sensor import NoiseLevel
 
 __all__ = ["predict"]
 
@@ -101,34 +98,10 @@ def predict(
     n_samples, n_points = len(theta), len(plan)
     per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))
 
-    total, squares, of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
-    log_sum = np.full(int(scored.sum()), -np.inf)
-    center: FloatArray | None = None
+    mixture = PredictiveMixture(recorded, scored, step)
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
-        mean = model.predict(theta[block], plan)
         level = chain.noise_level(theta[block], plan, sensor.noise_sd[block, None])
-        if center is None:
-            center = mean.mean(axis=0)  # Sums about a nearby value keep their digits.
-        total += (mean - center).sum(axis=0)
-        squares += ((mean - center) ** 2).sum(axis=0)
-        of_noise += np.broadcast_to(variance(level), mean.shape).sum(axis=0)
-        if step is not None:  # the pooled sd holds what a declared rounding adds
-            level = replace(level, step=np.full((1, 1), step))
-        if log_sum.size:
-            log_p = log_density(_of_rows(level, scored), recorded[scored], mean[:, scored])
-            log_sum = np.logaddexp(log_sum, np.logaddexp.reduce(log_p, axis=0))
-    shift = total / n_samples
-    spread = np.maximum(squares / n_samples - shift**2, 0.0)
-    scores = np.full(n_points, np.nan)
-    scores[scored] = log_sum - math.log(n_samples)
-    base = np.zeros(n_points) if center is None else center
-    return Prediction(plan, base + shift, np.sqrt(spread + of_noise / n_samples), scores, recorded)
-
-
-def _of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
-    """Keep the noise of some rows."""
-    if level.sd.shape[-1] == 1:
-        return level
-    return replace(level, sd=level.sd[:, rows])
+        mixture.add(model.predict(theta[block], plan), level)
+    return Prediction(plan, *mixture.finished(), recorded)

@@ -139,6 +139,7 @@ def diagnose_prepared(
         where=where,
         next_measurement=asked,
         report=VerdictReport(reason, found, noise, weighings, remainder, formula),
+        apparatus=prepared.apparatus,
     )
 
 

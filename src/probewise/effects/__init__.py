@@ -28,6 +28,7 @@ from probewise.effects.noise_law import NoiseRows, draw_readings, log_density, v
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.rails import BentRails, MissingTooth
+from probewise.effects.predictive_mixture import PredictiveMixture
 from probewise.effects.readings import Hysteresis, Lag
 from probewise.effects.reflection import Reflection
 from probewise.effects.response import Nonlinearity
@@ -158,6 +159,7 @@ __all__ = [
     "Outliers",
     "PeriodicPositionError",
     "PositionScale",
+    "PredictiveMixture",
     "Quantisation",
     "Reflection",
     "Saturation",

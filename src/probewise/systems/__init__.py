@@ -1,12 +1,15 @@
 """Any simulator over any table: what a person brings, and the chain of what it may leave out."""
 
 from probewise.systems.file import read_simulator
+from probewise.systems.fitted import FittedSystem, read_fitted_system, write_fitted_system
+from probewise.systems.prediction import SystemPrediction, as_recording, predict_system
 from probewise.systems.simulator import Extra, Law, Noise, Simulator
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, read_run_table, write_run_table
 
 __all__ = [
     "Extra",
+    "FittedSystem",
     "Law",
     "Noise",
     "RunRecording",
@@ -14,7 +17,12 @@ __all__ = [
     "Simulator",
     "System",
     "SystemChain",
+    "SystemPrediction",
+    "as_recording",
+    "predict_system",
+    "read_fitted_system",
     "read_run_table",
     "read_simulator",
+    "write_fitted_system",
     "write_run_table",
 ]

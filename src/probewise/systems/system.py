@@ -63,9 +63,9 @@ class System:
         ShapeError
             If it does not give one reading for each row.
         """
-        for what, name in (("reading", simulator.reading), *(("controls", name) for name in simulator.controls)):
+        for name in simulator.controls:
             if name not in table.columns:
-                raise ParameterError(what, name, f"a column of the table: {', '.join(table.columns)}")
+                raise ParameterError("controls", name, f"a column of the table: {', '.join(table.columns)}")
         bare = cls(simulator, table.scan_names)
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])

@@ -6,7 +6,7 @@ from probewise.diagnosis import Diagnosis, Judged, VerdictReport
 from probewise.diagnosis.judgement.judged import Hypothesis
 
 JUDGED = Judged("clean", (), 0.4, (Hypothesis((), 1.0),))
-FOUND = Diagnosis(None, JUDGED, None, (), None, VerdictReport("All is explained.", (), None))
+FOUND = Diagnosis(None, JUDGED, None, (), None, VerdictReport("All is explained.", (), None), None)
 
 
 def test_what_is_read_most_is_at_hand():

@@ -16,9 +16,8 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
-from probewise.recordings import Instrumentation
-from probewise.recordings.plan import Plan, Recording
-from probewise.systems import RunRecording, RunTable, Simulator, System
+from probewise.recordings.plan import Recording
+from probewise.systems import RunRecording, RunTable, Simulator, System, as_recording
 from probewise.systems.forms import About
 
 __all__ = ["diagnose_system", "fit_system", "prepare_system"]
@@ -71,17 +70,10 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     ParameterError
         If the column is missing, or holds no number.
     """
-    readings = table.columns.get(simulator.reading)
-    if readings is None or readings.dtype != np.float64:
-        raise ParameterError("reading", simulator.reading, f"a column of numbers: {', '.join(table.covariates)}")
-    low, high = simulator.noise.range
-    own = replace(
-        table,
-        instrumentation=Instrumentation(
-            unit=simulator.unit, min=low, max=high, step=simulator.noise.step, controls=simulator.controls
-        ),
-    )
-    whole = RunRecording(cast(Plan, own), np.array(readings), simulator.source)
+    if simulator.reading not in table.columns:
+        raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
+    whole = as_recording(simulator, table)
+    own, readings = whole.plan, whole.readings
     usable = np.flatnonzero(whole.usable)
     if len(usable) <= _MOST_COMPARED:
         return whole
@@ -89,7 +81,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     kept = np.full(len(readings), np.nan)
     chosen = usable[np.arange(len(usable)) % every < stretch]
     kept[chosen] = readings[chosen]
-    return RunRecording(cast(Plan, own), kept, simulator.source)
+    return RunRecording(own, kept, simulator.source)
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from probewise._display import ShowsItself
 from probewise.diagnosis.advice.next_scans import NextMeasurement
+from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.repair import Repair
@@ -74,6 +75,8 @@ class Diagnosis(ShowsItself):
         What to read next; None where nothing would tell more.
     report
         The verdict in words, and the numbers of effects and noise.
+    apparatus
+        What took the readings.
     """
 
     recording: Recording
@@ -82,6 +85,7 @@ class Diagnosis(ShowsItself):
     where: tuple[Place, ...]
     next_measurement: NextMeasurement | None
     report: VerdictReport
+    apparatus: Apparatus
 
     @property
     def verdict(self) -> Verdict:

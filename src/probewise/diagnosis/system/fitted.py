@@ -1,0 +1,55 @@
+"""The models of a diagnosis as files carry them: a simulator with posterior samples of what it leaves out."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import cast
+
+import numpy as np
+
+from probewise.diagnosis.repair.samples import ModelSamples
+from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.systems import FittedSystem, RunTable, write_run_table
+from probewise.systems.forms.again import recorded
+
+__all__ = ["calibrated_of", "repaired_of"]
+
+
+def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
+    """Take the repaired model of a diagnosis: the simulator with what it leaves out.
+
+    Raises
+    ------
+    TypeError
+        If it is the diagnosis of a light sensor.
+    """
+    return _fitted(diagnosis, diagnosis.repaired)
+
+
+def calibrated_of(diagnosis: Diagnosis) -> FittedSystem:
+    """Take the null of a diagnosis: the simulator alone; what is raised is as in `repaired_of`."""
+    return _fitted(diagnosis, diagnosis.null)
+
+
+def _fitted(diagnosis: Diagnosis, model: ModelSamples) -> FittedSystem:
+    apparatus = diagnosis.apparatus
+    if not isinstance(apparatus, PersonsSystem):
+        raise TypeError("a light sensor's models are written as sensor.json; a simulator's alone as system/1")
+    system, table = apparatus.system, cast(RunTable, diagnosis.recording.plan)
+    level = diagnosis.repair.before.readings[diagnosis.recording.usable]
+    about = apparatus.about
+    return FittedSystem(
+        system.simulator,
+        names=tuple(model.chain.names),
+        samples=model.theta,
+        noise_sd=model.noise_sd,
+        effects=model.effects,
+        absent=model.absent,
+        level=(float(np.min(level)), float(np.max(level))),
+        max_step=system.max_step,
+        known=recorded(about) if model.effects else None,
+        recording=hashlib.sha256(write_run_table(table).encode()).hexdigest()[:16],
+        source=diagnosis.recording.source,
+        notes=diagnosis.recording.notes,
+    )

@@ -1,0 +1,71 @@
+"""What posterior samples predict of new readings: mean, sd, and the density of what was read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.effects.noise_law import log_density, variance
+from probewise.sensor.stages import NoiseLevel
+
+__all__ = ["PredictiveMixture"]
+
+
+@dataclass(eq=False)
+class PredictiveMixture:
+    """Gather the predictions of posterior samples, some at a time: their mixture is the law of a new reading.
+
+    Parameters
+    ----------
+    readings
+        What was read, (n_points,).
+    scored
+        Which readings are scored, (n_points,).
+    step
+        What readings are rounded to, where that was declared.
+    """
+
+    readings: FloatArray
+    scored: BoolArray
+    step: float | None = None
+    n_samples: int = field(default=0, init=False)
+    _center: FloatArray | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        n_points = len(self.readings)
+        self._total, self._squares, self._of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
+        self._log_sum = np.full(int(self.scored.sum()), -np.inf)
+
+    def add(self, mean: FloatArray, level: NoiseLevel) -> None:
+        """Add noise-free predictions, (n_samples, n_points), and the noise about them."""
+        if self._center is None:
+            self._center = mean.mean(axis=0)  # Sums about a nearby value keep their digits.
+        self.n_samples += len(mean)
+        self._total += (mean - self._center).sum(axis=0)
+        self._squares += ((mean - self._center) ** 2).sum(axis=0)
+        self._of_noise += np.broadcast_to(variance(level), mean.shape).sum(axis=0)
+        if self.step is not None:  # the pooled sd holds what a declared rounding adds
+            level = replace(level, step=np.full((1, 1), self.step))
+        if self._log_sum.size:
+            log_p = log_density(_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
+            self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
+
+    def finished(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Give mean, sd and log density of each reading, (n_points,); the density is NaN where none is scored."""
+        n = self.n_samples
+        shift = self._total / n
+        spread = np.maximum(self._squares / n - shift**2, 0.0)
+        scores = np.full(len(self.readings), np.nan)
+        scores[self.scored] = self._log_sum - math.log(n)
+        base = np.zeros(len(self.readings)) if self._center is None else self._center
+        return base + shift, np.sqrt(spread + self._of_noise / n), scores
+
+
+def _of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
+    """Keep the noise of some rows."""
+    if level.sd.shape[-1] == 1:
+        return level
+    return replace(level, sd=level.sd[:, rows])

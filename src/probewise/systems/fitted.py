@@ -1,0 +1,239 @@
+"""A simulator fitted to a recording, repaired or not, and the file that carries it to predictions."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
+from probewise._version import __version__
+from probewise.effects import EFFECTS
+from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
+from probewise.recordings import strict_json, write_text_atomically
+from probewise.recordings.table import read_text
+from probewise.systems.forms.again import Recorded
+from probewise.systems.simulator import Simulator
+from probewise.systems.table import RunTable
+
+__all__ = ["FORMAT", "MIN_SAMPLES", "FittedSystem", "read_fitted_system", "write_fitted_system"]
+
+FORMAT = "system/1"
+MIN_SAMPLES = 500
+_WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"
+
+
+@dataclass(frozen=True, eq=False)
+class FittedSystem:
+    """Hold what a recording taught about a simulator and what it leaves out.
+
+    Parameters
+    ----------
+    simulator
+        The simulator.
+    names
+        Parameters, one a column of `samples`: the simulator's, `name[run]` where a run has its own, then
+        "<effect>.<parameter>".
+    samples
+        Equally weighted posterior samples, (n_samples, n_params), at least 500.
+    noise_sd
+        Sd of one new reading, one for each sample, (n_samples,).
+    effects
+        Names of the effects, those on the noise too.
+    absent
+        Samples that do without an effect, (n_samples,), by the effect.
+    level
+        Least and largest reading that was predicted of the recording.
+    max_step
+        Longest step of the integration, where there is a law.
+    known
+        What the effects were bound about; None where there is none.
+    recording
+        Fingerprint of the recording.
+    source
+        Its file's name.
+    notes
+        Why the result should be used with care.
+    version
+        The package's.
+    """
+
+    simulator: Simulator
+    names: tuple[str, ...]
+    samples: FloatArray
+    noise_sd: FloatArray
+    effects: tuple[str, ...] = ()
+    absent: Mapping[str, BoolArray] = field(default_factory=dict)
+    level: tuple[float, float] = (0.0, 1.0)
+    max_step: float = math.inf
+    known: Recorded | None = None
+    recording: str = ""
+    source: str = ""
+    notes: tuple[str, ...] = ()
+    version: str = __version__
+
+    def __post_init__(self) -> None:
+        samples, noise_sd = frozen(self.samples), frozen(self.noise_sd)
+        if samples.ndim != 2 or samples.shape[1] != len(self.names):
+            raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(self.names)})")
+        if len(samples) < MIN_SAMPLES:
+            raise ParameterError("n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
+        if noise_sd.shape != (len(samples),):
+            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one a sample")
+        require_finite("samples", samples)
+        require_finite("noise_sd", noise_sd)
+        if not (noise_sd > 0).all():
+            raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
+        own = {name.partition("[")[0] for name in self.names if name.partition("[")[0] in self.simulator.parameters}
+        lacking = [name for name in self.simulator.parameters if name not in own]
+        if lacking:
+            raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
+        if self.known is None and not set(self.effects) <= set(EFFECTS):
+            raise ParameterError("effects", list(self.effects), "none without the recording that they were bound about")
+        for name, without in self.absent.items():
+            if name not in self.effects or without.shape != (len(samples),):
+                raise ParameterError("absent", name, f"effects of the model, each with {len(samples)} truth values")
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "noise_sd", noise_sd)
+
+    def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Central interval of each parameter that holds `mass`."""
+        low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
+        return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
+
+    def to_json(self) -> str:
+        """Write it as strict JSON, format "system/1"."""
+        interval = self.interval()
+        mean, median, sd = (of(self.samples, axis=0).tolist() for of in (np.mean, np.median, np.std))
+        document = {
+            "format": FORMAT,
+            "version": self.version,
+            "simulator": {
+                "source": self.simulator.source,
+                "fingerprint": self.simulator.fingerprint,
+                "reading": self.simulator.reading,
+                "unit": self.simulator.unit,
+                "max_step": self.max_step if math.isfinite(self.max_step) else None,
+            },
+            "recording": {"fingerprint": self.recording, "source": self.source},
+            "parameters": [
+                {"name": n, "mean": mean[k], "median": median[k], "sd": sd[k], "interval95": list(interval[n])}
+                for k, n in enumerate(self.names)
+            ],
+            "effects": list(self.effects),
+            "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
+            "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},
+            "level": list(self.level),
+            "bound_about": None if self.known is None else _known_json(self.known),
+            "notes": list(self.notes),
+            "samples": self.samples.tolist(),
+        }
+        return json.dumps(document, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, simulator: Simulator, path: object = "repaired.json") -> FittedSystem:
+        """Read what `to_json` wrote; `path` is what error messages call it.
+
+        Raises
+        ------
+        FileError
+            If the text is damaged, of another format, or of another simulator than this one.
+        """
+        try:
+            document = strict_json(text)
+        except (ValueError, RecursionError) as error:
+            raise FileError(path, f"no strict JSON ({error})", _WHAT) from error
+        found = document.get("format") if isinstance(document, dict) else None
+        if found == "sensor/1":
+            raise FileError(path, "the model of a light sensor", f"{_WHAT}; for a sensor leave --simulator out")
+        if found != FORMAT:
+            raise FileError(path, f"format {found!r}", f"{FORMAT!r}: {_WHAT}")
+        try:
+            own = document["simulator"]
+            if own["fingerprint"] != simulator.fingerprint:
+                raise FileError(
+                    path, f"fitted with {own['source']} of fingerprint {own['fingerprint']}",
+                    f"that file unchanged; {simulator.source} has {simulator.fingerprint}, diagnose again with it",
+                )  # fmt: skip
+            samples, known = np.array(document["samples"], dtype=np.float64), document["bound_about"]
+            return cls(
+                simulator,
+                names=tuple(each["name"] for each in document["parameters"]),
+                samples=samples,
+                noise_sd=np.array(document["noise"]["sd"], dtype=np.float64),
+                effects=tuple(document["effects"]),
+                absent={name: _marks(rows, len(samples)) for name, rows in document["absent"].items()},
+                level=(float(document["level"][0]), float(document["level"][1])),
+                max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
+                known=None if known is None else _known(known, simulator),
+                recording=str(document["recording"]["fingerprint"]),
+                source=str(document["recording"]["source"]),
+                notes=tuple(document["notes"]),
+                version=str(document["version"]),
+            )
+        except FileError:
+            raise
+        except (KeyError, IndexError) as error:
+            raise FileError(path, f"no entry {error}", f"every entry of {_WHAT}") from error
+        except (ProbewiseError, ValueError, TypeError, AttributeError) as error:
+            raise FileError(path, f"contents that do not fit together ({error})", f"undamaged: {_WHAT}") from error
+
+
+def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> FittedSystem:
+    """Read repaired.json or calibrated.json, for the simulator that it was made with.
+
+    Raises
+    ------
+    FileError
+        If the file is missing or damaged, or was made with another simulator.
+    """
+    return FittedSystem.from_json(read_text(Path(path), _WHAT), simulator, path)
+
+
+def write_fitted_system(fitted: FittedSystem, path: str | os.PathLike[str]) -> None:
+    """Write repaired.json or calibrated.json in one piece or not at all."""
+    write_text_atomically(path, fitted.to_json())
+
+
+def _known_json(known: Recorded) -> dict[str, Any]:
+    table = known.table
+    return {
+        "time": table.time,
+        "run": table.run,
+        "columns": {name: _column_json(values) for name, values in table.columns.items()},
+        "predicted": known.predicted.tolist(),
+        "states": {name: values.tolist() for name, values in known.states.items()},
+    }
+
+
+def _column_json(values: NDArray[Any]) -> list[Any]:
+    """Write a column; a number that is missing is null."""
+    if values.dtype != np.float64:
+        return [str(value) for value in values.tolist()]
+    return [value if math.isfinite(value) else None for value in values.tolist()]
+
+
+def _known(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
+    columns = {name: _column(values) for name, values in document["columns"].items()}
+    table = RunTable(columns, document["time"], document["run"])
+    states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
+    return Recorded(table, np.array(document["predicted"], dtype=np.float64), states)
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    if any(isinstance(value, str) for value in values):
+        return np.array([str(value) for value in values])
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _marks(rows: list[int], n_samples: int) -> BoolArray:
+    out = np.zeros(n_samples, dtype=np.bool_)
+    out[np.array(rows, dtype=np.int64)] = True
+    return out

@@ -1,0 +1,117 @@
+"""Forms bound again, without a fit: a form takes what it needs from the recording that it was bound about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects import PROPOSAL
+from probewise.errors import ParameterError
+from probewise.sensor import Stage
+from probewise.systems.forms import forms_of
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Act, Form
+from probewise.systems.forms.proposals import proposals
+from probewise.systems.simulator import Simulator
+from probewise.systems.system import System
+from probewise.systems.table import RunTable
+
+__all__ = ["Recorded", "forms_again", "own_of_runs", "recorded"]
+
+_OWN_OF_RUNS = ("offset_per_run", "gain_per_run", "differs")
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What forms were bound about: the table, and what the fit there predicts of readings and states, (n_points,)."""
+
+    table: RunTable
+    predicted: FloatArray
+    states: Mapping[str, FloatArray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _AsRecorded(About):
+    """A fit that is known by what it predicted: nothing is simulated, and sizes, which only priors need, are any."""
+
+    known: Recorded | None = None
+
+    @property
+    def predicted(self) -> FloatArray:  # type: ignore[override]
+        assert self.known is not None
+        return self.known.predicted
+
+    @property
+    def states(self) -> dict[str, FloatArray]:  # type: ignore[override]
+        assert self.known is not None
+        return dict(self.known.states)
+
+    def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+        return np.ones(len(settings))
+
+    def typical(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
+        return guess
+
+    def sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
+        return float(tried[0]), float(tried[-1])
+
+
+def recorded(about: About) -> Recorded:
+    """Take what forms were bound about."""
+    return Recorded(about.table, about.predicted, about.states)
+
+
+def forms_again(names: Iterable[str], simulator: Simulator, known: Recorded, *, more_runs: Iterable[str] = ()) -> dict[str, Form]:
+    """Bind forms as they were bound about a recording, by name; names that are no form's are left out.
+
+    Parameters
+    ----------
+    names
+        Of forms and proposals.
+    simulator
+        The simulator.
+    known
+        What they were bound about.
+    more_runs
+        Runs that the recording does not hold: forms with a value for each run get one for each of these too.
+
+    Raises
+    ------
+    ParameterError
+        If a proposal cannot be bound again.
+    """
+    wanted = list(dict.fromkeys(names))
+    system = System(simulator, known.table.scan_names)
+    about = _AsRecorded(system, known.table, np.zeros(system.n_params), 1.0, known)
+    found = forms_of(about)
+    longer = _longer(known.table, list(more_runs))
+    if longer is not known.table:
+        system = System(simulator, longer.scan_names)
+        rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
+        beyond = Recorded(longer, known.predicted[rows], {name: values[rows] for name, values in known.states.items()})
+        again = forms_of(_AsRecorded(system, longer, np.zeros(system.n_params), 1.0, beyond))
+        found |= {name: form for name, form in again.items() if own_of_runs(name)}
+    if any(name.startswith(PROPOSAL) for name in wanted):
+        found |= {form.name: form for form in proposals(about)}
+    lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
+    if lost:
+        raise ParameterError("effects", lost[0], "a term that this version can bind again")
+    return {name: found[name] for name in wanted if name in found}
+
+
+def own_of_runs(name: str) -> bool:
+    """Tell whether a form has a value for each run."""
+    return name.partition(":")[0] in _OWN_OF_RUNS
+
+
+def _longer(table: RunTable, more_runs: list[str]) -> RunTable:
+    """Repeat the last row in each of further runs."""
+    if not more_runs or table.run is None:
+        return table
+    rows = np.append(np.arange(len(table)), np.full(len(more_runs), len(table) - 1))
+    of_rows = [table.scan_names[k] for k in table.scan.tolist()]
+    longer = table.take(rows)
+    return replace(longer, columns={**longer.columns, table.run: np.array([*of_rows, *more_runs])})

@@ -1,0 +1,205 @@
+"""Predict the rows of any table by a fitted simulator."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects import EFFECTS, NamedEffect, PredictiveMixture
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.progress import Progress, silent
+from probewise.recordings import Instrumentation
+from probewise.recordings.plan import Plan
+from probewise.sensor import AnyEffect, NoiseLevel, Stage
+from probewise.systems.fitted import FittedSystem
+from probewise.systems.forms.again import forms_again, own_of_runs
+from probewise.systems.simulator import Simulator
+from probewise.systems.system import System, SystemChain
+from probewise.systems.table import RunRecording, RunTable
+
+__all__ = ["SystemPrediction", "as_recording", "predict_system"]
+
+_BLOCK = 2_000_000  # numbers held at once by one pass over some samples
+
+
+@dataclass(frozen=True, eq=False)
+class SystemPrediction:
+    """What each row's reading is expected to be, (n_points,).
+
+    `sd` is that of one new reading, noise and parameters together; `log_density` is the natural logarithm of the
+    predictive density of that row's reading alone, per unit of the reading, NaN where none is scored. `n_failed`
+    samples of `n_samples` were left out: there the simulator gives no finite readings.
+    """
+
+    table: RunTable
+    readings: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+    log_density: FloatArray
+    n_samples: int
+    n_failed: int = 0
+
+
+def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
+    """Give a table the unit, range and step of a reading; readings are NaN where there is no such column.
+
+    Raises
+    ------
+    ParameterError
+        If the column of the readings holds texts.
+    """
+    low, high = simulator.noise.range
+    own = replace(
+        table,
+        instrumentation=Instrumentation(
+            unit=simulator.unit, min=low, max=high, step=simulator.noise.step, controls=simulator.controls
+        ),
+    )
+    readings = table.columns.get(simulator.reading)
+    if readings is None:
+        readings = np.full(len(table), np.nan)
+    elif readings.dtype != np.float64:
+        bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_float(cell)), 0)
+        found = f"{readings[bad]!s} in row {bad + 2}"
+        raise ParameterError(f"reading {simulator.reading!r}", found, "a number in each row, or nothing where it is missing")
+    return RunRecording(cast(Plan, own), np.array(readings), simulator.source)
+
+
+def _is_float(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return text == ""
+    return True
+
+
+def predict_system(
+    fitted: FittedSystem, table: RunTable, *, rng: np.random.Generator, progress: Progress = silent
+) -> SystemPrediction:
+    """Predict every row of a table, and score its readings where there are any.
+
+    The law of a new reading is the mixture, over the posterior samples, of that sample's noise about its prediction,
+    with all effects of the model. Of a run that was not recorded each sample draws what is a run's own: a `per_run`
+    parameter from its prior; a value that an effect gives each run from a Student-t about the values of the recorded
+    runs of that sample, as wide as they scatter, with as many degrees of freedom as there are runs and one more.
+
+    Parameters
+    ----------
+    fitted
+        The fitted simulator.
+    table
+        What to predict, n_points rows, with the columns that the simulator and the effects read.
+    rng
+        Source of randomness, for runs that were not recorded.
+    progress
+        Told how many samples are done.
+
+    Raises
+    ------
+    ParameterError
+        If a column is missing, or the simulator gives finite readings for no sample.
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        If the simulator gives no finite readings for some samples.
+    """
+    recording = as_recording(fitted.simulator, table)
+    own = cast(RunTable, recording.plan)
+    system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
+    chain = system.chain(own, bound_effects(fitted, own))
+    theta = _theta(fitted, chain, rng=rng)
+    mixture = PredictiveMixture(recording.readings, recording.usable, own.instrumentation.step)
+    n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
+    n_failed = 0
+    for first in range(0, n_samples, per_block):
+        progress("predicting", first, n_samples)
+        block = theta[first : first + per_block]
+        mean = chain.predict(block, own)
+        there = np.isfinite(mean).all(axis=1)
+        n_failed += int((~there).sum())
+        if there.any():
+            sd = fitted.noise_sd[first : first + per_block][there, None]
+            mixture.add(mean[there], _noise_level(fitted, chain, block[there], mean[there], sd, own))
+    if n_failed == n_samples:
+        raise ParameterError("simulate" if system.caller else "rates", "no finite reading", "finite readings of these rows for some of the samples")
+    if n_failed:
+        warnings.warn(
+            f"{n_failed} of {n_samples} samples are left out: the simulator gives no finite readings of these rows for them",
+            DoubtfulResultWarning,
+            stacklevel=2,
+        )
+    mean, sd, scores = mixture.finished()
+    return SystemPrediction(own, recording.readings, mean, sd, scores, n_samples, n_failed)
+
+
+def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
+    """Bind the effects of a fitted simulator to the runs of a table."""
+    forms: Mapping[str, Any] = {}
+    if fitted.known is not None:
+        lacking = _columns_read(fitted.effects, fitted.known.table) - set(table.columns)
+        if lacking:
+            name = min(lacking)
+            raise ParameterError("columns", name, f"a table with this column, which an effect of the model reads; it has {', '.join(table.columns)}")
+        new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
+        forms = forms_again(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
+    out = []
+    for name in fitted.effects:
+        if name not in forms and name not in EFFECTS:
+            raise ParameterError("effects", name, "an effect that this version can bind again; diagnose anew with it")
+        out.append(forms[name] if name in forms else EFFECTS[name]())
+    return cast(list[NamedEffect[Any]], out)
+
+
+def _columns_read(effects: Sequence[str], table: RunTable) -> set[str]:
+    """Columns of the recording that are the targets of effects."""
+    return {part for name in effects for part in name.split(":")[1:] if part in table.columns}
+
+
+def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator) -> FloatArray:
+    """Lay the samples out by the columns of a chain, with draws of what belongs to runs that were not recorded."""
+    at = {name: k for k, name in enumerate(fitted.names)}
+    n, system = len(fitted.samples), chain.system
+    out = np.empty((n, len(chain.names)))
+    for k, name in enumerate(chain.names):
+        if name in at:
+            out[:, k] = fitted.samples[:, at[name]]
+        elif name in system.marginals:
+            # One draw for each sample, spread evenly over the prior.
+            out[:, k] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
+        else:
+            effect = next(own for own in fitted.effects if own_of_runs(own) and name.startswith(f"{own}."))
+            known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
+            out[:, k] = _of_another_run(known, rng=rng)
+    return out
+
+
+def _of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+    """Draw what a further run has, where these do: (n_samples, n_runs) -> (n_samples,).
+
+    The mean and the variance of the runs are unknown; of the variance is believed beforehand as much as two more runs
+    would show that scatter like these.
+    """
+    n_runs = known.shape[1]
+    spread = known.std(axis=1, ddof=1) if n_runs > 1 else np.abs(known[:, 0])
+    return np.asarray(known.mean(axis=1) + spread * np.sqrt(1 + 1 / n_runs) * rng.standard_t(n_runs + 1, len(known)))
+
+
+def _noise_level(
+    fitted: FittedSystem, chain: SystemChain, theta: FloatArray, mean: FloatArray, sd: FloatArray, table: RunTable
+) -> NoiseLevel:
+    """Noise of each reading: its sd, then the effects on it."""
+    low, high = fitted.level
+    seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
+    level = NoiseLevel(sd, np.zeros((1, 1)), seen=seen)
+    end = chain.system.n_params
+    for effect in cast(Sequence[AnyEffect], chain.effects):
+        start, end = end, end + len(effect.prior.names)
+        if effect.stage is Stage.NOISE:
+            level = effect.apply(level, theta[:, start:end], cast(Any, table))
+    return level

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import is_journal, journal_recording
 from probewise.cli._output import check_out_directory, staged
+from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -28,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=a_path,
         nargs="+",
         metavar="REC.csv",
-        help="recording, its JSON beside it, or the journal.jsonl of an explore run; several are diagnosed together",
+        help="recording, its JSON beside it, or the journal.jsonl of an explore run; with --simulator any table; "
+        "several are diagnosed together",
     )
     parser.add_argument(
         "--sensor",
@@ -36,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S.json",
         help="an earlier calibration, whose posterior becomes the prior",
     )
+    add_simulator(parser)
     parser.add_argument(
         "--thorough",
         action="store_true",
@@ -47,6 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose and write diagnosis.json, both models, the next plan, report.html and the figures."""
+    if arguments.simulator is not None:
+        return diagnose_simulator(arguments)
     from functools import partial
 
     import numpy as np
@@ -136,4 +142,4 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *
         write_bytes_atomically(folder / name, png)
 
 
-VERB = Verb("diagnose", "Find which physics the sensor model leaves out of recordings.", add_arguments, run)
+VERB = Verb("diagnose", "Find which physics a sensor model, or a simulator of your own, leaves out of recordings.", add_arguments, run)

@@ -24,7 +24,10 @@ from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.system.diagnose import diagnose_system, notes_on_calls
+from probewise.diagnosis.system.fitted import calibrated_of, repaired_of
 from probewise.diagnosis.unknown_shape import SensorAndShape
+from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
 from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound, ParameterFound
@@ -40,6 +43,7 @@ __all__ = [
     "Diagnosis",
     "EffectAudit",
     "EffectFound",
+    "Formula",
     "Hypothesis",
     "Improvement",
     "Judged",
@@ -54,6 +58,7 @@ __all__ = [
     "PlanAudit",
     "Predicted",
     "PriorOdds",
+    "Remainder",
     "Repair",
     "SensorAndShape",
     "SensorPrior",
@@ -65,11 +70,15 @@ __all__ = [
     "audit_json",
     "audit_plan",
     "audit_recorded",
+    "calibrated_of",
     "diagnose",
+    "diagnose_system",
     "diagnosis_json",
     "diagnosis_schema",
     "join",
     "model_with",
+    "notes_on_calls",
     "p_in_words",
+    "repaired_of",
     "weigh_thoroughly",
 ]

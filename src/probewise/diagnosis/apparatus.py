@@ -28,12 +28,16 @@ __all__ = ["Apparatus", "Words"]
 class Words:
     """How sentences speak of an apparatus: what it is that is calibrated, and how to get a signal where there is none.
 
-    `settles_nothing` says of two aliased effects that no reading tells them apart.
+    `settles_nothing` says of two aliased effects that no reading tells them apart; `run` is what rows that belong
+    together are called; `next_plan` is the file of the readings to take next, `model` that of the repaired model.
     """
 
     null: str
     find_signal: str
     settles_nothing: str
+    run: str = "scan"
+    next_plan: str = "next_plan.csv"
+    model: str = "sensor.json"
 
 
 class Apparatus(Protocol):
@@ -91,4 +95,12 @@ class Apparatus(Protocol):
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> Sequence[Command]:
         """List what could be measured next, where `level` (n_points,) is what is expected of the plan's readings."""
+        ...
+
+    def one_after_another(self, commands: Sequence[Any], after: Plan) -> Plan:
+        """Set commands behind each other, each as if it came next after a plan: to predict all of them at once."""
+        ...
+
+    def in_turn(self, commands: Sequence[Any], after: Plan) -> Plan:
+        """Take commands one after the other, as they are to be carried out after a plan."""
         ...

@@ -107,6 +107,12 @@ def public_name(name: str) -> str:
     return name.removesuffix(AGAIN)
 
 
+def spoken_name(name: str) -> str:
+    """Write a name without underscores, but for those of a person's own columns, parameters and states."""
+    own = public_name(name)
+    return own if ":" in own else own.replace("_", " ")
+
+
 def first_of(name: str) -> str | None:
     """Name the effect that has to be there before this one; None where it can stand alone."""
     return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
@@ -180,5 +186,6 @@ __all__ = [
     "log_density",
     "public_name",
     "sign_of_move",
+    "spoken_name",
     "variance",
 ]

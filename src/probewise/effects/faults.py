@@ -111,5 +111,5 @@ class Dropouts(NoiseEffect):
         """Say how many readings are lost, and to which value."""
         return (
             f"readings are lost: {give_or_take(mean[0], sd[0], factor=100)} % of them read "
-            f"{give_or_take(mean[1], sd[1])} whatever lies under the sensor"
+            f"{give_or_take(mean[1], sd[1])} whatever there was to be read"
         )

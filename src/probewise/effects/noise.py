@@ -49,7 +49,7 @@ class CorrelatedNoise(NoiseEffect):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how alike neighbours are."""
         return (
-            f"the noise of neighbouring readings of a scan correlates by {give_or_take(mean[0], sd[0])}: "
+            f"the noise of neighbouring readings correlates by {give_or_take(mean[0], sd[0])}: "
             "readings repeat each other's errors"
         )
 
@@ -82,10 +82,10 @@ class SignalDependentNoise(NoiseEffect):
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much louder white is than black."""
+        """Say how much louder the highest level is than the lowest."""
         return (
-            f"the variance of the noise on white is {give_or_take(1 + mean[0], sd[0])} times that on black: "
-            "the noise grows with the light"
+            f"the noise grows with the level: its variance at the highest is {give_or_take(1 + mean[0], sd[0])} times "
+            "that at the lowest"
         )
 
 

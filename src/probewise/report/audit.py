@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from probewise.diagnosis import PlanAudit
 from probewise.diagnosis.audit.detectability import ALIAS, LAMBDA, LEAST_NATS
+from probewise.effects import spoken_name
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import AxesGrid, audit_matrix, png
@@ -82,7 +83,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
                 "would help enough."
             ),
         )
-    left = [e.name.replace("_", " ") for e in audit.after if e.detectability != "fine"]
+    left = [spoken_name(e.name) for e in audit.after if e.detectability != "fine"]
     return (
         table(
             ("step", "what to do", "readings", "effects that can then be identified"),
@@ -91,7 +92,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
                     str(k),
                     readable(cure.description),
                     str(len(cure.plan)),
-                    ", ".join(cure.cured).replace("_", " ") or "–",
+                    ", ".join(map(spoken_name, cure.cured)) or "–",
                 )
                 for k, cure in enumerate(audit.cures, start=1)
             ),
@@ -104,4 +105,4 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
 
 
 def _names(effects: Sequence[str]) -> str:
-    return ", ".join(effects).replace("_", " ") or "–"
+    return ", ".join(map(spoken_name, effects)) or "–"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from probewise.diagnosis import EffectAudit
+from probewise.effects import spoken_name
 from probewise.report.html import Markup, table
 from probewise.report.words import number, unit_name
 
@@ -18,10 +19,10 @@ def audit_table(effects: Sequence[EffectAudit]) -> Markup:
         ("effect", "status", "detectable share", "aliased with (cosine)", "size at λ = 8"),
         (
             (
-                effect.name.replace("_", " "),
+                spoken_name(effect.name),
                 effect.detectability,
                 number(effect.share, 2),
-                effect.reason or ", ".join(f"{n.replace('_', ' ')} {c:.3f}" for n, c in effect.alike[:4]) or "–",
+                effect.reason or ", ".join(f"{spoken_name(n)} {c:.3f}" for n, c in effect.alike[:4]) or "–",
                 "; ".join(_smallest(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))

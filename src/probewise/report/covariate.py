@@ -7,9 +7,13 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.light_sensor.covariates import covariates_of, slope_along_the_move
+from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.report.words import unit_name
 
-__all__ = ["category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words", "family_words"]
+__all__ = [
+    "label_of",
+    "words_and_unit",
+    "category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words", "family_words"]
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
@@ -52,6 +56,29 @@ def covariate_unit(name: str, unit: str) -> str:
     return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
 
 
+def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
+    """Name a covariate of a diagnosis, and its unit, "" where it has none that is known."""
+    unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
+    if not isinstance(apparatus, PersonsSystem):
+        return ("scan" if name == "scan" else covariate_words(name)), covariate_unit(name, unit)
+    own = apparatus.system.simulator
+    known = {
+        "time": (own.time or "time", own.time_unit),
+        "row": ("row of the table", ""),
+        "level": (f"predicted {own.reading}", unit),
+        "previous": (f"change of {own.reading} since the row before", unit),
+    }
+    return known.get(name, (name.replace("state:", "state "), ""))
+
+
+def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
+    """Label an axis with a covariate of a diagnosis and its unit."""
+    said, unit = words_and_unit(diagnosis, name)
+    run = diagnosis.apparatus.words.run
+    said += f", {run} {scan}" if scan is not None and name != run else ""
+    return said + (f" ({unit_name(unit)})" if unit else "")
+
+
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     """Give each row's value of the covariate of each place, (n_points,), by the place's witness.
 
@@ -59,6 +86,9 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     """
     if not diagnosis.where:
         return {}
+    if isinstance(diagnosis.apparatus, PersonsSystem):
+        found = diagnosis.apparatus.covariates_by_row(diagnosis.repair.before.readings)
+        return {place.witness: found[place.covariate] for place in diagnosis.where}
     plan = diagnosis.recording.plan
     usable = np.flatnonzero(diagnosis.recording.usable)
     covariates = covariates_of(plan, usable, diagnosis.repair.before.readings[usable], _slope(diagnosis)[usable])
@@ -78,7 +108,7 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
 def category_names(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
     """Name the values of a covariate that has no scale: scans, directions, orientations; None for all others."""
     match place.covariate:
-        case "scan":
+        case "scan" | "run":
             return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
         case "direction":
             return {-1.0: "backwards", 1.0: "forwards"}

@@ -12,16 +12,20 @@ from probewise.diagnosis import (
     Alias,
     Diagnosis,
     EffectFound,
+    Formula,
     ParameterFound,
     Place,
     PlanAudit,
+    notes_on_calls,
     p_in_words,
 )
+from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.effects import spoken_name
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
-from probewise.report.covariate import covariate_unit, covariate_words, family_words
+from probewise.report.covariate import family_words, words_and_unit
 from probewise.report.diagnosis_figures import figures, shown_first
-from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hypothesis_in_words, listed
+from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hypothesis_in_words, is_in_words, listed
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.terms import explained, terms_of
@@ -37,7 +41,7 @@ _CHANCE = 0.05  # p-value above which nobody is surprised
 _TELLS_SOMETHING = 0.5  # nats
 _WEAK = " too weak to be felt so far"
 _NOISE_CAPTIONS = {
-    "correlated_noise": "Correlation of residuals of the same scan, by how many readings they lie apart.",
+    "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
     "signal_dependent_noise": "How far residuals scatter, by the predicted reading: plain noise scatters evenly.",
     "outliers": "How many residuals lie how far out, on a logarithmic scale, beside a normal distribution.",
     "dropouts": "Recorded against predicted readings; lost readings stand at one value, whatever is predicted.",
@@ -77,9 +81,10 @@ def write_page(
                     ("recordings", source),
                     ("readings", f"{int(diagnosis.recording.usable.sum())} used of {len(diagnosis.recording)}"),
                     ("seed", str(seed)),
+                    *_simulator(diagnosis),
                 )
             ),
-            *(paragraph(f"Note: {note}.") for note in diagnosis.recording.notes),
+            *(paragraph(f"Note: {note}.") for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
         ),
     )
     design = () if audit is None else (Section("What these readings could have shown", _design(audit)),)
@@ -111,17 +116,42 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Answer, in words that need no statistics: what to do now, what was found, is it real, does the repair help."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(_found(diagnosis)))]
+    if diagnosis.report.formula is not None:
+        facts.append(("As a formula", _formula(diagnosis.report.formula)))
+    if diagnosis.report.remainder is not None:
+        facts.append(("Beside that", _sentence(diagnosis.report.remainder.sentence)))
     if not diagnosis.judged.too_little:
         facts.append(("Could it be chance?", _chance(diagnosis)))
     if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
         facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
     if diagnosis.repair.changes_predictions:
         left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
-        only_here = ". What has no name is corrected in these readings alone; sensor.json does not carry it"
+        model = diagnosis.apparatus.words.model
+        only_here = f". What has no name is corrected in these readings alone; {model} does not carry it"
         facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
     if diagnosis.repair.left_open:
-        facts.append(("In the repaired sensor", _shares(diagnosis.repair.left_open)))
+        facts.append(("In the repaired model", _shares(diagnosis.repair.left_open, diagnosis.apparatus.words.model)))
     return facts
+
+
+def _simulator(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Name the simulator, where it is a person's own, and how often it was called."""
+    if not isinstance(diagnosis.apparatus, PersonsSystem):
+        return []
+    system = diagnosis.apparatus.system
+    own = [("simulator", system.simulator.source or "given in Python")]
+    if system.caller is None:
+        return own
+    how = "for all samples at once" if system.caller.broadcasts else "for one sample after the other"
+    return [*own, ("calls of simulate", f"{system.caller.n_calls:,}, {how}")]
+
+
+def _formula(formula: Formula) -> str:
+    """Write a formula with its numbers."""
+    numbers = ", ".join(f"{p.name} = {give_or_take(p.mean, p.sd)}" for p in formula.parameters)
+    of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
+    gained = f"log evidence {formula.log_evidence:+.1f} nats"
+    return readable(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
 
 
 def _found(diagnosis: Diagnosis) -> str:
@@ -143,12 +173,12 @@ def _signed_nats(nats: float, sd: float) -> str:
     return f"{readable(written if written.startswith('-') else f'+{written}')} nats"
 
 
-def _shares(shares: Mapping[tuple[str, ...], float]) -> str:
+def _shares(shares: Mapping[tuple[str, ...], float], model: str) -> str:
     held = (
         f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
         for names, share in shares.items()
     )
-    return f"Samples in sensor.json hold: {', '.join(held)}."
+    return f"Samples in {model} hold: {', '.join(held)}."
 
 
 def _chance(diagnosis: Diagnosis) -> str:
@@ -172,12 +202,13 @@ def _chance(diagnosis: Diagnosis) -> str:
 def _next_in_words(diagnosis: Diagnosis) -> str:
     plan = diagnosis.next_measurement
     if plan is None and diagnosis.judged.too_little:
-        return "Scan across an edge, and take more readings."
+        cure = diagnosis.apparatus.words.find_signal
+        return f"{cure[:1].upper()}{cure[1:]}, and take more readings."
     if plan is None:
         return "Nothing that this apparatus can do would tell more."
     told = plan.expected_log_bayes_factor
     asked = f"{count(len(plan.plan), 'reading')}, about {count(max(round(plan.minutes), 1), 'minute')}"
-    said = f"{plan.description.rstrip('.')}: {asked}, next_plan.csv."
+    said = f"{plan.description.rstrip('.')}: {asked}, {diagnosis.apparatus.words.next_plan}."
     if told < _TELLS_SOMETHING:
         return f"No plan of {MOST_READINGS} readings was found that tells more than {number(told, 1)} nats: {said}"
     *others, last = map(_plain, plan.between)
@@ -189,7 +220,7 @@ def _plain(label: str) -> str:
     """Name a rival of a plan in words, where it goes by names of effects; it may be a phrase already."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
-    said = listed(map(effect_in_words, names)) if all(name in EFFECTS_IN_WORDS for name in names) else named
+    said = listed(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
     return f"{said}, too weak to be detected so far" if weak else said
 
 
@@ -239,13 +270,13 @@ def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _candidate(name: str) -> str:
-    return effect_in_words(name) if name in EFFECTS_IN_WORDS else family_words(name)
+    return effect_in_words(name) if is_in_words(name) else family_words(name)
 
 
 def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Say what the repaired sensor carries that no explanation above does."""
     return tuple(
-        paragraph(_sentence(f"In {share:.0%} of the repaired sensor's samples: {sentence}"))
+        paragraph(_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.carried
     )
 
@@ -287,7 +318,8 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
 
 
 def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    which = "The scan that the repair changes most" if diagnosis.repair.changes_predictions else "One scan"
+    run = diagnosis.apparatus.words.run
+    which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
     colours = "solid orange as calibrated, dashed blue repaired" if diagnosis.repair.changes_predictions else "orange"
     return (
         figure(
@@ -304,7 +336,7 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
         (
             figure(
                 drawn["gain.svg"],
-                "Gain in log predictive density of each held-out scan, both models fitted to the others: blue where "
+                f"Gain in log predictive density of each held-out {diagnosis.apparatus.words.run}, both models fitted to the others: blue where "
                 "the repaired model predicts better, orange where worse. Grey: mean of all, with standard error.",
             ),
         )
@@ -333,7 +365,8 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
 def _nothing_held_out(diagnosis: Diagnosis) -> str:
     if not diagnosis.repair.changes_predictions:
         return "The predicted mean is as calibrated: there is no repair to test on held-out readings."
-    return "No scan could be held out: that takes two scans of eight readings or more."
+    run = diagnosis.apparatus.words.run
+    return f"No {run} could be held out: that takes two {run}s of eight readings or more."
 
 
 def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
@@ -348,7 +381,7 @@ def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ..
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
         figure(
             drawn["noise.svg"],
-            "Residuals after the repair, if any. Above: correlation within scans by the number of readings between. "
+            f"Residuals after the repair, if any. Above: correlation within {diagnosis.apparatus.words.run}s by the number of readings between. "
             "Middle: scatter by predicted reading. Below: how many lie how far out, on a logarithmic scale.",
         ),
     )
@@ -413,7 +446,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
         ("aliased in these readings", "cosine", "what would separate them", "readings needed"),
         (
             (
-                " and ".join(a.effects).replace("_", " "),
+                " and ".join(map(spoken_name, a.effects)),
                 number(a.cosine, 3),
                 readable(a.settle_by),
                 _readings(a.readings),
@@ -456,17 +489,17 @@ def _sentence(text: str) -> str:
 
 def _where(diagnosis: Diagnosis, place: Place) -> str:
     """Say where the residuals stand out."""
-    covariate = "scan" if place.covariate == "scan" else covariate_words(place.covariate)
-    unit = covariate_unit(place.covariate, diagnosis.recording.plan.instrumentation.unit)
-    if place.covariate == "scan":
-        what = f"scan {place.scan}"
+    run = diagnosis.apparatus.words.run
+    covariate, unit = words_and_unit(diagnosis, place.covariate)
+    if place.covariate == run:
+        what = f"{run} {place.scan}"
     elif place.start is None or place.end is None:
         what = covariate
     else:
         start, end = f"{place.start:.4g}", f"{place.end:.4g}"
         ends = start if start == end else f"{start} to {end}"
         what = f"{covariate}, {ends} {unit}".rstrip()
-    if place.scan and place.covariate != "scan":
-        what += f", scan {place.scan}"
+    if place.scan and place.covariate != run:
+        what += f", {run} {place.scan}"
     chance = "" if place.p_value < ALARM else ", which may be chance"
     return readable(f"What stands out: {what} ({p_in_words(place.p_value)}{chance}).")

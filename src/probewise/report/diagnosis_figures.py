@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
-from probewise.report.covariate import covariate_label, covariate_values
+from probewise.report.covariate import covariate_values, label_of
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
     correlation_of_neighbours,
@@ -29,6 +29,7 @@ from probewise.report.plots import (
 from probewise.report.plots.residuals import AFTER, BEFORE
 from probewise.report.witness import Chance, Witness, along_scan, of_place, telling
 from probewise.report.words import unit_name
+from probewise.systems import RunTable
 
 __all__ = ["figures", "shown_first"]
 
@@ -96,7 +97,7 @@ def _witness(diagnosis: Diagnosis, chance: Chance, place: Place, at: FloatArray)
     A scan is drawn along its way first, then among the others: a residual that changes its sign leaves no mean.
     """
     by_covariate = of_place(diagnosis, place, at)
-    if place.scan is None or place.covariate != "scan":
+    if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         axes = stack_of_axes([2.6])
     else:
         axes = stack_of_axes([2.4, 2.6])
@@ -148,7 +149,8 @@ def _residuals(diagnosis: Diagnosis) -> bytes:
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
     models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
-    covariates = (("time (s)", plan.time_s), (covariate_label("level", unit), diagnosis.repair.before.readings))
+    time = label_of(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_time else "time")
+    covariates = ((time, plan.time_s), (label_of(diagnosis, "level"), diagnosis.repair.before.readings))
     return svg(
         residual_clouds(
             covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_name(unit)

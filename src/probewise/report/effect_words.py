@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-__all__ = ["EFFECTS_IN_WORDS", "effect_in_words", "hypothesis_in_words", "listed"]
+from probewise.effects import PROPOSAL, public_name, spoken_name
+
+__all__ = ["EFFECTS_IN_WORDS", "FORMS_IN_WORDS", "effect_in_words", "hypothesis_in_words", "is_in_words", "listed"]
 
 EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
     {
         "ambient_gradient": "stray light from one side",
         "ambient_step": "a sudden change of the room light",
         "offset_drift": "a slow drift of all readings",
-        "gain_drift": "a lamp that warms up",
+        "gain_drift": "a gain that drifts",
         "battery_sag": "a signal that follows the battery",
         "flicker": "a flickering lamp",
         "saturation": "readings cut off at a limit",
@@ -55,9 +57,57 @@ EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 """A noun phrase for each effect, to stand behind "the model leaves out"."""
 
 
+FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "offset_step": "a jump of all readings",
+        "offset_per_run": "an offset of its own in each run",
+        "gain_per_run": "a gain of its own in each run",
+        "delay": "readings that come late",
+        "settling": "readings that settle at the start of each run",
+        "interference": "a wave in the readings",
+        "random_walk": "a zero that wanders",
+        "noise_per_run": "noise that differs from run to run",
+        "clock_drift": "a clock that runs fast or slow",
+        "sensitivity": "readings that depend on {0}",
+        "input_offset": "an offset of {0}",
+        "input_gain": "a wrong scale of {0}",
+        "input_delay": "a late effect of {0}",
+        "input_saturation": "a limit of {0}",
+        "dead_zone": "a dead zone of {0}",
+        "periodic_error": "a periodic error of {0}",
+        "backlash": "backlash (play) of {0}",
+        "drifts": "a drift of {0}",
+        "steps": "a jump of {0}",
+        "differs": "{0} that differs from run to run",
+        "depends": "{0} that depends on {1}",
+        "damping": "damping of {0}",
+        "drag": "drag on {0}",
+        "friction": "dry friction of {0}",
+        "forcing": "a constant force on {0}",
+        "periodic_forcing": "a periodic force on {0}",
+        "cubic": "a cubic term of {1} in the rate of {0}",
+        "quadratic": "a quadratic term of {1} in the rate of {0}",
+        "coupling": "a coupling of {1} to {0}",
+        "limit": "a bound of {0}",
+    }
+)
+"""A noun phrase for each effect on a person's simulator, with its targets."""
+
+
+def is_in_words(name: str) -> bool:
+    """Tell whether an effect has a name in words."""
+    kind = public_name(name).partition(":")[0]
+    return name in EFFECTS_IN_WORDS or kind in FORMS_IN_WORDS or name.startswith(PROPOSAL)
+
+
 def effect_in_words(name: str) -> str:
     """Name an effect; one of a user's own goes by its own name."""
-    return EFFECTS_IN_WORDS.get(name, name.replace("_", " "))
+    kind, *targets = public_name(name).split(":")
+    if name.startswith(PROPOSAL):
+        return f"a term {targets[-1]} in {'the rate of ' if targets[0] == 'rate' else ''}{targets[1]}"
+    if targets and kind in FORMS_IN_WORDS:
+        return FORMS_IN_WORDS[kind].format(*targets)
+    return {**FORMS_IN_WORDS, **EFFECTS_IN_WORDS}.get(kind, spoken_name(name))
 
 
 def hypothesis_in_words(effects: Sequence[str]) -> str:

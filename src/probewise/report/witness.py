@@ -9,10 +9,11 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import ALARM, Diagnosis, Place
-from probewise.effects import UNNAMED
-from probewise.report.covariate import category_names, covariate_label, covariate_values
+from probewise.effects import UNNAMED, public_name
+from probewise.report.covariate import category_names, covariate_values, label_of, words_and_unit
 from probewise.report.residual_means import Means, mean_residuals
 from probewise.report.words import unit_name
+from probewise.systems import RunTable
 
 __all__ = ["Chance", "Witness", "along_scan", "of_place", "telling"]
 
@@ -89,14 +90,14 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
     places = sorted(alarming, key=lambda place: -_likeness(diagnosis, place))
     found = _folded(diagnosis)
     for place in places:
-        if place.covariate == "scan" and place.scan is not None:
+        if place.covariate == diagnosis.apparatus.words.run and place.scan is not None:
             found.append(along_scan(diagnosis, place.scan, place))
         found.append(of_place(diagnosis, place, values[place.witness]))
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_by_change(diagnosis))
     if not found:
         unit = diagnosis.recording.plan.instrumentation.unit
-        return Witness(np.array(diagnosis.repair.before.readings), covariate_label("level", unit))
+        return Witness(np.array(diagnosis.repair.before.readings), label_of(diagnosis, "level"))
     sizes = [chance.means(diagnosis, witness, after=False).stands_out for witness in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
@@ -104,7 +105,7 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
 def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> Witness:
     """Show a place along its covariate, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
-    label = covariate_label(place.covariate, unit, place.scan)
+    label = label_of(diagnosis, place.covariate, place.scan)
     if place.level is not None:
         label = f"reading to be expected without it ({unit_name(unit)})"
     names = category_names(diagnosis, place)
@@ -115,6 +116,11 @@ def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> W
     """Show one scan along its way: a residual that changes its sign leaves no mean by scan."""
     plan = diagnosis.recording.plan
     rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
+    if isinstance(plan, RunTable):
+        at = np.full(len(plan), np.nan)
+        at[rows] = plan.time_s[rows]
+        whole = scan if plan.run is not None else None
+        return Witness(at, label_of(diagnosis, "time" if plan.has_time else "row", whole), place=place)
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
     if np.ptp(along) == 0 or not _on_a_line(x_mm, y_mm):
@@ -146,15 +152,28 @@ def _folded(diagnosis: Diagnosis) -> list[Witness]:
         found = {p.name: p.mean for p in effect.parameters}
         if effect.name not in diagnosis.combination:
             continue
+        if isinstance(plan, RunTable):
+            out += _waves_of_table(diagnosis, plan, effect.name, found)
+            continue
         if found.get("alias_hz", 0.0) > 0:
             out.append((plan.time_s, 1 / found["alias_hz"], "time", "s"))
         if found.get("period_mm", 0.0) > 0:
             out.append((plan.x_mm, found["period_mm"], "X", "mm"))
     return [
-        Witness(np.mod(values, period), f"{name} within one period of {period:.4g} {unit} ({unit})")
+        Witness(np.mod(values, period), f"{name} within one period of {period:.4g} {unit}" + (f" ({unit})" if unit else ""))
         for values, period, name, unit in out
         if np.ptp(values) > _LEAST_PERIODS * period
     ]
+
+
+def _waves_of_table(
+    diagnosis: Diagnosis, table: RunTable, effect: str, found: Mapping[str, float]
+) -> list[tuple[FloatArray, float, str, str]]:
+    """Fold time at the period of a wave in time, or a column at that of its periodic error."""
+    if found.get("hz", 0.0) > 0:
+        return [(table.time_s, 1 / found["hz"], *words_and_unit(diagnosis, "time"))]
+    column = public_name(effect).partition(":")[2]
+    return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 
 
 def _by_change(diagnosis: Diagnosis) -> Witness:

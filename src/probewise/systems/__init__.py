@@ -1,13 +1,16 @@
 """Any simulator over any table: what a person brings, and the chain of what it may leave out."""
 
+from probewise.systems.calls import CountedCalls
 from probewise.systems.file import read_simulator
 from probewise.systems.fitted import FittedSystem, read_fitted_system, write_fitted_system
+from probewise.systems.joining import join_tables
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system
 from probewise.systems.simulator import Extra, Law, Noise, Simulator
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, read_run_table, write_run_table
 
 __all__ = [
+    "CountedCalls",
     "Extra",
     "FittedSystem",
     "Law",
@@ -19,6 +22,7 @@ __all__ = [
     "SystemChain",
     "SystemPrediction",
     "as_recording",
+    "join_tables",
     "predict_system",
     "read_fitted_system",
     "read_run_table",

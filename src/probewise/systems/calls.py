@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
+from probewise.progress import Progress
 from probewise.systems.simulator import Simulate
 
-__all__ = ["Caller"]
+__all__ = ["Caller", "CountedCalls"]
 
 _N_NODES = 5  # values at which a parameter that cannot vary by row is held, to interpolate between
 _SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
@@ -40,6 +41,7 @@ class Caller:
     n_calls: int = 0
     n_failed: int = 0
     interpolated: set[str] = field(default_factory=set)
+    on_call: Callable[[], None] = lambda: None
 
     @classmethod
     def probed(
@@ -89,7 +91,7 @@ class Caller:
         n_points = max(np.shape(v)[-1] for v in columns.values())
         with np.errstate(all="ignore"):
             if self.broadcasts:
-                self.n_calls += 1
+                self._counted()
                 try:
                     readings = np.asarray(self.simulate(dict(parameters), dict(columns)), dtype=np.float64)
                 except Exception:
@@ -116,10 +118,14 @@ class Caller:
                 raise first_error
         return out
 
+    def _counted(self) -> None:
+        self.n_calls += 1
+        self.on_call()
+
     def _one(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
         vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
         if not vary:
-            self.n_calls += 1
+            self._counted()
             return _of_shape(np.asarray(self.simulate(dict(own), dict(columns)), dtype=np.float64), (n_points,))
         self.interpolated.update(vary)
         nodes = [_nodes(own[name]) for name in vary]
@@ -131,6 +137,32 @@ class Caller:
                 share = share * _lagrange(each, i, own[name])
             out += share * self._one({**own, **fixed}, columns, n_points)
         return out
+
+
+class CountedCalls:
+    """Progress that says beside each stage how often `simulate` has been called; its last stage is told anew at every call.
+
+    Parameters
+    ----------
+    progress
+        Told.
+    caller
+        Whose calls are counted, from here on.
+    """
+
+    def __init__(self, progress: Progress, caller: Caller) -> None:
+        self._progress, self._caller = progress, caller
+        self._now = ("calling simulate", 0, 0, "")
+        caller.on_call = self._again
+
+    def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        self._now = stage, done, total, note
+        self._again()
+
+    def _again(self) -> None:
+        stage, done, total, note = self._now
+        calls = f"{self._caller.n_calls:,} calls of simulate"
+        self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
 
 def _taken_by_row(

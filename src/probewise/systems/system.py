@@ -102,7 +102,7 @@ class System:
         at = {name: k for k, name in enumerate(self.marginals)}
         for name in own.parameters:
             if name in own.per_run:
-                of_run = [at[f"{name}[{run}]"] for run in table.scan_names]
+                of_run = [at[f"{name}[{table.like.get(run, run)}]"] for run in table.scan_names]
                 out[name] = theta[:, of_run][:, table.scan]
             else:
                 out[name] = theta[:, at[name] : at[name] + 1]

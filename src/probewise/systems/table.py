@@ -36,12 +36,16 @@ class RunTable:
         Name of the column that says to which run a row belongs; None where there is one run.
     instrumentation
         Unit, range and step of a reading.
+    like
+        Runs that are yet to be taken, each with the recorded run that it is taken to be like: what is a run's own is
+        there as it was in that run.
     """
 
     columns: Mapping[str, NDArray[Any]]
     time: str | None = None
     run: str | None = None
     instrumentation: Instrumentation = field(default_factory=Instrumentation)
+    like: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         columns = {name: _column(name, values) for name, values in self.columns.items()}

@@ -16,7 +16,8 @@ from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.light_sensor.commands import commands, excerpts
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
-from probewise.diagnosis.scheduling import MOST_READINGS, in_turn, one_after_another, put_off
+from probewise.diagnosis.light_sensor.scheduling import in_turn, one_after_another, put_off
+from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
@@ -204,7 +205,7 @@ def test_a_scan_over_a_new_sheet_takes_longer():
 
 def test_a_battery_is_expected_to_stay_as_it_was():
     plan = paper_plan()
-    everywhere, rows = one_after_another(commands(plan)[:3], plan)
+    everywhere, rows = one_after_another(commands(plan)[:3], plan), rows_of(commands(plan)[:3])
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor())
@@ -212,6 +213,6 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
     after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
-    everywhere, _ = one_after_another(commands(plan)[:3], after)
+    everywhere = one_after_another(commands(plan)[:3], after)
     assert set(everywhere.covariates) == {"battery_mv"}
     assert (everywhere.covariates["battery_mv"] == gone[-2]).all()

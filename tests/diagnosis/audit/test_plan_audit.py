@@ -11,7 +11,7 @@ from probewise.diagnosis.audit.detectability import Expected, PlanTemplates, Pro
 from probewise.diagnosis.audit.plan_audit import _cured_at
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.light_sensor.commands import commands
-from probewise.diagnosis.scheduling import behind
+from probewise.diagnosis.light_sensor.scheduling import behind
 from probewise.effects import Backlash, EdgeMisplacement, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan

@@ -14,7 +14,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.scheduling import MOST_READINGS, one_after_another
+from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.effects import NamedEffect
@@ -114,13 +114,13 @@ def settle(
     scans = apparatus.commands(found.model.plan, level=null)
     if not (best and scans):
         return list(pairs)
-    everywhere, rows_of = one_after_another(scans, found.model.plan)
+    everywhere = apparatus.one_after_another(scans, found.model.plan)
     null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
     there = {
         name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale
         for name, (model, z, _, scale) in shapes.items()
     }
-    for scan, rows in zip(scans, rows_of, strict=True):
+    for scan, rows in zip(scans, rows_of(scans), strict=True):
         for first, second in best:
             sign = np.sign(float(shapes[first][2] @ shapes[second][2])) or 1.0
             apart = there[first][rows] - sign * there[second][rows]

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.scheduling import MOST_READINGS, Command, in_turn, one_after_another
+from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_of
 from probewise.recordings.plan import Plan
 
 __all__ = ["NextMeasurement", "Rival", "mutual_information", "next_scans"]
@@ -102,10 +102,10 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
     offered = apparatus.commands(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _promising(rivals, sd, offered, plan)]
+    offered = [offered[k] for k in _promising(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
-    everywhere, rows = one_after_another(offered, plan)
+    everywhere, rows = apparatus.one_after_another(offered, plan), rows_of(offered)
     predictives = [rival.predictive(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
@@ -127,7 +127,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
         return None
     scans = [offered[k] for k in chosen]
     return NextMeasurement(
-        in_turn(scans, plan),
+        apparatus.in_turn(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
         _expected_log_bayes_factor([predictive.take(taken) for predictive in predictives], weights),
@@ -155,11 +155,13 @@ def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatAr
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 
 
-def _promising(rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan) -> list[int]:
+def _promising(
+    rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
+) -> list[int]:
     """Keep, for each two rivals, the few scans in which what they predict differs most a minute."""
     if not offered:
         return []
-    everywhere, rows = one_after_another(offered, plan)
+    everywhere, rows = apparatus.one_after_another(offered, plan), rows_of(offered)
     means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
     minutes = np.array([option.minutes for option in offered])
     kept: dict[int, None] = {}

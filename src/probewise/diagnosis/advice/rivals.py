@@ -12,6 +12,7 @@ from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
+from probewise.effects import spoken_name
 
 __all__ = ["next_readings"]
 
@@ -53,7 +54,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
 
 
 def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> Rival:
-    label = " with ".join(candidate.names).replace("_", " ") or as_calibrated
+    label = " with ".join(map(spoken_name, candidate.names)) or as_calibrated
     return Rival(label, candidate.found.model, candidate.found.z, _root_of(candidate), probability)
 
 
@@ -79,7 +80,7 @@ def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
         if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.sd:
             root = np.zeros((len(z), len(z)))  # of that size, and no other
             root[: len(found.z), : len(found.z)] = _root_of(null)
-            return Rival(f"{name.replace('_', ' ')} too weak to be felt so far", model, z, root, 0.0)
+            return Rival(f"{spoken_name(name)} too weak to be felt so far", model, z, root, 0.0)
         setting[amplitudes] /= 4
     return None
 

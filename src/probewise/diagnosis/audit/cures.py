@@ -19,7 +19,7 @@ from probewise.diagnosis.audit.detectability import (
 )
 from probewise.diagnosis.light_sensor.commands import commands
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
-from probewise.diagnosis.scheduling import Command, behind, put_off
+from probewise.diagnosis.light_sensor.scheduling import Scan, behind, put_off
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan
@@ -39,7 +39,7 @@ def cures_of(
     effects: Mapping[str, type[NamedEffect[Any]]],
     ailing: Sequence[str],
     progress: Progress = silent,
-) -> list[Command]:
+) -> list[Scan]:
     """Choose scans to add, one at a time, each for the trouble of the ailing effects that a reading of it takes away.
 
     Parameters
@@ -56,7 +56,7 @@ def cures_of(
         Told of every scan that is chosen.
     """
     every = [*commands(plan, strides=_STRIDES), *target_swaps(plan)]
-    chosen: list[Command] = []
+    chosen: list[Scan] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)

@@ -23,7 +23,7 @@ from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.earlier import SensorPrior, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.scheduling import behind
+from probewise.diagnosis.light_sensor.scheduling import behind
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
@@ -87,7 +87,7 @@ class EffectAudit:
 
 @dataclass(frozen=True, eq=False)
 class Cure:
-    """One scan to add: its kind (`Command`), in words, readings, time, and the effects that are fine from then on."""
+    """One scan to add: its kind (`Scan`), in words, readings, time, and the effects that are fine from then on."""
 
     kind: str
     description: str

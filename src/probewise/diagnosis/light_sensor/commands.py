@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.scheduling import MOST_READINGS, Command, start_after
+from probewise.diagnosis.light_sensor.scheduling import Scan, start_after
+from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
@@ -63,7 +64,7 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
     return out
 
 
-def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
+def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
     """List what could be done with the scans of a plan, each pose of a scan once.
 
     Parameters
@@ -78,7 +79,7 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
     controls = plan.instrumentation.controls
     height_mm = plan.instrumentation.height_mm
     gap_s, start_s = reading_s(plan), start_after(plan)
-    out: list[Command] = []
+    out: list[Scan] = []
     for scan in distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
         degrees = math.degrees(float(plan.orientation_rad[scan[0]]))
@@ -87,13 +88,13 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
             once = rescheduled(plan, rows, start_s, gap_s, label)
             both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
             out += [
-                Command("repeat", f"take scan {name} again{every}", _named(once, "again")),
-                Command(
+                Scan("repeat", f"take scan {name} again{every}", _named(once, "again")),
+                Scan(
                     "reverse",
                     f"take scan {name} backwards{every}",
                     rescheduled(plan, rows[::-1], start_s, gap_s, f"{label}_reversed"),
                 ),
-                Command(
+                Scan(
                     "respeed",
                     f"scan {name} forth and back {_faster(part)}",
                     rescheduled(plan, both, start_s, gap_s, f"{label}_both"),
@@ -102,14 +103,14 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
             if "orientation_deg" in controls:
                 turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
                 words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
-                out.append(Command("rotate", words, _named(turned, "turned")))
+                out.append(Scan("rotate", words, _named(turned, "turned")))
             if "led" in controls:
                 dark = _commanded(once, "led", 0.0)
-                out.append(Command("relight", f"take scan {name} with the LED off{every}", _named(dark, "dark")))
+                out.append(Scan("relight", f"take scan {name} with the LED off{every}", _named(dark, "dark")))
             if "height_mm" in controls and height_mm is not None:
                 high = _commanded(once, "height_mm", _RAISE * height_mm)
                 words = f"take scan {name} with the sensor at {_RAISE * height_mm:.4g} mm{every}"
-                out.append(Command("raise", words, _named(high, "raised")))
+                out.append(Scan("raise", words, _named(high, "raised")))
     return out
 
 

@@ -17,10 +17,10 @@ from probewise.diagnosis.light_sensor.commands import commands
 from probewise.diagnosis.light_sensor.covariates import covariate_of, covariates_of, slope_along_the_move
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
+from probewise.diagnosis.light_sensor.scheduling import Scan, in_turn, one_after_another
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.scheduling import Command
 from probewise.effects import EFFECTS, NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
@@ -73,11 +73,13 @@ class LightSensor:
     prior_odds = staticmethod(PriorOdds.over)
     covariate_of = staticmethod(covariate_of)
     held_out_parts = staticmethod(held_out_parts)
+    one_after_another = staticmethod(one_after_another)
+    in_turn = staticmethod(in_turn)
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
         """Differentiate by what is finer in an SSF than any form that is fitted to it."""
         return fine_structure(found.model, found.z, usable)
 
-    def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
+    def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
         """List what the arm can do, and what a hand can: swap the target, or turn it."""
         return [*commands(plan, strides=strides, level=level), *target_swaps(plan)]

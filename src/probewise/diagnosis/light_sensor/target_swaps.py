@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.light_sensor.commands import distinct_scans, excerpts, reading_s, rescheduled
-from probewise.diagnosis.scheduling import Command, start_after
+from probewise.diagnosis.light_sensor.scheduling import Scan, start_after
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 
@@ -28,7 +28,7 @@ _STRIPES = (5, 10)  # how many go into a scan
 _STRIDE = 4
 
 
-def target_swaps(plan: Plan) -> list[Command]:
+def target_swaps(plan: Plan) -> list[Scan]:
     """List scans over plain surfaces, along the other axis, and over an edge of the plan laid otherwise.
 
     All begin as the plan's first scan that moves does, or as its first over a `HalfPlane`, the sensor as it was there.
@@ -40,17 +40,17 @@ def target_swaps(plan: Plan) -> list[Command]:
     out = []
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
         flat = _scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
-        out.append(Command("lay", f"scan a plain {colour} surface", _over(flat, f"plain_{colour}", Uniform(albedo))))
+        out.append(Scan("lay", f"scan a plain {colour} surface", _over(flat, f"plain_{colour}", Uniform(albedo))))
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
         across = _turned(_scan(plan, part.rows, f"across{part.suffix}"))
-        out.append(Command("across", f"scan across scan {name}, along the other axis{part.words}", across))
+        out.append(Scan("across", f"scan across scan {name}, along the other axis{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
     laid = (_laid_otherwise(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
     return [*out, *next(filter(None, laid), [])]
 
 
-def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command]:
+def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     """Turn the sheet of an edge, half round or by a quarter; move it; lay stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
     beyond = _beyond(plan, scan, edge)
@@ -75,14 +75,14 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command
         seen = ndtr(_beyond(whole, rows, pattern) / (_FOOTPRINT * length))
         for part in excerpts(rows, strides=(_STRIDE,), level=seen):
             taken = _over(_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
-            out.append(Command("lay", f"scan {words}{part.words}", taken))
+            out.append(Scan("lay", f"scan {words}{part.words}", taken))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of {name}"
         for part in excerpts(scan, strides=(_STRIDE // 2, _STRIDE)):
             taken = _over(_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
-            out.append(Command("lay", f"{words}{part.words}", taken))
+            out.append(Scan("lay", f"{words}{part.words}", taken))
     return out
 
 

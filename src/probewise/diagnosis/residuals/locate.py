@@ -27,6 +27,7 @@ ALARM = 0.01
 """p-value below which something is missing."""
 
 _LEAST_ROWS = 3
+_RUNS = ("scan", "run")  # covariates whose values are the numbers of parts of the recording
 _SIGNIFICANT = 0.05  # share of its greatest strength
 _PLAIN = 0.25  # a share of the first draws from which more of them would change nothing
 
@@ -193,7 +194,7 @@ def places(
         end: float | None
         start, end = kept[best]
         scan = covariate.scan
-        if covariate.name == "scan":
+        if covariate.name in _RUNS:
             scan, start, end = scan_names[int(kept[best][0])], None, None
         curve = _curve(covariate, residuals, problem.sd)
         out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), **curve))
@@ -234,6 +235,9 @@ def places_of_effect(
         Of the noise.
     """
     name = covariate.name
+    if name == "run":
+        strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
+        return [Place(name, strongest, None, None, p_value, size, **_curve(covariate, residuals, sd))]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
         curve = _curve(scans, residuals, sd)
         return [

@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.scheduling import Command
+from probewise.diagnosis.system.commands import RunCommand, in_turn, one_after_another, run_commands
 from probewise.effects import (
     CorrelatedNoise,
     DriftingNoise,
@@ -68,6 +68,9 @@ class PersonsSystem:
             null="the simulator",
             find_signal="record where the reading changes",
             settles_nothing="no rows like those of this table tell them apart",
+            run="run",
+            next_plan="next.csv",
+            model="repaired.json",
         )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
@@ -97,13 +100,8 @@ class PersonsSystem:
         """List time, columns, level, states, the change since the row before, and runs, as far as they vary."""
         table = cast(RunTable, recording.plan)
         usable = np.flatnonzero(recording.usable)
-        level = found.predicted
-        everywhere = found.model.predict(found.z[None, :])[0]
-        pooled: dict[str, FloatArray] = {"time" if table.has_time else "row": table.time_s[usable], "level": level}
-        own = self.system.simulator
-        pooled |= {name: v[usable] for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
-        pooled |= {f"state:{name}": v[usable] for name, v in self.about.states.items()}
-        pooled["previous"] = _change(everywhere, table)[usable]
+        by_row = self.covariates_by_row(found.model.predict(found.z[None, :])[0])
+        pooled = {name: values[usable] for name, values in by_row.items() if name != "run"}
         out = []
         for name, values in pooled.items():
             there = np.flatnonzero(np.isfinite(values))
@@ -112,6 +110,16 @@ class PersonsSystem:
         if len(table.scan_names) > 1:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
         return out, pooled["previous"]
+
+    def covariates_by_row(self, predicted: FloatArray) -> dict[str, FloatArray]:
+        """Give every covariate at each row, (n_points,), where these readings are predicted; that of runs last."""
+        table, own = self.about.table, self.system.simulator
+        out = {"time" if table.has_time else "row": table.time_s, "level": predicted}
+        out |= {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
+        out |= {f"state:{name}": v for name, v in self.about.states.items()}
+        out["previous"] = _change(predicted, table)
+        out["run"] = table.scan.astype(np.float64)
+        return out
 
     def covariate_of(
         self,
@@ -144,9 +152,13 @@ class PersonsSystem:
 
     def commands(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-    ) -> Sequence[Command]:
-        """Nothing yet."""
-        return ()
+    ) -> list[RunCommand]:
+        """List runs that a person could record; the other arguments play no part."""
+        own = self.system.simulator
+        return run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
+
+    one_after_another = staticmethod(one_after_another)
+    in_turn = staticmethod(in_turn)
 
 
 def _change(values: FloatArray, table: RunTable) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -16,18 +17,26 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
+from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
-from probewise.systems import RunRecording, RunTable, Simulator, System, as_recording
+from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording
 from probewise.systems.forms import About
 
-__all__ = ["diagnose_system", "fit_system", "prepare_system"]
+__all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
 
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 _MOST_COMPARED = 2400
 
 
 def diagnose_system(
-    simulator: Simulator, table: RunTable, *, thorough: Thorough | None = None, rng: np.random.Generator
+    simulator: Simulator,
+    table: RunTable,
+    *,
+    source: str = "",
+    notes: Sequence[str] = (),
+    thorough: Thorough | None = None,
+    rng: np.random.Generator,
+    progress: Progress = silent,
 ) -> Diagnosis:
     """Tell what physics a simulator leaves out of a table of readings.
 
@@ -37,10 +46,14 @@ def diagnose_system(
         What predicts the readings.
     table
         What was recorded, with the column that is predicted.
+    source, notes
+        What the table is called, and what is to be noted of it.
     thorough
-        Weighs what leads a second time.
+        Weighs what leads a second time: `weigh_thoroughly`, by nested sampling.
     rng
         Source of randomness.
+    progress
+        Told what is being done, and how often `simulate` has been called.
 
     Raises
     ------
@@ -49,17 +62,40 @@ def diagnose_system(
     NotConvergedError
         If the fit of the simulator did not arrive anywhere.
     """
-    return diagnose_prepared(prepare_system(simulator, table), thorough=thorough, rng=rng)
+    prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
+    return diagnose_prepared(prepared, thorough=thorough, rng=rng)
 
 
-def prepare_system(simulator: Simulator, table: RunTable) -> Prepared:
+def prepare_system(
+    simulator: Simulator, table: RunTable, *, source: str = "", notes: Sequence[str] = (), progress: Progress = silent
+) -> Prepared:
     """Fit the simulator, and bind the forms about the fit."""
-    recording = recording_of(simulator, table)
-    system, found, sd = fit_system(System.of(simulator, table), recording)
+    recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
+    system = System.of(simulator, table)
+    told = progress if system.caller is None else CountedCalls(progress, system.caller)
+    told("fitting the simulator")
+    system, found, sd = fit_system(system, recording)
     apparatus = PersonsSystem(About(system, table, found.z, sd))
     begun = replace(system, first=found.z)
+    told("binding effects")
     effects = apparatus.effects(recording, begun)
+    told("diagnosing")
     return Prepared(recording, effects, begun, apparatus, recording)
+
+
+def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Say where a person's `simulate` gave no readings, and which parameters it could not take row by row."""
+    apparatus = diagnosis.apparatus
+    caller = apparatus.system.caller if isinstance(apparatus, PersonsSystem) else None
+    if caller is None:
+        return ()
+    out = []
+    if caller.n_failed:
+        out.append(f"simulate raised an error for {caller.n_failed:,} parameters tried: taken to be impossible")
+    if caller.interpolated:
+        names = ", ".join(sorted(caller.interpolated))
+        out.append(f"simulate takes no array of {names}: where it varies by row, it is interpolated between fixed values")
+    return tuple(out)
 
 
 def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:

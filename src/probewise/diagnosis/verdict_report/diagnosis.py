@@ -162,7 +162,8 @@ class Diagnosis(ShowsItself):
         elif self.verdict == "noise":
             lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f}")
         if self.repair.by_rows:
-            lines.append("what has no name is put right in these readings alone: sensor.json does not carry it")
+            model = self.apparatus.words.model
+            lines.append(f"what has no name is put right in these readings alone: {model} does not carry it")
         lines += [f"in {share:.0%} of its samples: {sentence}" for _, share, sentence in self.carried]
         if self.repair.left_open:
             shares = ", ".join(

@@ -86,7 +86,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "next_measurement": None
         if plan is None
         else {
-            "plan": NEXT_PLAN,
+            "plan": diagnosis.apparatus.words.next_plan,
             "readings": len(plan.plan),
             "minutes": plan.minutes,
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,

@@ -11,6 +11,7 @@ from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
+from probewise.effects import spoken_name
 
 __all__ = ["Grounds", "reason_of"]
 
@@ -99,7 +100,7 @@ def _unknown(judged: Judged, grounds: Grounds) -> str:
     likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
     most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
     place = f" It shows most in {most.replace('_', ' ')}." if most else ""
-    known = " and ".join(name.replace("_", " ") for name in grounds.beside)
+    known = " and ".join(spoken_name(name) for name in grounds.beside)
     beside = f", beside {known}" if known else ""
     return f"Something is missing ({p}) that no named effect explains{beside}.{place}"
 

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
+from probewise.effects import spoken_name
 from probewise.report.plots.canvas import (
     BLUE,
     COPPER,
@@ -46,7 +47,7 @@ def audit_matrix(
     The two axes, shape (1, 2).
     """
     order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(sights[k]), -cosines[k, k]))
-    labels = [names[k].replace("_", " ") for k in order]
+    labels = [spoken_name(names[k]) for k in order]
     at = np.arange(len(order))
     own = axes is None
     axes = axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)

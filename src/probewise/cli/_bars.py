@@ -1,0 +1,156 @@
+"""Progress on standard error: a bar on a terminal, elsewhere a line now and then."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, Never
+
+from tqdm import tqdm
+
+from probewise.nested import State
+from probewise.progress import Progress, silent
+
+__all__ = ["of_nested", "progress_shown"]
+
+_PATIENCE_S = 2.0  # what ends sooner needs no bar
+_BETWEEN_LINES_S = 5.0
+_SHARE_OF_ALL = 0.05  # of the time so far: hours of work fill no log
+_BEAT_S = 0.5
+_WITH_TOTAL = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
+_WITHOUT = "{desc} [{elapsed}]{postfix}"
+
+
+@contextlib.contextmanager
+def progress_shown(*, quiet: bool, beat: bool = True) -> Iterator[Progress]:
+    """Yield what shows how far the work is, once it takes longer than two seconds.
+
+    Parameters
+    ----------
+    quiet
+        Show nothing.
+    beat
+        Keep the clock going between two words of the work. Not while a person is asked at the same terminal.
+    """
+    if quiet:
+        yield silent
+        return
+    shown = _Bars() if sys.stderr.isatty() else _Lines()
+    stopped = threading.Event()
+
+    def keep_beating() -> None:
+        while not stopped.wait(_BEAT_S):
+            shown.beat()
+
+    heart = threading.Thread(target=keep_beating, daemon=True)
+    if beat:
+        heart.start()
+    ended = False
+    try:
+        yield shown
+        ended = True
+    finally:
+        stopped.set()
+        if beat:
+            heart.join()
+        shown.close(ended=ended)
+
+
+def of_nested(progress: Progress) -> Callable[[int | str, State], None]:
+    """Tell of nested sampling, after every round: of a number of Gaussians, or of a hypothesis by name."""
+
+    def tell(what: int | str, state: State) -> None:
+        stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
+        to_come = state.log_z_remaining - state.log_z
+        progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")
+
+    return tell
+
+
+class _Said(NamedTuple):
+    """The last word of the work; see `Progress`."""
+
+    stage: str
+    done: int
+    total: int
+    note: str
+
+
+class _Bars:
+    """A bar for each stage; those that took their time stay."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._shows_at = time.monotonic() + _PATIENCE_S
+        self._now: _Said | None = None
+        self._began = 0.0
+        self._bar: tqdm[Never] | None = None
+
+    def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        with self._lock:
+            if self._now is None or (stage, total) != (self._now.stage, self._now.total):
+                self._end(ended=True)
+                self._began = time.time()
+            self._now = _Said(stage, done, total, note)
+            self._draw()
+
+    def beat(self) -> None:
+        """Let the clock go on."""
+        with self._lock:
+            self._draw()
+            if self._bar is not None:
+                self._bar.refresh()
+
+    def close(self, *, ended: bool) -> None:
+        """End the last bar."""
+        with self._lock:
+            self._end(ended=ended)
+
+    def _draw(self) -> None:
+        if self._now is None or time.monotonic() < self._shows_at:
+            return
+        if self._bar is None:
+            total = self._now.total or None
+            self._bar = tqdm(desc=self._now.stage, total=total, bar_format=_WITH_TOTAL if total else _WITHOUT)
+            self._bar.start_t = self._began
+        self._bar.set_postfix_str(self._now.note, refresh=False)
+        self._bar.update(self._now.done - self._bar.n)
+
+    def _end(self, *, ended: bool) -> None:
+        if self._bar is not None:
+            if ended and self._bar.total:  # a stage may come to its end early
+                self._bar.n = self._bar.total
+            self._bar.leave = time.time() - self._began > _PATIENCE_S
+            self._bar.close()
+        self._bar = self._now = None
+
+
+class _Lines:
+    """A line of text after two seconds, after five more, and more seldom as the work goes on."""
+
+    def __init__(self) -> None:
+        self._began = self._last = time.monotonic()
+        self._said = False
+        self._now = _Said("getting ready", 0, 0, "")
+
+    def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        self._now = _Said(stage, done, total, note)
+        self.beat()
+
+    def beat(self) -> None:
+        """Write a line if it is time for one."""
+        now = time.monotonic()
+        wait = max(_BETWEEN_LINES_S, _SHARE_OF_ALL * (now - self._began)) if self._said else _PATIENCE_S
+        if now - self._last < wait:
+            return
+        self._last, self._said = now, True
+        said = self._now
+        count = f", {said.done} of {said.total}" if said.total else ""
+        sys.stderr.write(f"{said.stage}{count}{', ' + said.note if said.note else ''} ({now - self._began:.0f} s)\n")
+        sys.stderr.flush()
+
+    def close(self, *, ended: bool) -> None:
+        """Nothing is left open."""

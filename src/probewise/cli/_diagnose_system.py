@@ -1,0 +1,90 @@
+"""`probewise diagnose --simulator`: which physics a person's simulator leaves out of their table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import say
+from probewise.cli._output import check_out_directory, staged
+from probewise.cli._simulator import read_tables, refuse_beside
+
+if TYPE_CHECKING:
+    from probewise.diagnosis import Diagnosis
+
+__all__ = ["diagnose_simulator"]
+
+_OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next.csv")
+
+
+def diagnose_simulator(arguments: argparse.Namespace) -> int:
+    """Diagnose and write diagnosis.json, both models, next.csv, report.html and the figures."""
+    from functools import partial
+
+    import numpy as np
+
+    from probewise.cli._bars import of_nested, progress_shown
+    from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
+    from probewise.report import diagnosis as report
+    from probewise.systems import read_simulator
+
+    refuse_beside(arguments, "sensor")
+    out = check_out_directory(arguments.out)
+    simulator = read_simulator(arguments.simulator)
+    table, notes = read_tables(simulator, arguments.recordings)
+    diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=of_nested(progress))
+        diagnosis = diagnose_system(
+            simulator,
+            table,
+            source=", ".join(path.name for path in arguments.recordings),
+            notes=notes,
+            thorough=weigh_again if arguments.thorough else None,
+            rng=diagnosis_rng,
+            progress=progress,
+        )
+        progress("drawing the figures")
+        drawn = report.figures(diagnosis)
+        page = report.write_page(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
+    with staged(out, inputs=_to_be_kept(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
+        write_results(diagnosis, stage.folder)
+        for name, image in drawn.items():
+            (stage / name).write_bytes(image)
+        (stage / "report.html").write_text(page, encoding="utf-8")
+    for note in (*notes, *notes_on_calls(diagnosis), *stage.notes):
+        say(f"note: {note}", quiet=arguments.quiet)
+    say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def write_results(diagnosis: Diagnosis, folder: Path) -> None:
+    """Write diagnosis.json, the calibrated and the repaired simulator, and the rows to take next."""
+    from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
+    from probewise.systems import write_fitted_system, write_run_table
+
+    text = json.dumps(diagnosis_json(diagnosis), allow_nan=False, indent=1)
+    (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
+    write_fitted_system(repaired_of(diagnosis), folder / "repaired.json")
+    write_fitted_system(calibrated_of(diagnosis), folder / "calibrated.json")
+    if diagnosis.next_measurement is not None:
+        asked = diagnosis.next_measurement.plan
+        (folder / diagnosis.apparatus.words.next_plan).write_text(write_run_table(asked), encoding="utf-8")
+
+
+def _to_be_kept(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
+    """List what must not be lost: all that was read, and rows of an earlier run that were filled in with readings."""
+    from probewise.errors import FileError
+    from probewise.recordings.table import read_table
+
+    read = [*arguments.recordings, arguments.simulator]
+    filled_in = out / "next.csv"
+    if filled_in.is_file():
+        try:
+            cells = read_table(filled_in).columns.get(reading, ())
+            read += [filled_in] if any(cells) else []
+        except FileError:
+            read.append(filled_in)
+    return read

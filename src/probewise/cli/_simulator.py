@@ -1,0 +1,61 @@
+"""What verbs share that take a person's simulator: its file and tables read, and calls of it counted as they go."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import a_path
+from probewise.errors import FileError, ParameterError
+
+if TYPE_CHECKING:
+    from probewise.systems import RunTable, Simulator
+
+__all__ = ["add_simulator", "read_tables", "refuse_beside"]
+
+
+def add_simulator(parser: argparse.ArgumentParser) -> None:
+    """Add --simulator FILE.py."""
+    parser.add_argument(
+        "--simulator",
+        type=a_path,
+        metavar="FILE.py",
+        help="a simulator of your own instead of the light sensor; the file says which columns of the table it reads",
+    )
+
+
+def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
+    """Refuse options that only a light sensor has.
+
+    Raises
+    ------
+    ParameterError
+        If one of them is given.
+    """
+    for name in names:
+        value = getattr(arguments, name)
+        if value is not None and value is not False:
+            option = f"--{name.replace('_', '-')}"
+            raise ParameterError(option, str(value), "nothing beside --simulator, which stands for what took the readings")
+
+
+def read_tables(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
+    """Read tables of one system as one, with what is to be noted of their columns.
+
+    Raises
+    ------
+    FileError
+        If one cannot be read, lacks a column that the simulator names, or holds something that cannot be used.
+    ParameterError
+        If two are the same.
+    """
+    from probewise.systems import join_tables, read_run_table
+
+    tables = []
+    for path in paths:
+        if path.suffix == ".jsonl":
+            raise FileError(path, "a journal", "a CSV table; the journal of an explore run goes with --sensor")
+        tables.append(read_run_table(path, time=simulator.time, run=simulator.run))
+    return join_tables(tables, [path.name for path in paths])

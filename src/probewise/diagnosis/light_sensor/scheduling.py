@@ -1,0 +1,121 @@
+"""One scan that the arm could take, and several as one plan, one after the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise.diagnosis.joining import covariates_joined, join_plans, last_known
+from probewise.recordings.plan import Plan
+from probewise.sensor import COMMANDED
+
+__all__ = [
+    "Scan",
+    "behind",
+    "in_turn",
+    "minutes_of",
+    "one_after_another",
+    "put_off",
+    "start_after",
+]
+
+BREAK_S = 30.0  # to turn the sensor, or to change what lies under it
+LAY_S = 60.0  # more than that to lay something that the plan had not
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One scan that the arm could take: which of the six R's, "across" or "lay", words for it, its readings."""
+
+    kind: str
+    description: str
+    plan: Plan
+
+    @property
+    def minutes(self) -> float:
+        """How long it takes, with the break before it."""
+        return minutes_of(self.plan) + self.lay_s / 60.0
+
+    @property
+    def lay_s(self) -> float:
+        """How much longer the break before it is, to lay something."""
+        return LAY_S if self.kind == "lay" else 0.0
+
+
+def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
+    """Set plans behind a plan; a pattern of one name is one pattern.
+
+    A covariate that the others lack keeps its last known value there, such as a battery's; what is commanded
+    (the LED, the height) is as at calibration where a plan does not say.
+    """
+    plans = [plan, *more]
+    starts = np.cumsum([0, *(len(p.scan_names) for p in plans)])
+    names = tuple(dict.fromkeys(name for p in plans for name in p.pattern_names))
+    numbers = [np.array([names.index(name) for name in p.pattern_names], dtype=np.int64) for p in plans]
+    return replace(
+        plan,
+        x_mm=np.concatenate([p.x_mm for p in plans]),
+        y_mm=np.concatenate([p.y_mm for p in plans]),
+        orientation_rad=np.concatenate([p.orientation_rad for p in plans]),
+        time_s=np.concatenate([p.time_s for p in plans]),
+        scan=np.concatenate([p.scan + start for p, start in zip(plans, starts, strict=False)]),
+        scan_names=tuple(name for p in plans for name in p.scan_names),
+        pattern=np.concatenate([own[p.pattern] for own, p in zip(numbers, plans, strict=True)]),
+        pattern_names=names,
+        patterns={name: pattern for p in reversed(plans) for name, pattern in p.patterns.items()},
+        covariates=covariates_joined(plans),
+    )
+
+
+def start_after(plan: Plan) -> float:
+    """When a scan after a plan can begin, in s."""
+    return float(plan.time_s.max(initial=0.0)) + BREAK_S
+
+
+def minutes_of(plan: Plan) -> float:
+    """Estimate how long a plan takes, with the break before it."""
+    return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
+
+
+def one_after_another(scans: Sequence[Scan], after: Plan) -> Plan:
+    """Lay scans out as one plan, so that a model looks at all of them in one prediction.
+
+    Covariates that they lack, such as a battery's, stay as they were at the end of the plan before them.
+    """
+    return _as_left(_joined(scans), after)
+
+
+def in_turn(scans: Sequence[Scan], after: Plan) -> Plan:
+    """Take scans one after the other, with a break before each, a longer one where something has to be laid.
+
+    Covariates that they lack are as expected, as in `one_after_another`: a column to be filled in with what is read.
+    """
+    out: list[Scan] = []
+    for scan in scans:
+        out.append(_from(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
+    return _as_left(_joined(out), after)
+
+
+def _as_left(plan: Plan, after: Plan) -> Plan:
+    """Fill in covariates that nobody commands with what they were at the end of the plan before."""
+    read = {name: last_known(values) for name, values in after.covariates.items() if name not in COMMANDED}
+    kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
+    return replace(plan, covariates={**kept, **plan.covariates})
+
+
+def _joined(scans: Sequence[Scan]) -> Plan:
+    return join_plans([scan.plan for scan in scans])
+
+
+def put_off(scan: Scan, plan: Plan) -> Scan:
+    """Put a scan off until a plan is over, and what has to be laid for it is laid."""
+    return _from(scan, start_after(plan))
+
+
+def _from(scan: Scan, start_s: float) -> Scan:
+    """Begin a scan at a time, or later by what it takes to lay something."""
+    delay_s = start_s + scan.lay_s - float(scan.plan.time_s[0])
+    return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))

@@ -1,0 +1,176 @@
+"""What a person could record next: a run again, backwards, slower, or with what they can set moved in another way."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.scheduling import MOST_READINGS
+from probewise.recordings.plan import Plan
+from probewise.systems import RunTable
+from probewise.systems.joining import behind
+
+__all__ = ["RunCommand", "in_turn", "one_after_another", "run_commands"]
+
+_LEAST_ROWS = 4
+_MOST_RUNS = 4  # recorded runs that candidates start from
+_MINUTES = {"ms": 1 / 60_000, "s": 1 / 60, "min": 1.0, "h": 60.0, "hour": 60.0, "day": 1440.0, "d": 1440.0}
+_A_READING = 1 / 60  # minutes, where no time tells how long one takes
+_BREAK = 0.5  # minutes, before a run
+_RUN = "run"
+
+
+@dataclass(frozen=True, eq=False)
+class RunCommand:
+    """One run that could be recorded: how its rows are made, in words, its rows, how long they take."""
+
+    kind: str
+    description: str
+    table: RunTable
+    minutes: float
+
+    @property
+    def plan(self) -> Plan:
+        """The rows."""
+        return cast(Plan, self.table)
+
+
+def run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
+    """List runs that a person could record: every recorded run again, and with its controls moved otherwise.
+
+    Parameters
+    ----------
+    table
+        What was recorded.
+    reading
+        The column that is predicted: empty in what is yet to be taken.
+    controls
+        Columns that can be set; without any, runs are taken again as they were.
+    time_unit
+        Unit of time.
+    """
+    out: list[RunCommand] = []
+    settable = [name for name in controls if name in table.covariates]
+    ends = {name: _ends(table.covariates[name]) for name in settable}
+    for rows in _distinct(table, settable):
+        name = table.scan_names[int(table.scan[rows[0]])]
+        kept = rows[:: -(-len(rows) // MOST_READINGS)]
+        of = f"run {name}" if table.run is not None else "the rows"
+        for kind, words, columns, slower in _changes(table, kept, ends, of):
+            made = _run(table, kept, columns, reading, f"{name} {kind}", name, slower)
+            out.append(RunCommand(kind, words, made, _minutes(made, time_unit)))
+    return out
+
+
+Change = tuple[str, str, Mapping[str, FloatArray], float]
+"""Kind, words, the columns that are set, and how many times as long the run takes."""
+
+
+def _changes(table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str) -> Iterator[Change]:
+    own = {name: table.covariates[name][rows] for name in ends}
+    yield "again", f"take {of} again", {}, 1.0
+    if not ends:
+        return
+    if any(np.ptp(values) > 0 for values in own.values()):
+        yield "reversed", f"take {of} with {_and(ends)} in reverse order", {k: v[::-1] for k, v in own.items()}, 1.0
+    if table.has_time:
+        yield "slow", f"take {of} again, twice as slowly", {}, 2.0
+    n = len(rows)
+    share = np.linspace(0.0, 1.0, n)
+    shapes: dict[str, tuple[str, Callable[[float, float], FloatArray]]] = {
+        "up": ("swept from {low} to {high}", lambda low, high: low + (high - low) * share),
+        "down": ("swept from {high} to {low}", lambda low, high: high + (low - high) * share),
+        "up and down": (
+            "swept from {low} to {high} and back", lambda low, high: low + (high - low) * (1 - np.abs(2 * share - 1)),
+        ),
+        "steps": ("switched between {low} and {high}, twice", lambda low, high: np.where((4 * share).astype(int) % 2 == 0, low, high)),
+        "low": ("held at {low}", lambda low, high: np.full(n, low)),
+        "middle": ("held at {middle}", lambda low, high: np.full(n, 0.5 * (low + high))),
+        "high": ("held at {high}", lambda low, high: np.full(n, high)),
+    }  # fmt: skip
+    for name, (low, high) in ends.items():
+        for kind, (said, shape) in shapes.items():
+            text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{0.5 * (low + high):.4g}")
+            yield f"{name} {kind}", f"take {of} with {name} {text}", {name: shape(low, high)}, 1.0
+
+
+def _run(
+    table: RunTable,
+    rows: IntArray,
+    columns: Mapping[str, FloatArray],
+    reading: str,
+    name: str,
+    like: str,
+    slower: float,
+) -> RunTable:
+    """Take rows as a new run, with what is set, and no readings yet."""
+    taken = table.take(rows)
+    changed: dict[str, Any] = {**columns}
+    if reading in table.columns:
+        changed[reading] = np.full(len(rows), np.nan)
+    if table.time is not None:
+        time = table.time_s[rows]
+        begin = time[0] if table.time_begins_anew else _begin(table)
+        changed[table.time] = begin + slower * (time - time[0])
+    run = table.run or _RUN
+    changed[run] = np.full(len(rows), name)
+    return replace(taken, columns={**taken.columns, **changed}, run=run, like={name: table.like.get(like, like)})
+
+
+def _begin(table: RunTable) -> float:
+    """Say when a run after a table begins: as long after it as runs lie apart, ten rows where there is one run."""
+    by_run = [table.time_s[rows] for rows in table.rows_by_scan()]
+    between = [later[0] - earlier[-1] for earlier, later in itertools.pairwise(by_run)]
+    gaps = np.concatenate([np.diff(time) for time in by_run])
+    gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+    apart = [pause for pause in between if pause > 0]
+    return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
+
+
+def one_after_another(commands: Sequence[RunCommand], after: Plan) -> Plan:
+    """Set runs behind each other, each as if it came next: to predict all of them at once."""
+    first, *more = (command.table for command in commands)
+    return cast(Plan, behind(first, more))
+
+
+def in_turn(commands: Sequence[RunCommand], after: Plan) -> Plan:
+    """Take runs one after the other: where time goes on from run to run, each begins later than the one before."""
+    recorded = cast(RunTable, after)
+    out: list[RunTable] = []
+    for command in commands:
+        table = command.table
+        if table.time is not None and not recorded.time_begins_anew and out:
+            later = float(out[-1].time_s[-1]) + _begin(recorded) - float(recorded.time_s.max())
+            table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
+        out.append(table)
+    return cast(Plan, behind(out[0], out[1:]))
+
+
+def _distinct(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
+    """Row numbers of the first runs that differ in what was set, or in how many rows they have."""
+    seen: dict[tuple[object, ...], IntArray] = {}
+    for rows in table.rows_by_scan():
+        if len(rows) >= _LEAST_ROWS:
+            own = tuple(np.round(table.covariates[name][rows], 9).tobytes() for name in controls)
+            seen.setdefault(own or (int(table.scan[rows[0]]),), rows)
+    return list(seen.values())[:_MOST_RUNS]
+
+
+def _ends(values: FloatArray) -> tuple[float, float]:
+    return float(np.nanmin(values)), float(np.nanmax(values))
+
+
+def _minutes(table: RunTable, time_unit: str) -> float:
+    if table.time is None or time_unit not in _MINUTES:
+        return _BREAK + len(table) * _A_READING
+    return _BREAK + float(np.ptp(table.time_s)) * _MINUTES[time_unit]
+
+
+def _and(names: Mapping[str, object]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last

@@ -1,0 +1,113 @@
+"""Several tables of one system, taken together."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise.errors import ParameterError
+from probewise.systems.table import RunTable
+
+__all__ = ["behind", "join_tables"]
+
+_FILE = "file"
+
+
+def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
+    """Set tables behind each other: the first one's columns, and runs of two tables stay two runs.
+
+    A column that another table lacks is missing there. Where no column names the runs, one is added: each table is a run.
+
+    Parameters
+    ----------
+    tables
+        One or more, with the same time and run.
+    sources
+        What messages call each.
+
+    Returns
+    -------
+    The table, and notes on columns that not all have.
+
+    Raises
+    ------
+    ParameterError
+        If two are the same, or a column is of numbers in one and of texts in another.
+    """
+    if not tables:
+        raise ParameterError("tables", (), "one or more")
+    for (one, first), (another, second) in itertools.combinations(zip(sources, tables, strict=True), 2):
+        if _same(first, second):
+            raise ParameterError("tables", f"{one} and {another}", "tables that differ; these hold the same rows")
+    if len(tables) == 1:
+        return tables[0], ()
+    first, notes = tables[0], []
+    for source, table in zip(sources[1:], tables[1:], strict=True):
+        notes += [f"{source} has no column {name}: missing there" for name in first.columns if name not in table.columns]
+        beyond = [name for name in table.columns if name not in first.columns]
+        notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
+    columns = {
+        name: _joined(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources) for name in first.columns
+    }
+    run = first.run or _unused(_FILE, columns)
+    columns[run] = np.array(list(_runs(tables, sources, named=first.run is not None)))
+    return replace(first, columns=columns, run=run), tuple(notes)
+
+
+def behind(table: RunTable, more: Sequence[RunTable]) -> RunTable:
+    """Set tables with the same columns behind a table, with their runs as they are called."""
+    columns = {name: np.concatenate([t.columns[name] for t in (table, *more)]) for name in table.columns}
+    return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
+
+
+def _joined(
+    name: str, parts: Sequence[NDArray[Any] | None], lengths: Sequence[int], sources: Sequence[str]
+) -> NDArray[Any]:
+    first = parts[0]
+    assert first is not None
+    numeric = first.dtype == np.float64
+    out: list[NDArray[Any]] = []
+    for part, n, source in zip(parts, lengths, sources, strict=True):
+        if part is None:
+            out.append(np.full(n, np.nan) if numeric else np.full(n, ""))
+        elif numeric and part.dtype != np.float64:
+            raise ParameterError(f"column {name!r} of {source}", str(part[0]), f"numbers, as in {sources[0]}")
+        else:
+            out.append(part if numeric else np.array([str(value) for value in part.tolist()]))
+    return np.concatenate(out)
+
+
+def _runs(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> Iterable[str]:
+    """Name the run of each row: as in its table, or with a number behind where another table's run has that name."""
+    taken: set[str] = set()
+    for table, source in zip(tables, sources, strict=True):
+        own = {}
+        for name in table.scan_names if named else (source,):
+            own[name] = _unused(name, taken)
+        taken |= set(own.values())
+        names = table.scan_names if named else (source,)
+        yield from (own[names[k]] for k in table.scan.tolist())
+
+
+def _unused(name: str, taken: Iterable[str]) -> str:
+    known = set(taken)
+    numbered = (f"{name} ({k})" for k in itertools.count(2))
+    return next(n for n in itertools.chain([name], numbered) if n not in known)
+
+
+def _same(first: RunTable, second: RunTable) -> bool:
+    """Tell whether two tables hold the same rows."""
+    if len(first) != len(second) or set(first.columns) != set(second.columns):
+        return False
+    return all(_equal(values, second.columns[name]) for name, values in first.columns.items())
+
+
+def _equal(first: NDArray[Any], second: NDArray[Any]) -> bool:
+    if first.dtype == np.float64 and second.dtype == np.float64:
+        return bool(np.array_equal(first, second, equal_nan=True))
+    return [str(v) for v in first.tolist()] == [str(v) for v in second.tolist()]

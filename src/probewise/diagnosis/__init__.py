@@ -24,6 +24,7 @@ from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.system.audit import audit_system
 from probewise.diagnosis.system.diagnose import diagnose_system, notes_on_calls
 from probewise.diagnosis.system.fitted import calibrated_of, repaired_of
 from probewise.diagnosis.unknown_shape import SensorAndShape
@@ -70,6 +71,7 @@ __all__ = [
     "audit_json",
     "audit_plan",
     "audit_recorded",
+    "audit_system",
     "calibrated_of",
     "diagnose",
     "diagnose_system",

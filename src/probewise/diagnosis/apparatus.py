@@ -29,7 +29,8 @@ class Words:
     """How sentences speak of an apparatus: what it is that is calibrated, and how to get a signal where there is none.
 
     `settles_nothing` says of two aliased effects that no reading tells them apart; `run` is what rows that belong
-    together are called; `next_plan` is the file of the readings to take next, `model` that of the repaired model.
+    together are called; `next_plan` is the file of the readings to take next, `model` that of the repaired model; `no_cure` says that no further
+    rows would show an effect.
     """
 
     null: str
@@ -38,6 +39,7 @@ class Words:
     run: str = "scan"
     next_plan: str = "next_plan.csv"
     model: str = "sensor.json"
+    no_cure: str = "no scan of this arm helps"
 
 
 class Apparatus(Protocol):

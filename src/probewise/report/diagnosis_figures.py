@@ -50,7 +50,12 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
         drawn["gain.svg"] = svg(
-            gain_by_scan(gain.heldout_by_scan, gain.heldout_log_density_per_reading, gain.heldout_sd)
+            gain_by_scan(
+                gain.heldout_by_scan,
+                gain.heldout_log_density_per_reading,
+                gain.heldout_sd,
+                part=diagnosis.apparatus.words.run,
+            )
         )
     for place in diagnosis.where:
         drawn[place.witness] = _witness(diagnosis, chance, place, values[place.witness])

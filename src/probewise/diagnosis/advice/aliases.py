@@ -17,7 +17,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, first_of
 
 __all__ = ["Alias", "aliased_pairs", "aliases", "settle", "surviving_cosine"]
 
@@ -82,7 +82,7 @@ def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[A
     telling: dict[str, FloatArray] = {}
     chosen: dict[str, NamedEffect[Any]] = {}
     for name, effect in prepared.effects.items():
-        if name in prepared.on_noise or out_of_vocabulary((name,)):
+        if name in prepared.on_noise or out_of_vocabulary((name,)) or first_of(name) is not None:
             continue
         templates = screening.templates.of(screening.about, effect.coarse())
         blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))

@@ -85,13 +85,19 @@ class PlanTemplates:
 
         Without `most` all of them, but for plans of thousands of readings.
         """
+        extent = Extent(*expected.levels, plan)
+        maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
+        return cls.of_built(expected, plan, {name: effect for name, effect in maybe.items() if effect is not None}, most=most)
+
+    @classmethod
+    def of_built(
+        cls, expected: Expected, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
+    ) -> Self:
+        """Lay out effects that have their scale already."""
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
         model = Model(expected.null, (), plan)
         predicted, slopes = model.jacobian(expected.z)
         found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, sd=expected.sd, objective=0.0)
-        extent = Extent(*expected.levels, plan)
-        maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
-        built = {name: effect for name, effect in maybe.items() if effect is not None}
         columns = [np.zeros((len(plan), 0))]
         settings: list[FloatArray] = []
         owner: list[int] = []

@@ -38,6 +38,7 @@ def audit_json(audit: PlanAudit) -> dict[str, Any]:
             ],
         },
         "after": _effects(audit.after),
+        **({} if audit.classes is None else {"alias_classes": [list(names) for names in audit.classes]}),
     }
 
 
@@ -50,6 +51,7 @@ def _effects(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
             "alike": [{"effect": name, "cosine": cosine} for name, cosine in effect.alike],
             "smallest": [{"parameter": s.parameter, "unit": s.unit, "amount": s.amount} for s in effect.smallest],
             "reason": effect.reason,
+            **({} if effect.rows is None else {"rows": effect.rows}),
         }
         for effect in effects
     ]

@@ -18,12 +18,14 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
 from probewise.calibration import FittedSensor
+from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.audit.cures import cures_of
 from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected, PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.earlier import SensorPrior, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.light_sensor.scheduling import behind
+from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import VOCABULARY, Extent, NamedEffect
@@ -32,7 +34,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
-__all__ = ["Cure", "Detectability", "EffectAudit", "PlanAudit", "Smallest", "audit_plan", "audit_recorded"]
+__all__ = ["Cure", "Detectability", "EffectAudit", "PlanAudit", "Smallest", "audit_plan", "audit_recorded", "judged"]
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
@@ -69,6 +71,8 @@ class EffectAudit:
         The size at which it is seen, for each amplitude.
     reason
         Why it is invisible, or "".
+    rows
+        Rows like these at which it is seen where it changes readings by one noise sd rms; None where not counted.
     """
 
     name: str
@@ -77,6 +81,7 @@ class EffectAudit:
     alike: tuple[tuple[str, float], ...] = ()
     smallest: tuple[Smallest, ...] = ()
     reason: str = ""
+    rows: int | None = None
 
     @property
     def sight(self) -> Detectability:
@@ -113,6 +118,10 @@ class PlanAudit(ShowsItself):
         `effects`; on the diagonal the surviving share.
     cures
         Scans to add, the most telling first.
+    words
+        How to speak of what would take the readings.
+    classes
+        Effects that are not told apart, each class once; None where not asked.
     """
 
     plan: Plan
@@ -121,6 +130,8 @@ class PlanAudit(ShowsItself):
     cosines: FloatArray
     cures: tuple[Cure, ...]
     after: tuple[EffectAudit, ...]
+    words: Words = LightSensor.words
+    classes: tuple[tuple[str, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cosines", frozen(self.cosines))
@@ -151,12 +162,12 @@ class PlanAudit(ShowsItself):
 
     def summary(self) -> str:
         """Say it on one screen."""
-        lines = [f"{len(self.plan)} readings in {len(self.plan.scan_names)} scans; {self.assumed}"]
+        lines = [f"{len(self.plan)} readings in {count_of(self.plan.scan_names, self.words.run)}; {self.assumed}"]
         lines += _listed("fine", [e.name for e in self.seen_as("fine")])
         lines += _listed("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
         lines += _listed("invisible", [e.name for e in self.seen_as("invisible")])
         if not self.cures:
-            cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else "no scan of this arm helps"
+            cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
             return "\n".join([*lines, f"cure       {cured}"])
         minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
         lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
@@ -166,6 +177,11 @@ class PlanAudit(ShowsItself):
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.detectability != "fine"]
         return "\n".join([*lines, *_listed("left", left or ["nothing"])])
+
+
+def count_of(names: Sequence[str], noun: str) -> str:
+    """Count what has names."""
+    return f"{len(names)} {noun}{'' if len(names) == 1 and noun != 'scan' else 's'}"
 
 
 def _with_aliases(effect: EffectAudit) -> str:
@@ -226,14 +242,14 @@ def audit_plan(
     expected, said = _expected(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     progress("judging the plan")
-    before, cosines = _judged(PlanTemplates.of(expected, plan, effects), effects, unit)
+    before, cosines = judged(PlanTemplates.of(expected, plan, effects), effects, unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
     chosen = cures_of(plan, expected, effects, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
         current = behind(current, [command.plan])
-        steps.append(_judged(PlanTemplates.of(expected, current, effects), effects, unit)[0])
+        steps.append(judged(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)
     n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
     cures = tuple(
@@ -290,7 +306,7 @@ def audit_recorded(
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
-    judged, cosines = _judged(
+    judged, cosines = judged(
         PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
     )
     return PlanAudit(plan, "the sensor as calibrated from these readings", judged, cosines, (), judged)
@@ -317,7 +333,7 @@ def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) ->
     return Expected(null, z, (low, high), sd), f"{said}, noise {sd:.3g} {plan.instrumentation.unit}".rstrip()
 
 
-def _judged(
+def judged(
     laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Judge every effect, and how well each (row) is imitated by each other (column)."""

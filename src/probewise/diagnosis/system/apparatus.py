@@ -31,9 +31,9 @@ from probewise.systems import RunTable, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.proposals import proposals
 
-__all__ = ["PersonsSystem"]
+__all__ = ["ON_NOISE", "PersonsSystem"]
 
-_ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
+ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     SignalDependentNoise,
     CorrelatedNoise,
     Outliers,
@@ -71,12 +71,13 @@ class PersonsSystem:
             run="run",
             next_plan="next.csv",
             model="repaired.json",
+            no_cure="more rows, or columns and runs that vary otherwise",
         )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Bind every form that this table could show, and what may be wrong with its noise."""
         extent = Extent.of(recording)
-        on_noise = [effect for kind in _ON_NOISE if (effect := kind.for_extent(extent)) is not None]
+        on_noise = [effect for kind in ON_NOISE if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
         return forms | {effect.name: effect for effect in on_noise}
 

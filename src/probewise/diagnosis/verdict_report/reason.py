@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from probewise.diagnosis.apparatus import Words
@@ -123,4 +123,9 @@ def _named(judged: Judged, grounds: Grounds) -> str:
 
 def _stated(judged: Judged, grounds: Grounds) -> str:
     said = "; ".join(grounds.sentences[name] for name in judged.combination if name in grounds.sentences)
-    return f"{said[0].upper()}{said[1:]}"
+    return said if _is_of_a_person(said.split()[0], judged.combination) else f"{said[0].upper()}{said[1:]}"
+
+
+def _is_of_a_person(word: str, names: Iterable[str]) -> bool:
+    """Tell whether a word is a name that a person gave, which stays as it is."""
+    return "_" in word or any(word in name.split(":")[1:] for name in names)

@@ -190,7 +190,9 @@ def residual_clouds(
     return axes
 
 
-def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float, *, ax: Axes | None = None) -> Axes:
+def gain_by_scan(
+    scans: Sequence[tuple[str, float]], mean: float, sd: float, *, part: str = "scan", ax: Axes | None = None
+) -> Axes:
     """Draw the gain on each held-out scan, nats per reading, and the mean of all with its standard error.
 
     Parameters
@@ -199,6 +201,8 @@ def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float, *, 
         Name and gain of each. Of more than twelve those of largest and least gain are drawn.
     mean, sd
         Over all held-out readings, with the standard error.
+    part
+        What is held out.
     ax
         Axes to draw on; a new figure without.
     """
@@ -210,12 +214,12 @@ def gain_by_scan(scans: Sequence[tuple[str, float]], mean: float, sd: float, *, 
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
     ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, zorder=0)
-    said = f"all scans: {signed(mean, 3)} ± {number(sd, 3)} nats per reading"
+    said = f"all {part}s: {signed(mean, 3)} ± {number(sd, 3)} nats per reading"
     ax.axvline(mean, color=GREY, linewidth=1.4, label=said)
     ax.axvline(0, color=BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
-    tidy(ax, x="gain on a scan that the fit has not seen (nats per reading)", y="held-out scan")
+    tidy(ax, x=f"gain on a {part} that the fit has not seen (nats per reading)", y=f"held-out {part}")
     plain_numbers(ax, y=False)
     legend_above(ax)
     return ax

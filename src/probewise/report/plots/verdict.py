@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from probewise.effects import spoken_name
 
 from probewise.report.plots.canvas import BLUE, GREY, SMALL_PT, axes_or_new, tidy
 
@@ -39,7 +38,7 @@ def hypothesis_probabilities(
     beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": SMALL_PT}
     for y, (name, p) in zip(at, shown, strict=True):
         ax.annotate(f"{p:.3f}", (p, y - 0.22), xytext=(4, 0), va="center", **beside)
-        ax.annotate(spoken_name(name), (0.0, y + 0.06), xytext=(3, 0), **beside)
+        ax.annotate(name, (0.0, y + 0.06), xytext=(3, 0), **beside)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
     ax.set_xlim(0, 1.08)

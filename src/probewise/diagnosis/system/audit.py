@@ -1,0 +1,137 @@
+"""Audit a table before any reading: which effects it could not show, or not tell apart, for a person's simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
+from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, judged
+from probewise.diagnosis.system.apparatus import ON_NOISE, PersonsSystem
+from probewise.effects import NamedEffect, first_of
+from probewise.errors import ParameterError
+from probewise.recordings.plan import Plan
+from probewise.systems import RunTable, Simulator, System, as_recording
+from probewise.systems.forms import About, driving_columns, forms_of
+
+__all__ = ["audit_system"]
+
+_STANDS_STILL = 0.02  # noise sds that predictions may move by when the step of the integration is halved
+_NOISE = 0.01  # of the span of the readings, where the noise was not declared
+_SETTINGS = 64  # of an effect's bank
+_MOST_ROWS = 1200  # that are looked at; of a longer table every second, every third, ...
+
+
+def audit_system(simulator: Simulator, table: RunTable) -> PlanAudit:
+    """Say of each effect whether a table could show it and tell it from the others, at the middle of the prior.
+
+    Where the readings there do not change at all, as those of a pendulum at rest, another place of the prior is taken,
+    and `assumed` says so. The column of the readings plays no part.
+
+    Parameters
+    ----------
+    simulator
+        The simulator.
+    table
+        The rows, with the columns that it reads.
+
+    Raises
+    ------
+    ParameterError
+        If the simulator and the table do not fit together, or the readings change nowhere in the prior.
+    """
+    own = cast(RunTable, as_recording(simulator, _without_readings(simulator, table)).plan)
+    system = System.of(simulator, own)
+    z, predicted, where = _middle(system, own)
+    sd, noise = _noise(simulator, own, predicted)
+    system = system.standing_still(own, z[None, :], tolerance=_STANDS_STILL * sd)
+    about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
+    forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
+    on_noise = {kind.name: kind() for kind in ON_NOISE}
+    built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
+    reasons = _reasons(about)
+    names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
+    expected = Expected(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
+    stride = -(-len(own) // _MOST_ROWS)
+    laid = PlanTemplates.of_built(expected, cast(Plan, own), built, most=_SETTINGS)
+    laid = replace(laid, slopes=laid.slopes[::stride], columns=laid.columns[::stride])
+    found, cosines = judged(laid, cast(Any, names), simulator.unit)
+    effects = tuple(_with_rows(effect, reasons) for effect in found)
+    assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
+    words = PersonsSystem(about).words
+    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _classes(effects))
+
+
+def _without_readings(simulator: Simulator, table: RunTable) -> RunTable:
+    return replace(table, columns={name: v for name, v in table.columns.items() if name != simulator.reading})
+
+
+def _middle(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
+    """Take the middle of the prior, or the first place of it at which readings change, and what they are there."""
+    for k, z in enumerate(system.starts):
+        predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
+        if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-9 * max(float(np.abs(predicted).max()), 1e-300):
+            at = "the middle of the prior" if k == 0 else "a place of the prior beside its middle, where readings stand still"
+            return z, predicted, at
+    raise ParameterError("the table", "one reading in all rows", "rows over which what the simulator predicts changes")
+
+
+def _noise(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:
+    declared = simulator.noise.sd
+    if isinstance(declared, str):
+        values = table.columns.get(declared)
+        if values is not None and values.dtype == np.float64 and np.isfinite(values).any():
+            return float(np.nanmedian(values)), f"the median of {declared}"
+    elif declared is not None:
+        return float(declared), "as declared"
+    return _NOISE * float(np.ptp(predicted)), "a hundredth of the span of the readings, for none was declared"
+
+
+def _reasons(about: About) -> dict[str, str]:
+    """Say of every effect on such a simulator why it could not be bound, were it not."""
+    own, table = about.system.simulator, about.table
+    timeless = "no time was recorded" if not table.has_time else "it changes nothing here"
+    one_run = "there is one run" if len(table.scan_names) == 1 else "it changes nothing here"
+    nothing = "it changes nothing here"
+    out = {"offset_drift": timeless, "gain_drift": timeless, "offset_step": nothing, "gain_step": nothing}
+    out |= {"offset_per_run": one_run, "gain_per_run": one_run, "nonlinearity": nothing, "saturation": nothing}
+    out |= {"hysteresis": "the readings move one way only"}
+    out |= dict.fromkeys(("lag", "delay", "settling", "interference"), timeless)
+    out |= {f"sensitivity:{c}": "the column does not vary" for c in table.covariates if c not in (own.reading, own.noise.sd)}
+    for column in driving_columns(about):
+        out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
+        out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}
+        out |= {f"periodic_error:{column}": "the column has too few values"}
+    out |= {"clock_drift": timeless}
+    for name in own.parameters:
+        out |= {f"drifts:{name}": timeless, f"steps:{name}": nothing}
+        if name not in own.per_run:
+            out[f"differs:{name}"] = one_run
+    for state in about.states:
+        kinds = ("damping", "drag", "friction", "forcing", "periodic_forcing", "limit")
+        out |= {f"{kind}:{state}": nothing for kind in kinds}
+    return out
+
+
+def _with_rows(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
+    """Count rows like these at which lambda 8 is left of an effect that changes readings by one noise sd rms."""
+    if effect.share == 0:
+        return replace(effect, reason=reasons.get(effect.name, effect.reason))
+    return replace(effect, rows=math.ceil((LAMBDA / effect.share) ** 2))
+
+
+def _classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
+    """Join effects that are taken for each other, directly or by way of others."""
+    group = {effect.name: {effect.name} for effect in effects}
+    for effect in effects:
+        for name, _ in effect.alike:
+            if group[name] is not group[effect.name]:
+                joined = group[name] | group[effect.name]
+                group |= dict.fromkeys(joined, joined)
+    kept = {id(members): tuple(sorted(members)) for members in group.values() if len(members) > 1}
+    return tuple(sorted(kept.values()))

@@ -17,7 +17,19 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from probewise.cli import arm, audit, calibrate, challenge, demo, diagnose, emulate_nxt, explore, predict, study
+from probewise.cli import (
+    arm,
+    audit,
+    calibrate,
+    challenge,
+    demo,
+    diagnose,
+    emulate_nxt,
+    explore,
+    fit,
+    predict,
+    study,
+)
 from probewise.cli._common import OneLineParser, Verb
 from probewise.cli._stopping import Stopped, stoppable
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
@@ -32,6 +44,7 @@ VERBS: tuple[Verb, ...] = (
     study.VERB,
     audit.VERB,
     diagnose.VERB,
+    fit.VERB,
     challenge.VERB,
     arm.VERB,
     emulate_nxt.VERB,

@@ -25,7 +25,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from probewise.cli._bars import of_nested, progress_shown
+    from probewise._progress import of_nested, progress_shown
     from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
     from probewise.report import diagnosis as report
     from probewise.systems import read_simulator

@@ -8,22 +8,25 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, a_path, add_quiet, say
 from probewise.cli._output import check_out_directory, staged
+from probewise.cli._simulator import add_simulator, refuse_beside
 
 if TYPE_CHECKING:
     from probewise.diagnosis import PlanAudit
+    from probewise.progress import Progress
 
 __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
-    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
+    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it; with --simulator any table")
     parser.add_argument(
         "--sensor",
         type=a_path,
         metavar="S.json",
         help="the sensor as calibrated; without, a typical one is expected",
     )
+    add_simulator(parser)
     parser.add_argument(
         "--out",
         type=a_path,
@@ -42,9 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = None if arguments.out is None else check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
-        plan = read_plan(arguments.plan, progress=progress)
-        sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
-        audit = audit_plan(plan, sensor=sensor, progress=progress)
+        if arguments.simulator is not None:
+            audit = _of_simulator(arguments, progress)
+        else:
+            plan = read_plan(arguments.plan, progress=progress)
+            sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+            audit = audit_plan(plan, sensor=sensor, progress=progress)
         progress("drawing the figures")
         notes = [] if out is None else _write(audit, out, arguments.plan)
     say(audit.summary(), quiet=arguments.quiet)
@@ -53,6 +59,17 @@ def run(arguments: argparse.Namespace) -> int:
     if out is not None:
         say(f"written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _of_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudit:
+    from probewise.diagnosis import audit_system
+    from probewise.systems import read_run_table, read_simulator
+
+    refuse_beside(arguments, "sensor")
+    simulator = read_simulator(arguments.simulator)
+    table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
+    progress("laying out effects")
+    return audit_system(simulator, table)
 
 
 def _write(audit: PlanAudit, out: Path, plan: Path) -> list[str]:

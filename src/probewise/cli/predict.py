@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-
-from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._common import Verb, a_path, add_common, say
 from probewise.cli._output import check_out_file
+from probewise.cli._simulator import add_simulator
 
 __all__ = ["VERB"]
 
@@ -13,15 +13,21 @@ __all__ = ["VERB"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
     parser.add_argument(
-        "sensor", type=a_path, metavar="S.json", help="sensor model, as calibrate and diagnose write it"
+        "sensor",
+        type=a_path,
+        metavar="S.json",
+        help="sensor model, as calibrate and diagnose write it; with --simulator a repaired.json or calibrated.json",
     )
-    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it")
+    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it; with --simulator any table")
     parser.add_argument("--out", type=a_path, required=True, metavar="P.csv", help="where the prediction goes")
-    add_quiet(parser)
+    add_simulator(parser)
+    add_common(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict every row, and say how well the readings were expected where there are any."""
+    if arguments.simulator is not None:
+        return _by_simulator(arguments)
     from probewise._progress import progress_shown
     from probewise.calibration import predict, read_sensor
     from probewise.recordings import read_plan_and_readings, write_prediction
@@ -34,6 +40,31 @@ def run(arguments: argparse.Namespace) -> int:
         progress(f"writing {out.name}")
         out.parent.mkdir(parents=True, exist_ok=True)
         write_prediction(prediction, out)
+    say(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _by_simulator(arguments: argparse.Namespace) -> int:
+    """Predict every row of a table by a simulator and what a diagnosis, or a fit, has found of it."""
+    import numpy as np
+
+    from probewise._progress import progress_shown
+    from probewise.systems import (
+        predict_system,
+        read_fitted_system,
+        read_run_table,
+        read_simulator,
+        write_system_prediction,
+    )
+
+    out = check_out_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
+    simulator = read_simulator(arguments.simulator)
+    fitted = read_fitted_system(arguments.sensor, simulator)
+    table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        prediction = predict_system(fitted, table, rng=np.random.default_rng(arguments.seed), progress=progress)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_system_prediction(prediction, out)
     say(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 

@@ -26,6 +26,7 @@ from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.system.audit import audit_system
 from probewise.diagnosis.system.diagnose import diagnose_system, notes_on_calls
+from probewise.diagnosis.system.fit import Evidence, SystemFit, fit_json, fit_simulator
 from probewise.diagnosis.system.fitted import calibrated_of, repaired_of
 from probewise.diagnosis.unknown_shape import SensorAndShape
 from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
@@ -44,6 +45,7 @@ __all__ = [
     "Diagnosis",
     "EffectAudit",
     "EffectFound",
+    "Evidence",
     "Formula",
     "Hypothesis",
     "Improvement",
@@ -64,6 +66,7 @@ __all__ = [
     "SensorAndShape",
     "SensorPrior",
     "Smallest",
+    "SystemFit",
     "Thorough",
     "Verdict",
     "VerdictReport",
@@ -77,6 +80,8 @@ __all__ = [
     "diagnose_system",
     "diagnosis_json",
     "diagnosis_schema",
+    "fit_json",
+    "fit_simulator",
     "join",
     "model_with",
     "notes_on_calls",

@@ -16,7 +16,7 @@ from probewise.recordings.files import plan_columns
 from probewise.recordings.plan import Plan
 from probewise.recordings.table import csv_text, number_text, read_table
 
-__all__ = ["Prediction", "read_prediction", "write_prediction"]
+__all__ = ["Prediction", "read_prediction", "said_of_prediction", "write_prediction"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +59,22 @@ class Prediction(ShowsItself):
 
     def summary(self) -> str:
         """Say how many readings were predicted and, of those that were recorded, how well they were expected."""
-        lines = [f"{len(self)} readings predicted"]
-        scored = np.isfinite(self.log_density) & np.isfinite(self.readings)
-        if scored.any():
-            n_left = int(len(self) - scored.sum())
-            left_out = f" ({n_left} missing or out of range, left out)" if n_left else ""
-            z = (self.readings[scored] - self.mean[scored]) / self.sd[scored]
-            lines.append(
-                f"of {int(scored.sum())} recorded{left_out}: chi-square per reading {float(np.mean(z**2)):.3f}, "
-                f"log density per reading {float(self.log_density[scored].mean()):.3f}"
-            )
-        return "\n".join(lines)
+        return said_of_prediction(self.readings, self.mean, self.sd, self.log_density)
+
+
+def said_of_prediction(readings: FloatArray, mean: FloatArray, sd: FloatArray, log_density: FloatArray) -> str:
+    """Say how many readings were predicted and how well those that were recorded were expected; all (n_points,)."""
+    lines = [f"{len(mean)} readings predicted"]
+    scored = np.isfinite(log_density) & np.isfinite(readings)
+    if scored.any():
+        n_left = int(len(mean) - scored.sum())
+        left_out = f" ({n_left} missing or out of range, left out)" if n_left else ""
+        z = (readings[scored] - mean[scored]) / sd[scored]
+        lines.append(
+            f"of {int(scored.sum())} recorded{left_out}: chi-square per reading {float(np.mean(z**2)):.3f}, "
+            f"log density per reading {float(log_density[scored].mean()):.3f}"
+        )
+    return "\n".join(lines)
 
 
 def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:

@@ -2,9 +2,9 @@
 
 from probewise.systems.calls import CountedCalls
 from probewise.systems.file import read_simulator
-from probewise.systems.fitted import FittedSystem, read_fitted_system, write_fitted_system
+from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
 from probewise.systems.joining import join_tables
-from probewise.systems.prediction import SystemPrediction, as_recording, predict_system
+from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
 from probewise.systems.simulator import Extra, Law, Noise, Simulator
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, read_run_table, write_run_table
@@ -27,6 +27,8 @@ __all__ = [
     "read_fitted_system",
     "read_run_table",
     "read_simulator",
+    "samples_csv",
     "write_fitted_system",
+    "write_system_prediction",
     "write_run_table",
 ]

@@ -18,12 +18,12 @@ from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
 from probewise.recordings import strict_json, write_text_atomically
-from probewise.recordings.table import read_text
+from probewise.recordings.table import csv_text, number_text, read_text
 from probewise.systems.forms.again import Recorded
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
-__all__ = ["FORMAT", "MIN_SAMPLES", "FittedSystem", "read_fitted_system", "write_fitted_system"]
+__all__ = ["FORMAT", "MIN_SAMPLES", "FittedSystem", "read_fitted_system", "samples_csv", "write_fitted_system"]
 
 FORMAT = "system/1"
 MIN_SAMPLES = 500
@@ -237,3 +237,10 @@ def _marks(rows: list[int], n_samples: int) -> BoolArray:
     out = np.zeros(n_samples, dtype=np.bool_)
     out[np.array(rows, dtype=np.int64)] = True
     return out
+
+
+def samples_csv(fitted: FittedSystem) -> str:
+    """Write the posterior samples out as the text of a CSV file: a column a parameter, and the sd of the noise."""
+    columns = {name: fitted.samples[:, k] for k, name in enumerate(fitted.names)}
+    columns["noise_sd"] = fitted.noise_sd
+    return csv_text({name: [number_text(value) for value in values] for name, values in columns.items()})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,8 +14,10 @@ from probewise._arrays import FloatArray
 from probewise.effects import EFFECTS, NamedEffect, PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
-from probewise.recordings import Instrumentation
+from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.recordings.plan import Plan
+from probewise.recordings.prediction import said_of_prediction
+from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import AnyEffect, NoiseLevel, Stage
 from probewise.systems.fitted import FittedSystem
 from probewise.systems.forms.again import forms_again, own_of_runs
@@ -22,7 +25,7 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable
 
-__all__ = ["SystemPrediction", "as_recording", "predict_system"]
+__all__ = ["SystemPrediction", "as_recording", "predict_system", "write_system_prediction"]
 
 _BLOCK = 2_000_000  # numbers held at once by one pass over some samples
 
@@ -43,6 +46,10 @@ class SystemPrediction:
     log_density: FloatArray
     n_samples: int
     n_failed: int = 0
+
+    def summary(self) -> str:
+        """Say how many readings were predicted and, of those that were recorded, how well they were expected."""
+        return said_of_prediction(self.readings, self.mean, self.sd, self.log_density)
 
 
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
@@ -203,3 +210,21 @@ def _noise_level(
         if effect.stage is Stage.NOISE:
             level = effect.apply(level, theta[:, start:end], cast(Any, table))
     return level
+
+
+def write_system_prediction(prediction: SystemPrediction, path: str | os.PathLike[str]) -> None:
+    """Write the rows of the table in their order, none dropped, with `mean`, `sd` and `log_density`, in full precision.
+
+    Columns of the table that have one of these names are left out.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    predicted = {"mean": prediction.mean, "sd": prediction.sd, "log_density": prediction.log_density}
+    columns = {
+        name: [number_text(v) if values.dtype == np.float64 else str(v) for v in values.tolist()]
+        for name, values in {**prediction.table.columns, **predicted}.items()
+    }
+    write_text_atomically(path, csv_text(columns))

@@ -67,9 +67,15 @@ def diagnose_system(
 
 
 def prepare_system(
-    simulator: Simulator, table: RunTable, *, source: str = "", notes: Sequence[str] = (), progress: Progress = silent
+    simulator: Simulator,
+    table: RunTable,
+    *,
+    source: str = "",
+    notes: Sequence[str] = (),
+    progress: Progress = silent,
+    bound: bool = True,
 ) -> Prepared:
-    """Fit the simulator, and bind the forms about the fit."""
+    """Fit the simulator, and bind the forms about the fit; none where they are not to be `bound`."""
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
     told = progress if system.caller is None else CountedCalls(progress, system.caller)
@@ -78,7 +84,7 @@ def prepare_system(
     apparatus = PersonsSystem(About(system, table, found.z, sd))
     begun = replace(system, first=found.z)
     told("binding effects")
-    effects = apparatus.effects(recording, begun)
+    effects = apparatus.effects(recording, begun) if bound else {}
     told("diagnosing")
     return Prepared(recording, effects, begun, apparatus, recording)
 

@@ -7,13 +7,15 @@ from typing import cast
 
 import numpy as np
 
+from probewise._arrays import FloatArray
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
-from probewise.systems import FittedSystem, RunTable, write_run_table
-from probewise.systems.forms.again import recorded
+from probewise.recordings.plan import Recording
+from probewise.systems import FittedSystem, RunTable, System, write_run_table
+from probewise.systems.forms.again import Recorded, recorded
 
-__all__ = ["calibrated_of", "repaired_of"]
+__all__ = ["calibrated_of", "fitted_system", "repaired_of"]
 
 
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
@@ -36,9 +38,29 @@ def _fitted(diagnosis: Diagnosis, model: ModelSamples) -> FittedSystem:
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, PersonsSystem):
         raise TypeError("a light sensor's models are written as sensor.json; a simulator's alone as system/1")
-    system, table = apparatus.system, cast(RunTable, diagnosis.recording.plan)
-    level = diagnosis.repair.before.readings[diagnosis.recording.usable]
-    about = apparatus.about
+    before = diagnosis.repair.before.readings
+    return fitted_system(
+        apparatus.system, model, diagnosis.recording, before, known=recorded(apparatus.about) if model.effects else None
+    )
+
+
+def fitted_system(
+    system: System, model: ModelSamples, recording: Recording, predicted: FloatArray, *, known: Recorded | None = None
+) -> FittedSystem:
+    """Take posterior samples of a system for the file that carries them.
+
+    Parameters
+    ----------
+    system, model
+        The simulator over the runs of the recording, and the samples.
+    recording
+        What it was fitted to.
+    predicted
+        What it predicts of every row, (n_points,).
+    known
+        What the effects were bound about, if there are any.
+    """
+    level = predicted[recording.usable]
     return FittedSystem(
         system.simulator,
         names=tuple(model.chain.names),
@@ -48,8 +70,8 @@ def _fitted(diagnosis: Diagnosis, model: ModelSamples) -> FittedSystem:
         absent=model.absent,
         level=(float(np.min(level)), float(np.max(level))),
         max_step=system.max_step,
-        known=recorded(about) if model.effects else None,
-        recording=hashlib.sha256(write_run_table(table).encode()).hexdigest()[:16],
-        source=diagnosis.recording.source,
-        notes=diagnosis.recording.notes,
+        known=known,
+        recording=hashlib.sha256(write_run_table(cast(RunTable, recording.plan)).encode()).hexdigest()[:16],
+        source=recording.source,
+        notes=recording.notes,
     )

@@ -15,6 +15,7 @@ from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
 from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
+from probewise.report.plots.fit import predicted_and_recorded
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.noise import (
     correlation_of_neighbours,
@@ -66,6 +67,7 @@ __all__ = [
     "png",
     "posterior_widths",
     "predicted_against_recorded",
+    "predicted_and_recorded",
     "quadrant_patterns",
     "reach_map",
     "readings_by_orientation",

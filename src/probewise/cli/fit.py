@@ -1,0 +1,60 @@
+"""`probewise fit`: a person's simulator fitted to their table, without a diagnosis."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._output import check_out_directory, staged
+from probewise.cli._simulator import add_simulator, read_tables
+from probewise.errors import ParameterError
+
+__all__ = ["VERB"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument(
+        "tables", type=a_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
+    )
+    add_simulator(parser)
+    add_out_directory(parser)
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit and write fit.json, fitted.json, samples.csv, report.html and the figures."""
+    import numpy as np
+
+    from probewise._progress import progress_shown
+    from probewise.diagnosis import fit_json, fit_simulator
+    from probewise.report import fit as report
+    from probewise.systems import read_simulator, samples_csv, write_fitted_system
+
+    if arguments.simulator is None:
+        raise ParameterError("--simulator", None, "FILE.py, the simulator to fit; a light sensor is fitted by calibrate")
+    out = check_out_directory(arguments.out)
+    simulator = read_simulator(arguments.simulator)
+    table, notes = read_tables(simulator, arguments.tables)
+    source = ", ".join(path.name for path in arguments.tables)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        rng = np.random.default_rng(arguments.seed)
+        fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
+        progress("drawing the figures")
+        drawn = report.figures(fitted)
+    with staged(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
+        text = json.dumps(fit_json(fitted), allow_nan=False, indent=1)
+        (stage / "fit.json").write_text(text + "\n", encoding="utf-8")
+        write_fitted_system(fitted.fitted, stage / "fitted.json")
+        (stage / "samples.csv").write_text(samples_csv(fitted.fitted), encoding="utf-8")
+        for name, png in drawn.items():
+            (stage / name).write_bytes(png)
+        (stage / "report.html").write_text(report.write_page(fitted, drawn, seed=arguments.seed), encoding="utf-8")
+    for note in (*notes, *stage.notes):
+        say(f"note: {note}", quiet=arguments.quiet)
+    say(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+VERB = Verb("fit", "Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.", add_arguments, run)

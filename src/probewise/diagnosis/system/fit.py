@@ -1,0 +1,244 @@
+"""Fit a person's simulator to their table: posterior and evidence, and nothing else."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise import nested
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.joint import JointProblem
+from probewise.diagnosis.evidence.laplace import NoiseEvidence
+from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.fitting.coordinates import FARTHEST
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
+from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.nulls import fit_nulls
+from probewise.diagnosis.search.refits import Refits
+from probewise.diagnosis.search.state import SearchState
+from probewise.diagnosis.search.weighed_fit import WeighedFit
+from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.system.fitted import fitted_system
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.progress import Progress, silent
+from probewise.recordings.plan import Recording
+from probewise.systems import FittedSystem, RunTable, Simulator
+
+__all__ = ["Evidence", "SystemFit", "fit_json", "fit_simulator"]
+
+_N_LIVE = 200
+_MOST_NUMBERS = 60_000_000  # readings that nested sampling predicts; those of a law, which is integrated, count twice
+_LEAST_CALLS = 50_000  # of the likelihood, without which it would not end
+_MOST_PARAMETERS = 24  # beyond them it would take more
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Log evidence (nats) and its error, 0 where none is known; by which method, and why not by nested sampling."""
+
+    log_z: float
+    error: float
+    method: str
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class SystemFit:
+    """A simulator fitted to a table.
+
+    Parameters
+    ----------
+    recording
+        The table with its readings.
+    fitted
+        The simulator with posterior samples.
+    evidence
+        Log evidence.
+    predicted, sd
+        Mean and sd of every row's reading by the posterior, (n_points,).
+    """
+
+    recording: Recording
+    fitted: FittedSystem
+    evidence: Evidence
+    predicted: FloatArray
+    sd: FloatArray
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Recorded minus predicted, (n_points,), NaN where there is no usable reading."""
+        return np.where(self.recording.usable, self.recording.readings - self.predicted, np.nan)
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the residuals."""
+        return float(np.sqrt(np.nanmean(self.residuals**2)))
+
+    def summary(self) -> str:
+        """Describe the fit in plain text."""
+        own, unit = self.fitted, self.recording.plan.instrumentation.unit
+        how = f" ({self.evidence.reason})" if self.evidence.reason else ""
+        error = f" ± {self.evidence.error:.2f}" if self.evidence.error else ""
+        lines = [
+            f"{int(self.recording.usable.sum())} readings, rms of the residuals {self.rms:.4g} {unit}",
+            f"log evidence {self.evidence.log_z:.2f}{error} nats by {self.evidence.method}{how}",
+            f"noise of a new reading {np.median(own.noise_sd):.4g} {unit}",
+        ]
+        width = max(9, *(len(name) for name in own.names))
+        median, interval = np.median(own.samples, axis=0), own.interval()
+        lines.append(f"{'parameter':<{width}}  {'median':>11}  95 % interval")
+        lines += [
+            f"{name:<{width}}  {median[k]:>11.5g}  {interval[name][0]:.5g} to {interval[name][1]:.5g}"
+            for k, name in enumerate(own.names)
+        ]
+        return "\n".join(lines)
+
+
+def fit_simulator(
+    simulator: Simulator,
+    table: RunTable,
+    *,
+    source: str = "",
+    notes: Sequence[str] = (),
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> SystemFit:
+    """Fit a simulator to a table of readings: posterior and evidence, without asking what it leaves out.
+
+    Parameters
+    ----------
+    simulator
+        What predicts the readings.
+    table
+        What was recorded, with the column that is predicted.
+    source, notes
+        What the table is called, and what is to be noted of it.
+    rng
+        Source of randomness.
+    progress
+        Told what is being done.
+
+    Returns
+    -------
+    SystemFit
+        With evidence and posterior by nested sampling where `simulate` takes all samples at once, or there is a law,
+        and that ends before 60 million readings have been predicted; else by the Laplace approximation, and it says so.
+
+    Raises
+    ------
+    ParameterError
+        If simulator and table do not fit together, or there are too few readings.
+    NotConvergedError
+        If the fit did not arrive anywhere.
+    """
+    prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, bound=False)
+    if prepared.too_little:
+        found = f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"
+        raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
+    null, noise = _weighed(prepared)
+    samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
+    evidence = Evidence(noise.log_z + null.log_factor, 0.0, "the Laplace approximation", _why_not(prepared))
+    if not evidence.reason:
+        samples, evidence = _by_nested_sampling(prepared, null, noise, samples, evidence, rng=rng, progress=progress)
+    recording, system = prepared.recording, cast(PersonsSystem, prepared.apparatus).system
+    predicted = samples.chain.predict(samples.theta, recording.plan)
+    sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2))
+    fitted = fitted_system(system, samples, recording, predicted.mean(axis=0))
+    return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
+
+
+def _weighed(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
+    """Weigh the simulator alone, noise white."""
+    prior = PriorOdds.over({})
+    noises, templates = Noises(prepared.recording, {}, prior), TemplateMemory(prepared.usable)
+    state = SearchState({}, prior, noises, templates, Refits(prepared.null, noises, templates), frozenset())
+    fit_nulls(state, prepared, max_order=1)
+    return state.null, state.null.evidence[()]
+
+
+def _why_not(prepared: Prepared) -> str:
+    """Say why nested sampling would take too long; "" where it would not."""
+    system = cast(PersonsSystem, prepared.apparatus).system
+    if system.n_params > _MOST_PARAMETERS:
+        return f"nested sampling of {system.n_params} parameters would take too many calls"
+    if system.caller is not None and not system.caller.broadcasts:
+        return "nested sampling would take too many calls of simulate, which takes one sample at a time"
+    if _most_calls(prepared) < _LEAST_CALLS:
+        return f"nested sampling would take too long with {len(prepared.recording)} rows"
+    return ""
+
+
+def _most_calls(prepared: Prepared) -> int:
+    each = 1 if cast(PersonsSystem, prepared.apparatus).system.simulator.law is None else 2
+    return _MOST_NUMBERS // (each * len(prepared.recording))
+
+
+def _by_nested_sampling(
+    prepared: Prepared,
+    null: WeighedFit,
+    noise: NoiseEvidence,
+    samples: ModelSamples,
+    otherwise: Evidence,
+    *,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[ModelSamples, Evidence]:
+    """Search the whole prior; keep what is given where that does not end in time."""
+    problem = JointProblem(null.found.model, prepared.recording, noise)
+    n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * problem.model.n_params)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against it is told
+        found = nested.run(
+            problem, rng=rng, n_live=n_live, max_calls=_most_calls(prepared), progress=_told(progress),
+            return_interrupted=False,
+        )  # fmt: skip
+    if found.warnings:
+        return samples, replace(otherwise, reason=f"nested sampling: {found.warnings[0]}")
+    z = np.clip(found.samples(N_SAMPLES, rng=rng), -FARTHEST, FARTHEST)
+    law, usable = noise.law, prepared.recording.usable
+    residuals = prepared.recording.readings[usable] - null.found.model.predict(z)[:, usable]
+    sigma = law.scale(law(residuals.T))
+    noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, N_SAMPLES))
+    theta = cast(Any, null.found.model.sensor).theta(z)
+    evidence = Evidence(found.log_z + null.log_factor, found.log_z_error, "nested sampling")
+    return replace(samples, theta=theta, noise_sd=noise_sd), evidence
+
+
+def _told(progress: Progress) -> Callable[[nested.State], None]:
+    def tell(state: nested.State) -> None:
+        to_come = state.log_z_remaining - state.log_z
+        progress("nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")
+
+    return tell
+
+
+def fit_json(fit: SystemFit) -> dict[str, Any]:
+    """Lay a fit out as fit.json, format "fit/1": strict JSON."""
+    own, interval = fit.fitted, fit.fitted.interval()
+    median, sd = np.median(own.samples, axis=0).tolist(), own.samples.std(axis=0).tolist()
+    return {
+        "format": "fit/1",
+        "simulator": {"source": own.simulator.source, "fingerprint": own.simulator.fingerprint},
+        "recording": {"source": own.source, "fingerprint": own.recording, "readings": int(fit.recording.usable.sum())},
+        "parameters": [
+            {"name": name, "median": median[k], "sd": sd[k], "interval95": list(interval[name])}
+            for k, name in enumerate(own.names)
+        ],
+        "noise": {"unit": own.simulator.unit, "median": float(np.median(own.noise_sd))},
+        "log_evidence": {
+            "value": fit.evidence.log_z,
+            "error": fit.evidence.error or None,
+            "method": fit.evidence.method,
+            "reason": fit.evidence.reason,
+        },
+        "rms": fit.rms,
+        "samples": "samples.csv",
+        "model": "fitted.json",
+    }

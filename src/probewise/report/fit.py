@@ -1,0 +1,78 @@
+"""The page of a fit: predicted against recorded, the posterior, the evidence, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis import SystemFit
+from probewise.report.html import Section, definition_list, figure, page, paragraph, table
+from probewise.report.plots import predicted_and_recorded, residual_clouds, svg
+from probewise.report.words import number, readable, unit_name
+from probewise.systems import RunTable
+
+__all__ = ["answer", "figures", "write_page"]
+
+_MOST_COLUMNS = 6
+
+
+def answer(fit: SystemFit) -> str:
+    """Say in one sentence how well the simulator fits."""
+    unit = unit_name(fit.recording.plan.instrumentation.unit)
+    n = int(fit.recording.usable.sum())
+    return f"The simulator fits {n} readings with residuals of {fit.rms:.3g} {unit} (rms)."
+
+
+def figures(fit: SystemFit) -> dict[str, bytes]:
+    """Draw predicted against recorded, and the residuals along time, level and every column that varies."""
+    recording, own = fit.recording, fit.fitted.simulator
+    unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
+    drawn = svg(predicted_and_recorded(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
+    clouds = residual_clouds(_along(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit)
+    return {"predicted.svg": drawn, "residuals.svg": svg(clouds)}
+
+
+def _along(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
+    own = fit.fitted.simulator
+    time = f"{plan.time} ({own.time_unit})" if plan.has_time else "row of the table"
+    out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
+    varying = {name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd) and np.nanstd(v) > 0}
+    return (*out, *list(varying.items())[: _MOST_COLUMNS - len(out)])
+
+
+def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
+    """Write the whole page."""
+    own, evidence = fit.fitted, fit.evidence
+    median, interval = np.median(own.samples, axis=0), own.interval()
+    error = f" ± {number(evidence.error, 2)}" if evidence.error else ""
+    how = f"; {evidence.reason}" if evidence.reason else ""
+    rows = [
+        (name, readable(f"{median[k]:.5g}"), readable(f"{interval[name][0]:.5g} to {interval[name][1]:.5g}"))
+        for k, name in enumerate(own.names)
+    ]
+    run = (
+        ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
+        ("simulator", own.simulator.source or "given in Python"),
+        ("noise of a new reading", f"{np.median(own.noise_sd):.4g} {unit_name(own.simulator.unit)}"),
+        ("log evidence", f"{number(evidence.log_z, 2)}{error} nats by {evidence.method}{how}"),
+        ("seed", str(seed)),
+    )
+    return page(
+        f"Fit of {own.source}",
+        answer=answer(fit),
+        key_figure=figure(drawn["predicted.svg"], "Recorded against predicted readings; on the line they are the same."),
+        sections=[
+            Section("Posterior", (table(("parameter", "median", "95 % interval"), rows),)),
+            Section(
+                "Residuals",
+                (
+                    figure(drawn["residuals.svg"], "Recorded minus predicted reading, with running means."),
+                    paragraph("What stands out in them, and which physics would explain it: probewise diagnose."),
+                ),
+            ),
+            Section("This run", (definition_list(run), *(paragraph(f"Note: {note}.") for note in fit.recording.notes))),
+        ],
+    )

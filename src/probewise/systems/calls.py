@@ -15,10 +15,17 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.progress import Progress
 from probewise.systems.simulator import Simulate
 
-__all__ = ["Caller", "CountedCalls"]
+__all__ = ["Caller", "CountedCalls", "Tally"]
 
 _N_NODES = 5  # values at which a parameter that cannot vary by row is held, to interpolate between
 _SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
+
+
+@dataclass(eq=False)
+class Tally:
+    """Count samples at which a law raises an error."""
+
+    n_failed: int = 0
 
 
 @dataclass(eq=False)
@@ -65,7 +72,8 @@ class Caller:
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run))
         if broadcasts:
             together = cls(simulate, broadcasts=True)
-            together(samples, columns)
+            if not np.isfinite(together(samples, columns, strict=True)).any():
+                raise ParameterError("simulate", "NaN at every place of the prior that was tried", "finite readings")
             return together
         alone = one(samples, columns, strict=True)
         if not np.isfinite(alone).any():

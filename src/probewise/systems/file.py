@@ -6,6 +6,7 @@ import hashlib
 import os
 import traceback
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -57,7 +58,12 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     try:
         return _simulator(said, path, text)
     except ParameterError as error:
-        raise FileError(path, f"{error.name} is {error.value!r}", error.allowed) from error
+        found = f"{error.name} is {error.value!r}" if error.value is not None else f"{error.name} is missing"
+        like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []
+        hint = f"; was {like[0]} meant to be {error.name}?" if like else ""
+        raise FileError(path, found, error.allowed + hint) from error
+    except (TypeError, ValueError, AttributeError, LookupError) as error:
+        raise FileError(path, f"what it says does not fit together ({_briefly(error)})", f"these names: {', '.join(_NAMES)}") from error
 
 
 def _run(code: CodeType, path: Path) -> dict[str, Any]:

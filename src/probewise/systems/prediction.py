@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.effects import EFFECTS, NamedEffect, PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
@@ -27,6 +27,7 @@ from probewise.systems.table import RunRecording, RunTable
 
 __all__ = ["SystemPrediction", "as_recording", "predict_system", "write_system_prediction"]
 
+_FEW = 20  # samples that tell which rows cannot be predicted
 _BLOCK = 2_000_000  # numbers held at once by one pass over some samples
 
 
@@ -121,13 +122,14 @@ def predict_system(
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
     chain = system.chain(own, bound_effects(fitted, own))
     theta = _theta(fitted, chain, rng=rng)
-    mixture = PredictiveMixture(recording.readings, recording.usable, own.instrumentation.step)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
+    lost = _lost(chain, theta, own)
+    mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
-        mean = chain.predict(block, own)
+        mean = np.where(lost, 0.0, chain.predict(block, own))
         there = np.isfinite(mean).all(axis=1)
         n_failed += int((~there).sum())
         if there.any():
@@ -142,7 +144,23 @@ def predict_system(
             stacklevel=2,
         )
     mean, sd, scores = mixture.finished()
+    if lost.any():
+        mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
+        warnings.warn(
+            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a column is missing there",
+            DoubtfulResultWarning,
+            stacklevel=2,
+        )
     return SystemPrediction(own, recording.readings, mean, sd, scores, n_samples, n_failed)
+
+
+def _lost(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
+    """Find rows that cannot be predicted because a column is missing there, (n_points,)."""
+    missing = np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
+    if not np.any(missing):
+        return np.zeros(len(table), dtype=np.bool_)
+    there = np.isfinite(chain.predict(theta[:_FEW], table))
+    return np.asarray(~there.any(axis=0) if there.any() else np.zeros(len(table), dtype=np.bool_))
 
 
 def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:

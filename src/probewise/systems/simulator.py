@@ -196,7 +196,7 @@ def marginal_of(name: str, given: object) -> Marginal:
     allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
     if all(hasattr(given, each) for each in ("from_unit", "to_unit", "log_prob")):
         return given  # type: ignore[return-value]
-    if not isinstance(given, Sequence) or isinstance(given, str):
+    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
         raise ParameterError(f"parameters[{name!r}]", given, allowed)
     kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}
     kind, numbers = (given[0], given[1:]) if isinstance(given[0], str) else ("uniform", given)

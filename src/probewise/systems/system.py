@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,10 +13,11 @@ from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
 from probewise.effects import NamedEffect
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
-from probewise.systems.calls import Caller
+from probewise.systems.calls import Caller, Tally
+from probewise.systems.mistakes import mistake_in
 from probewise.systems.motion import Motion, RowsInRuns, integrate
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
@@ -44,6 +45,8 @@ class System:
         How `simulate` is called, where there is none.
     first
         Coordinates of an earlier fit, to start from.
+    tally
+        Counts samples at which a law raises an error.
     """
 
     simulator: Simulator
@@ -51,6 +54,7 @@ class System:
     max_step: float = np.inf
     caller: Caller | None = None
     first: FloatArray | None = None
+    tally: Tally = field(default_factory=Tally)
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable) -> System:
@@ -62,25 +66,65 @@ class System:
             If a column that the simulator names is missing, or it gives no finite reading anywhere in the prior.
         ShapeError
             If it does not give one reading for each row.
+        FileError
+            If it raises an error wherever it is called.
         """
+        declared = simulator.noise.sd
+        if isinstance(declared, str) and declared not in table.covariates:
+            raise ParameterError('noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}")
         for name in simulator.controls:
             if name not in table.columns:
                 raise ParameterError("controls", name, f"a column of the table: {', '.join(table.columns)}")
         bare = cls(simulator, table.scan_names)
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])
-            caller = Caller.probed(
-                simulator.simulate,
-                bare.parameters(tried, table),
-                given_columns(simulator, table),
-                per_run=simulator.per_run,
-                broadcasts=simulator.vectorized,
-            )
+            columns = given_columns(simulator, table)
+            try:
+                caller = Caller.probed(
+                    simulator.simulate,
+                    bare.parameters(tried, table),
+                    columns,
+                    per_run=simulator.per_run,
+                    broadcasts=simulator.vectorized,
+                )
+            except ProbewiseError:
+                raise
+            except Exception as error:
+                raise mistake_in("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         gaps = RowsInRuns(table).gaps
         typical = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
         assert simulator.law is not None
-        return replace(bare, max_step=simulator.law.max_step_s or typical)
+        system = replace(bare, max_step=simulator.law.max_step_s or typical)
+        system.try_law(table)
+        return system
+
+    def try_law(self, table: RunTable) -> None:
+        """Integrate the law at some places of the prior.
+
+        Raises
+        ------
+        FileError
+            If it raises an error at all of them.
+        ParameterError
+            If there is no finite reading at any.
+        """
+        columns, law = given_columns(self.simulator, table), self.simulator.law
+        assert law is not None
+        readings: list[FloatArray] = []
+        wrong: Exception | None = None
+        for z in self.starts:
+            try:
+                parameters = self.parameters(self.theta(z[None, :]), table)
+                readings.append(integrate(Motion(law), RowsInRuns(table), parameters, columns, max_step=self.max_step))
+            except ProbewiseError:
+                raise
+            except Exception as error:
+                wrong = wrong or error
+        if not readings and wrong is not None:
+            raise mistake_in("rates", wrong, self.simulator, columns) from wrong
+        if not np.isfinite(readings).any():
+            raise ParameterError("rates", "NaN at every place of the prior that was tried", "finite states and readings")
 
     @cached_property
     def marginals(self) -> dict[str, Marginal]:
@@ -249,11 +293,38 @@ class SystemChain:
         if system.caller is not None:
             readings = system.caller(parameters, columns)
         else:
-            law = system.simulator.law
-            assert law is not None
-            motion = self._applied(Stage.RATE, Motion(law), theta, plan)
-            readings = integrate(motion, RowsInRuns(plan), parameters, columns, max_step=system.max_step)
+            readings = self._moved(parameters, columns, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
+
+    def _moved(
+        self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], theta: FloatArray, plan: RunTable
+    ) -> FloatArray:
+        """Integrate the law with its effects; NaN for samples at which it raises an error."""
+        law = self.system.simulator.law
+        assert law is not None
+        motion = self._applied(Stage.RATE, Motion(law), theta, plan)
+        try:
+            return integrate(motion, RowsInRuns(plan), parameters, columns, max_step=self.system.max_step)
+        except ProbewiseError:
+            raise
+        except Exception:
+            if len(theta) == 1:
+                self.system.tally.n_failed += 1
+                return np.full((1, len(plan)), np.nan)
+
+        def of_one(values: Any, k: int) -> Any:
+            return values[min(k, len(values) - 1)][None] if np.ndim(values) == 2 else values
+
+        each = [
+            self._moved(
+                {name: of_one(values, k) for name, values in parameters.items()},
+                {name: of_one(values, k) for name, values in columns.items()},
+                theta[k : k + 1],
+                plan,
+            )
+            for k in range(len(theta))
+        ]
+        return np.concatenate(each)
 
     def read(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""

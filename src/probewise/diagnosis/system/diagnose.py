@@ -78,6 +78,7 @@ def prepare_system(
     """Fit the simulator, and bind the forms about the fit; none where they are not to be `bound`."""
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
+    recording = without_lost_rows(system, recording)
     told = progress if system.caller is None else CountedCalls(progress, system.caller)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
@@ -89,12 +90,43 @@ def prepare_system(
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
+def without_lost_rows(system: System, recording: Recording) -> Recording:
+    """Leave out readings of rows in which a column is missing, so that nothing can be predicted there, and note it.
+
+    Raises
+    ------
+    ParameterError
+        If the simulator gives no finite reading in a row where no column is missing.
+    """
+    table = cast(RunTable, recording.plan)
+    tried = system.chain(table, ()).predict(system.theta(system.starts), table)
+    there = np.isfinite(tried)
+    lost = ~there[there.any(axis=1)].any(axis=0) & recording.usable if there.any() else recording.usable
+    if not lost.any():
+        return recording
+    missing = np.zeros(len(table), dtype=np.bool_)
+    for values in table.covariates.values():
+        missing |= ~np.isfinite(values)
+    if system.simulator.law is not None:  # what is missing once is missing to the end of its run
+        for rows in table.rows_by_scan():
+            missing[rows] = np.maximum.accumulate(missing[rows])
+    wrong = np.flatnonzero(lost & ~missing)
+    if wrong.size:
+        what = "simulate" if system.simulator.law is None else "rates"
+        where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + 2}"
+        raise ParameterError(what, where, "a finite reading in each row somewhere in the prior")
+    note = f"{int(lost.sum())} readings left out: a column that the simulator reads is missing there"
+    return replace(recording, readings=np.where(lost, np.nan, recording.readings), notes=(*recording.notes, note))
+
+
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Say where a person's `simulate` gave no readings, and which parameters it could not take row by row."""
     apparatus = diagnosis.apparatus
-    caller = apparatus.system.caller if isinstance(apparatus, PersonsSystem) else None
-    if caller is None:
+    if not isinstance(apparatus, PersonsSystem):
         return ()
+    caller, n_failed = apparatus.system.caller, apparatus.system.tally.n_failed
+    if caller is None:
+        return (f"rates raised an error for {n_failed:,} parameters tried: taken to be impossible",) if n_failed else ()
     out = []
     if caller.n_failed:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameters tried: taken to be impossible")
@@ -114,6 +146,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     """
     if simulator.reading not in table.columns:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
+    _require_rising_time(table)
     whole = as_recording(simulator, table)
     own, readings = whole.plan, whole.readings
     usable = np.flatnonzero(whole.usable)
@@ -124,6 +157,19 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     chosen = usable[np.arange(len(usable)) % every < stretch]
     kept[chosen] = readings[chosen]
     return RunRecording(own, kept, simulator.source)
+
+
+def _require_rising_time(table: RunTable) -> None:
+    if table.time is None:
+        return
+    for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True):
+        falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
+        if falls.size:
+            before, at = rows[falls[0]], rows[falls[0] + 1]
+            run = f" in run {name}" if table.run is not None else ""
+            found = f"{table.time_s[at]:g} in row {at + 2}, after {table.time_s[before]:g}{run}"
+            cure = "" if table.run is not None else '; where it begins anew name the runs: run = "..."'
+            raise ParameterError(f"column {table.time!r}", found, f"a time that does not fall within a run{cure}")
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:

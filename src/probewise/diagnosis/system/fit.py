@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from scipy.special import ndtri
 
 from probewise import nested
 from probewise._arrays import FloatArray
@@ -190,9 +191,18 @@ def _by_nested_sampling(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[ModelSamples, Evidence]:
-    """Search the whole prior; keep what is given where that does not end in time."""
-    problem = JointProblem(null.found.model, prepared.recording, noise)
-    n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * problem.model.n_params)
+    """Search the prior; keep what is given where that does not end in time.
+
+    A law, which is integrated, is searched from a prior near the samples that are given, which takes far fewer calls.
+    """
+    problem: nested.Samplable = JointProblem(null.found.model, prepared.recording, noise)
+    system = cast(PersonsSystem, prepared.apparatus).system
+    n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * system.n_params)
+    method = "nested sampling"
+    if system.simulator.law is not None:
+        u = system.prior.to_unit_cube(samples.theta[:, : system.n_params])
+        problem = nested.repartitioned(problem, np.clip(ndtri(u), -FARTHEST, FARTHEST))
+        method = "nested sampling near the posterior"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against it is told
         found = nested.run(
@@ -207,7 +217,7 @@ def _by_nested_sampling(
     sigma = law.scale(law(residuals.T))
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, N_SAMPLES))
     theta = cast(Any, null.found.model.sensor).theta(z)
-    evidence = Evidence(found.log_z + null.log_factor, found.log_z_error, "nested sampling")
+    evidence = Evidence(found.log_z + null.log_factor, found.log_z_error, method)
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence
 
 

@@ -1,0 +1,72 @@
+"""What goes wrong inside a person's functions, told in one line: which function, where in it, what is allowed."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise.errors import FileError
+from probewise.systems.simulator import Simulator
+
+__all__ = ["mistake_in"]
+
+_LONGEST = 160
+
+
+def mistake_in(
+    what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]
+) -> FileError:
+    """Tell of an error that `simulate`, `rates` or `observe` raises wherever it is called.
+
+    Parameters
+    ----------
+    what
+        The function.
+    error
+        What it raises.
+    simulator, columns
+        Whose function it is, and the columns that it was given.
+    """
+    where = _files(simulator)
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename in where]
+    said = " ".join(str(error).split())
+    said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."
+    found = f"{what} raises {type(error).__name__}: {said}".rstrip(": ")
+    texts = [name for name, values in columns.items() if values.dtype != np.float64]
+    if isinstance(error, KeyError):
+        names = ", ".join(columns)
+        states = f", states {', '.join(simulator.law.states)}" if simulator.law is not None else ""
+        allowed = f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
+    elif texts and isinstance(error, TypeError | ValueError):
+        shown = ", ".join(f"{name} ({_first_text(columns[name])!r})" for name in texts[:4])
+        allowed = f"calculations with columns of numbers; these hold texts: {shown}"
+    else:
+        allowed = f"a function that gives a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
+    return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
+
+
+def _files(simulator: Simulator) -> set[str]:
+    """Files that a person's functions are in."""
+    functions: list[Any] = [simulator.simulate]
+    if simulator.law is not None:
+        functions += [simulator.law.rates, simulator.law.observe]
+    codes = (getattr(function, "__code__", None) for function in functions)
+    return {code.co_filename for code in codes if code is not None}
+
+
+def _first_text(values: NDArray[Any]) -> str:
+    """Give the first cell that is no number, where there is one."""
+    for cell in values.tolist():
+        try:
+            float(cell)
+        except ValueError:
+            return str(cell)
+    return str(values[0]) if len(values) else ""
+
+
+def _n_rows(columns: Mapping[str, NDArray[Any]]) -> int:
+    return max((np.shape(values)[-1] for values in columns.values()), default=0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.priors import Uniform
 from probewise.systems import RunTable, Simulator, System
 
@@ -79,7 +79,7 @@ def test_a_simulator_that_always_raises_is_refused_with_its_own_message():
     def simulate(p, data):
         raise KeyError("powr_w")
 
-    with pytest.raises(KeyError, match="powr_w"):
+    with pytest.raises(FileError, match=r"simulate raises KeyError: 'powr_w'"):
         _system(simulate)
 
 

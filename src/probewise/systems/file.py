@@ -106,7 +106,7 @@ def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
         run=_text(said, "run") if said.get("run") is not None else None,
         per_run=_texts(said, "per_run"),
         controls=_texts(said, "controls"),
-        noise=_noise(said.get("noise", {})),
+        noise=Noise.of(said.get("noise", {})),
         extra={name: _extra(name, each) for name, each in _mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
         source=path.name,
@@ -140,13 +140,6 @@ def _function(said: Mapping[str, Any], name: str) -> Any:
     if not callable(value):
         raise ParameterError(name, value, f"a function: def {name}(...)")
     return value
-
-
-def _noise(given: object) -> Noise:
-    if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
-        raise ParameterError("noise", given, 'a dict with some of "sd", "step", "range", "zero"')
-    low, high = given.get("range", (None, None))
-    return Noise(given.get("sd"), given.get("step"), (low, high), given.get("zero", 0.0))
 
 
 def _extra(name: str, given: object) -> Extra:

@@ -54,6 +54,22 @@ class Noise:
     range: tuple[float | None, float | None] = (None, None)
     zero: float = 0.0
 
+    @classmethod
+    def of(cls, given: object) -> Noise:
+        """Read what is known of the noise as a person writes it: a dict with some of "sd", "step", "range", "zero".
+
+        Raises
+        ------
+        ParameterError
+            If it is nothing like that.
+        """
+        if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
+            raise ParameterError("noise", given, 'a dict with some of "sd", "step", "range", "zero"')
+        ends = given.get("range", (None, None))
+        if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
+            raise ParameterError('noise["range"]', ends, "(low, high), low < high")
+        return cls(given.get("sd"), given.get("step"), (ends[0], ends[1]), given.get("zero", 0.0))
+
     def __post_init__(self) -> None:
         if isinstance(self.sd, int | float) and not 0 < self.sd < np.inf:
             raise ParameterError('noise["sd"]', self.sd, "a number greater than 0, or the name of a column")
@@ -118,7 +134,7 @@ class Simulator:
     reading, unit
         The column that is predicted, and its unit.
     parameters
-        Prior of each parameter.
+        Prior of each parameter, as in FILE.py: (low, high), ("log", low, high), ("normal", mean, sd), or a prior.
     simulate
         Predicts the readings of the whole table.
     law
@@ -132,7 +148,7 @@ class Simulator:
     controls
         Columns that a person can set.
     noise
-        What is known of the noise.
+        What is known of the noise; a dict with some of "sd", "step", "range", "zero" does.
     extra
         Effects of a person's own, by name.
     vectorized
@@ -143,7 +159,7 @@ class Simulator:
 
     reading: str
     unit: str
-    parameters: Mapping[str, Marginal]
+    parameters: Mapping[str, Any]
     simulate: Simulate | None = None
     law: Law | None = None
     time: str | None = None
@@ -165,6 +181,11 @@ class Simulator:
             )
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
+        object.__setattr__(self, "parameters", {n: marginal_of(n, prior) for n, prior in self.parameters.items()})
+        object.__setattr__(self, "per_run", tuple(self.per_run))
+        object.__setattr__(self, "controls", tuple(self.controls))
+        if isinstance(self.noise, Mapping):
+            object.__setattr__(self, "noise", Noise.of(self.noise))
         for name in self.per_run:
             if name not in self.parameters:
                 raise ParameterError("per_run", name, f"a parameter: {', '.join(self.parameters)}")

@@ -1,0 +1,88 @@
+"""Predictions of a fitted simulator: of recorded runs by their posterior, of new ones by what is believed of any run."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from heater import SIMULATOR, fitted, runs
+
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.systems import FittedSystem, predict_system, write_system_prediction
+
+RNG = 7
+
+
+def predicted(model, table):
+    return predict_system(model, table, rng=np.random.default_rng(RNG))
+
+
+def test_a_recorded_run_is_predicted_from_its_own_posterior():
+    found = predicted(fitted(), runs())
+    np.testing.assert_allclose(found.mean, runs().columns["temp_c"], atol=0.2)
+    assert (found.sd < 0.6).all()
+
+
+def test_a_new_run_starts_where_its_prior_says():
+    """At time 0 the reading is the start, normal about 20 with sd 5, and noise of 0.05."""
+    found = predicted(fitted(), runs((20.0,), names="9", n=4))
+    np.testing.assert_allclose(found.mean[0], 20.0, atol=0.05)
+    np.testing.assert_allclose(found.sd[0], 5.0, rtol=0.02)
+
+
+def test_a_new_run_has_an_offset_as_those_of_the_recorded_runs_differ():
+    """Three runs of mean 1 and sd 1: a Student-t of four degrees of freedom, sd sqrt(2 (1 + 1/3)) about 1."""
+    model = fitted(("offset_per_run",))
+    samples, names = np.array(model.samples), list(model.names)
+    for name, value in zip("123", (0.0, 1.0, 2.0), strict=True):
+        samples[:, names.index(f"offset_per_run.values[{name}]")] = value
+    model = dataclasses.replace(model, samples=np.tile(samples, (40, 1)), noise_sd=np.full(20_000, 0.05))
+    found = predicted(model, runs((20.0,), names="9", n=4))
+    plain = predicted(fitted(), runs((20.0,), names="9", n=4))
+    np.testing.assert_allclose(found.mean[0] - plain.mean[0], 1.0, atol=0.1)
+    np.testing.assert_allclose(np.sqrt(found.sd[0] ** 2 - plain.sd[0] ** 2), np.sqrt(8 / 3), rtol=0.15)
+
+
+def test_the_density_of_a_sure_prediction_is_that_of_its_noise():
+    model = fitted()
+    sure = dataclasses.replace(model, samples=np.tile(model.samples[:1], (500, 1)))
+    found = predicted(sure, runs())
+    z = (runs().columns["temp_c"] - found.mean) / 0.05
+    np.testing.assert_allclose(found.log_density, -0.5 * z**2 - np.log(0.05 * np.sqrt(2 * np.pi)))
+
+
+def test_a_table_without_readings_is_predicted_and_not_scored():
+    table = runs()
+    bare = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "temp_c"})
+    found = predicted(fitted(), bare)
+    assert np.isnan(found.log_density).all()
+    np.testing.assert_array_equal(found.mean, predicted(fitted(), table).mean)
+
+
+def test_a_model_that_was_read_predicts_as_the_one_that_was_written():
+    model = fitted(("lag", "sensitivity:room_c"))
+    read = FittedSystem.from_json(model.to_json(), SIMULATOR)
+    new = runs((20.0, 22.0), names="89")
+    np.testing.assert_array_equal(predicted(read, new).log_density, predicted(model, new).log_density)
+
+
+def test_a_row_that_lacks_a_column_is_not_predicted_and_the_others_are():
+    table = runs()
+    power = table.columns["power_w"].copy()
+    power[3] = np.nan
+    with pytest.warns(DoubtfulResultWarning, match=r"1 rows .* first row 5"):
+        found = predicted(fitted(), table.with_columns({"power_w": power}))
+    assert np.flatnonzero(np.isnan(found.mean)).tolist() == [3]
+
+
+def test_a_column_that_an_effect_reads_must_be_there():
+    table = runs()
+    bare = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "room_c"})
+    with pytest.raises(ParameterError, match="room_c"):
+        predicted(fitted(("sensitivity:room_c",)), bare)
+
+
+def test_predictions_are_written_row_by_row_with_the_columns_of_the_table(tmp_path):
+    write_system_prediction(predicted(fitted(), runs()), tmp_path / "p.csv")
+    lines = (tmp_path / "p.csv").read_text().splitlines()
+    assert lines[0] == "run,t_s,power_w,room_c,temp_c,mean,sd,log_density"
+    assert len(lines) == 1 + len(runs())

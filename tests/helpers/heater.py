@@ -8,7 +8,7 @@ from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.again import recorded
 
-FILE = '''
+FILE = '''\
 import numpy as np
 reading, unit = "temp_c", "degC"
 time, run = "t_s", "run"

@@ -5,7 +5,7 @@ from probewise.systems.file import read_simulator
 from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
 from probewise.systems.joining import join_tables
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
-from probewise.systems.simulator import Extra, Law, Noise, Simulator
+from probewise.systems.simulator import Extra, Law, Noise, Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, read_run_table, write_run_table
 
@@ -28,6 +28,7 @@ __all__ = [
     "read_run_table",
     "read_simulator",
     "samples_csv",
+    "table_for",
     "write_fitted_system",
     "write_system_prediction",
     "write_run_table",

@@ -21,7 +21,7 @@ from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import AnyEffect, NoiseLevel, Stage
 from probewise.systems.fitted import FittedSystem
 from probewise.systems.forms.again import forms_again, own_of_runs
-from probewise.systems.simulator import Simulator
+from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable
 
@@ -87,7 +87,7 @@ def _is_float(text: str) -> bool:
 
 
 def predict_system(
-    fitted: FittedSystem, table: RunTable, *, rng: np.random.Generator, progress: Progress = silent
+    fitted: FittedSystem, table: RunTable | Mapping[str, Any], *, rng: np.random.Generator, progress: Progress = silent
 ) -> SystemPrediction:
     """Predict every row of a table, and score its readings where there are any.
 
@@ -101,7 +101,8 @@ def predict_system(
     fitted
         The fitted simulator.
     table
-        What to predict, n_points rows, with the columns that the simulator and the effects read.
+        What to predict, n_points rows, with the columns that the simulator and the effects read: a table, a dict of
+        arrays, or a DataFrame.
     rng
         Source of randomness, for runs that were not recorded.
     progress
@@ -117,7 +118,7 @@ def predict_system(
     DoubtfulResultWarning
         If the simulator gives no finite readings for some samples.
     """
-    recording = as_recording(fitted.simulator, table)
+    recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = cast(RunTable, recording.plan)
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
     chain = system.chain(own, bound_effects(fitted, own))

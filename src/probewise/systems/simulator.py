@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
+from probewise.systems.table import RunTable
 
-__all__ = ["Columns", "Extra", "Law", "Noise", "Observe", "Rates", "Simulate", "Simulator", "Values", "marginal_of"]
+__all__ = ["Columns", "Extra", "Law", "Noise", "Observe", "Rates", "Simulate", "Simulator", "Values", "marginal_of", "table_for"]
 
 Values: TypeAlias = Mapping[str, Any]
 """Parameters by name: floats, or arrays that broadcast against the rows."""
@@ -204,6 +205,11 @@ class Simulator:
         for name in self.extra:
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")
+
+
+def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
+    """Take a table, or columns by name (a dict of arrays, a DataFrame), with the time and the runs of a simulator."""
+    return data if isinstance(data, RunTable) else RunTable(data, simulator.time, simulator.run)
 
 
 def marginal_of(name: str, given: object) -> Marginal:

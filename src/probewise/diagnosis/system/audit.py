@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -16,7 +16,7 @@ from probewise.diagnosis.system.apparatus import ON_NOISE, PersonsSystem
 from probewise.effects import NamedEffect, first_of
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.systems import RunTable, Simulator, System, as_recording
+from probewise.systems import RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import About, driving_columns, forms_of
 
 __all__ = ["audit_system"]
@@ -27,7 +27,7 @@ _SETTINGS = 64  # of an effect's bank
 _MOST_ROWS = 1200  # that are looked at; of a longer table every second, every third, ...
 
 
-def audit_system(simulator: Simulator, table: RunTable) -> PlanAudit:
+def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> PlanAudit:
     """Say of each effect whether a table could show it and tell it from the others, at the middle of the prior.
 
     Where the readings there do not change at all, as those of a pendulum at rest, another place of the prior is taken,
@@ -38,13 +38,14 @@ def audit_system(simulator: Simulator, table: RunTable) -> PlanAudit:
     simulator
         The simulator.
     table
-        The rows, with the columns that it reads.
+        The rows, with the columns that it reads: a table, a dict of arrays, or a DataFrame.
 
     Raises
     ------
     ParameterError
         If the simulator and the table do not fit together, or the readings change nowhere in the prior.
     """
+    table = table_for(simulator, table)
     own = cast(RunTable, as_recording(simulator, _without_readings(simulator, table)).plan)
     system = System.of(simulator, own)
     z, predicted, where = _middle(system, own)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
-from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording
+from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import About
 
 __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
@@ -30,7 +30,7 @@ _MOST_COMPARED = 2400
 
 def diagnose_system(
     simulator: Simulator,
-    table: RunTable,
+    table: RunTable | Mapping[str, Any],
     *,
     source: str = "",
     notes: Sequence[str] = (),
@@ -45,7 +45,7 @@ def diagnose_system(
     simulator
         What predicts the readings.
     table
-        What was recorded, with the column that is predicted.
+        What was recorded, with the column that is predicted: a table, a dict of arrays, or a DataFrame.
     source, notes
         What the table is called, and what is to be noted of it.
     thorough
@@ -62,6 +62,7 @@ def diagnose_system(
     NotConvergedError
         If the fit of the simulator did not arrive anywhere.
     """
+    table = table_for(simulator, table)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
     return diagnose_prepared(prepared, thorough=thorough, rng=rng)
 

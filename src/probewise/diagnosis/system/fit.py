@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -30,7 +30,7 @@ from probewise.diagnosis.system.fitted import fitted_system
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
-from probewise.systems import FittedSystem, RunTable, Simulator
+from probewise.systems import FittedSystem, RunTable, Simulator, table_for
 
 __all__ = ["Evidence", "SystemFit", "fit_json", "fit_simulator"]
 
@@ -104,7 +104,7 @@ class SystemFit:
 
 def fit_simulator(
     simulator: Simulator,
-    table: RunTable,
+    table: RunTable | Mapping[str, Any],
     *,
     source: str = "",
     notes: Sequence[str] = (),
@@ -118,7 +118,7 @@ def fit_simulator(
     simulator
         What predicts the readings.
     table
-        What was recorded, with the column that is predicted.
+        What was recorded, with the column that is predicted: a table, a dict of arrays, or a DataFrame.
     source, notes
         What the table is called, and what is to be noted of it.
     rng
@@ -139,6 +139,7 @@ def fit_simulator(
     NotConvergedError
         If the fit did not arrive anywhere.
     """
+    table = table_for(simulator, table)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, bound=False)
     if prepared.too_little:
         found = f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"

@@ -1,0 +1,109 @@
+"""Mistakes in a person's file and table: exit status 2, one line that says which, where and what is allowed."""
+
+import numpy as np
+import pytest
+from heater import FILE, runs
+
+from probewise.cli import main
+from probewise.systems import write_run_table
+
+
+def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
+    (tmp_path / "heater.py").write_text(file)
+    data = tmp_path / "data.csv"
+    data.write_text(table if table is not None else write_run_table(runs()))
+    out = tmp_path / "out"
+    simulator = str(tmp_path / "heater.py")
+    assert main(["diagnose", str(data), *more, "--simulator", simulator, "--out", str(out), *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert not out.exists()
+    return captured.err
+
+
+FILES = {
+    "a column that the table lacks": (
+        ('data["power_w"]', 'data["power"]'), "heater.py, row 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
+    ),
+    "readings of another shape": (("return p", "return np.ones(3)\n    return p"), "shape (3,); allowed: (36,)"),
+    "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "NaN at every place"),
+    "a prior without mass": (("(0, 10)", "(10, 10)"), "parameters['gain'] is (10, 10)"),
+    "a prior of nothing": (("(0, 10)", "()"), "parameters['gain'] is ()"),
+    "a run that the table lacks": (('"run"\n', '"pass"\n'), "row 1, column pass: no such column; the header has 'run', 't_s'"),
+    "a reading that the table lacks": (('"temp_c"', '"temp"'), "reading is 'temp'; allowed: a column of the table: run, t_s"),
+    "a name that is misspelt": (("\nparameters", "\nparameter"), "was parameter meant to be parameters?"),
+    "an error at every place": (("return p", "raise ValueError('too hot')\n    return p"), "row 10: simulate raises ValueError: too hot"),
+    "a control that the table lacks": (('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'"),
+    "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
+    "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "row 9: is no Python"),
+    "no simulator": (("def simulate", "def simulat"), "simulate, rates is 'neither'"),
+    "runs that are not named": (
+        ('time, run = "t_s", "run"', 'time = "t_s"'), "per_run is ['start_c']; allowed: nothing, or run =",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "said"), FILES.values(), ids=FILES)
+def test_a_mistake_in_the_file_is_one_line(capsys, tmp_path, change, said):
+    assert change[0] in FILE
+    assert said in refused(capsys, tmp_path, FILE.replace(*change))
+
+
+def cell(row, column, text):
+    lines = [line.split(",") for line in write_run_table(runs()).splitlines()]
+    lines[row - 1][lines[0].index(column)] = text
+    return "\n".join(map(",".join, lines)) + "\n"
+
+
+TABLES = {
+    "a reading that is text": (cell(5, "temp_c", "n/a"), "n/a in row 5"),
+    "an input that is text": (cell(5, "power_w", "4;5"), "these hold texts: power_w ('4;5')"),
+    "a time that is missing": (cell(5, "t_s", ""), "row 5, column t_s: the cell is empty"),
+    "a time that falls": (cell(5, "t_s", "1"), "column 't_s' is '1 in row 5, after 10 in run 1'"),
+    "no rows": ("run,t_s,power_w,room_c,temp_c\n", "no row below the header"),
+}
+
+
+@pytest.mark.parametrize(("table", "said"), TABLES.values(), ids=TABLES)
+def test_a_mistake_in_the_table_is_one_line(capsys, tmp_path, table, said):
+    assert said in refused(capsys, tmp_path, FILE, table=table)
+
+
+def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path):
+    law = FILE.partition("def simulate")[0] + (
+        'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n    return {"temp_c": p["gain"] * s["heat"]}\n'
+    )
+    said = refused(capsys, tmp_path, law)
+    assert "heater.py, row 12: rates raises KeyError: 'heat'" in said
+    assert "states temp_c" in said
+
+
+def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):
+    assert "--sensor is 's.json'; allowed: nothing beside --simulator" in refused(capsys, tmp_path, FILE, "--sensor", "s.json")
+
+
+def test_a_table_given_twice_is_refused(capsys, tmp_path):
+    assert "these hold the same rows" in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "data.csv"),))
+
+
+def test_a_journal_is_refused(capsys, tmp_path):
+    (tmp_path / "journal.jsonl").write_text("{}\n")
+    assert "a journal; allowed: a CSV table" in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "journal.jsonl"),))
+
+
+def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
+    from probewise.diagnosis.system.diagnose import prepare_system
+    from probewise.systems import Simulator
+
+    x = np.arange(30.0)
+    simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, data: p["a"] * data["x"])
+    prepared = prepare_system(simulator, _table(np.where(x == 3, np.nan, x), 2 * x + 0.1 * np.sin(9 * x)), bound=False)
+    assert prepared.recording.notes == ("1 readings left out: a column that the simulator reads is missing there",)
+    assert 3 not in prepared.usable
+
+
+def _table(x, y):
+    from probewise.systems import RunTable
+
+    return RunTable({"x": x, "y": y})

@@ -1,0 +1,61 @@
+"""What a person could record next."""
+
+from typing import cast
+
+import numpy as np
+from heater import runs
+
+from probewise.diagnosis.system.commands import in_turn, one_after_another, run_commands
+from probewise.systems import RunTable
+
+TABLE = runs()
+
+
+def offered(controls=("power_w",), table=TABLE):
+    return {c.table.scan_names[0]: c for c in run_commands(table, "temp_c", controls, "s")}
+
+
+def test_without_controls_recorded_runs_are_taken_again():
+    assert list(offered(())) == ["1 again", "2 again", "3 again"]
+
+
+def test_a_control_is_swept_held_and_switched_between_its_ends():
+    found = offered()
+    power = {name: command.table.columns["power_w"] for name, command in found.items()}
+    np.testing.assert_allclose(power["1 power_w up"][[0, -1]], [2.0, 4.0])
+    np.testing.assert_allclose(power["1 power_w down"][[0, -1]], [4.0, 2.0])
+    assert set(power["1 power_w steps"].tolist()) == {2.0, 4.0}
+    assert set(power["1 power_w middle"].tolist()) == {3.0}
+
+
+def test_a_slow_run_takes_twice_the_time():
+    time = offered()["1 slow"].table.time_s
+    np.testing.assert_allclose(np.ptp(time), 2 * np.ptp(TABLE.time_s[:12]))
+
+
+def test_what_is_yet_to_be_read_is_empty():
+    assert all(np.isnan(command.table.columns["temp_c"]).all() for command in offered().values())
+
+
+def test_time_that_begins_anew_in_each_run_does_so_in_the_next():
+    assert offered()["2 again"].table.time_s[0] == 0.0
+
+
+def test_time_that_goes_on_is_later_than_all_that_was_recorded():
+    time = np.arange(float(len(TABLE)))
+    table = TABLE.with_columns({"t_s": time})
+    commands = list(offered((), table).values())
+    asked = cast(RunTable, in_turn(commands[:2], table))
+    assert (np.diff(asked.time_s) > 0).all()
+    assert asked.time_s[0] > time[-1]
+
+
+def test_commands_set_behind_each_other_are_runs_of_their_own():
+    together = cast(RunTable, one_after_another(list(offered().values())[:3], TABLE))
+    assert len(together.scan_names) == 3
+    assert set(together.like.values()) <= set(TABLE.scan_names)
+
+
+def test_no_command_has_more_than_102_readings():
+    long = runs((20.0,), n=1000)
+    assert max(len(command.table) for command in offered(table=long).values()) <= 102

@@ -94,6 +94,6 @@ def test_a_diagnosis_writes_what_the_contract_promises(folder):
         assert word not in page
     if document["next_measurement"] is not None:
         assert document["next_measurement"]["plan"] == "next.csv"
-        asked = list(csv.DictReader((out / "next.csv").open()))
+        asked = (out / "next.csv").read_text().splitlines()[1:]
         assert len(asked) == document["next_measurement"]["readings"]
         run(folder, "predict", str(out / "repaired.json"), str(out / "next.csv"), "--out", str(folder / "n.csv"))

@@ -24,16 +24,18 @@ def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
 
 FILES = {
     "a column that the table lacks": (
-        ('data["power_w"]', 'data["power"]'), "heater.py, row 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
+        ('data["power_w"]', 'data["power"]'), "row 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
     ),
     "readings of another shape": (("return p", "return np.ones(3)\n    return p"), "shape (3,); allowed: (36,)"),
     "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "NaN at every place"),
     "a prior without mass": (("(0, 10)", "(10, 10)"), "parameters['gain'] is (10, 10)"),
     "a prior of nothing": (("(0, 10)", "()"), "parameters['gain'] is ()"),
-    "a run that the table lacks": (('"run"\n', '"pass"\n'), "row 1, column pass: no such column; the header has 'run', 't_s'"),
-    "a reading that the table lacks": (('"temp_c"', '"temp"'), "reading is 'temp'; allowed: a column of the table: run, t_s"),
+    "a run that the table lacks": (('"run"\n', '"pass"\n'), "column pass: no such column; the header has 'run', 't_s'"),
+    "a reading that the table lacks": (('"temp_c"', '"temp"'), "reading is 'temp'; allowed: a column of the table"),
     "a name that is misspelt": (("\nparameters", "\nparameter"), "was parameter meant to be parameters?"),
-    "an error at every place": (("return p", "raise ValueError('too hot')\n    return p"), "row 10: simulate raises ValueError: too hot"),
+    "an error at every place": (
+        ("return p", "raise ValueError('too hot')\n    return p"), "row 10: simulate raises ValueError: too hot",
+    ),
     "a control that the table lacks": (('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'"),
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "row 9: is no Python"),
@@ -80,7 +82,9 @@ def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path
 
 
 def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):
-    assert "--sensor is 's.json'; allowed: nothing beside --simulator" in refused(capsys, tmp_path, FILE, "--sensor", "s.json")
+    assert "--sensor is 's.json'; allowed: nothing beside --simulator" in refused(
+        capsys, tmp_path, FILE, "--sensor", "s.json"
+    )
 
 
 def test_a_table_given_twice_is_refused(capsys, tmp_path):

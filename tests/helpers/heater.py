@@ -8,7 +8,7 @@ from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.again import recorded
 
-FILE = '''\
+FILE = """\
 import numpy as np
 reading, unit = "temp_c", "degC"
 time, run = "t_s", "run"
@@ -19,7 +19,7 @@ noise = {"sd": 0.05}
 
 def simulate(p, data):
     return p["start_c"] + p["gain"] * data["power_w"] * (1 - np.exp(-data["t_s"] / p["tau_s"]))
-'''
+"""
 
 
 def simulate(p, data):

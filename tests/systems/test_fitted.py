@@ -12,6 +12,7 @@ from probewise.systems import FittedSystem
 from probewise.systems.forms import forms_of
 from probewise.systems.forms.again import forms_again, recorded
 
+
 def test_what_is_written_is_read_back_bit_for_bit():
     text = fitted(("lag", "sensitivity:room_c", "nonlinearity")).to_json()
     assert FittedSystem.from_json(text, SIMULATOR).to_json() == text
@@ -30,7 +31,9 @@ def test_the_file_of_another_simulator_is_refused():
         FittedSystem.from_json(fitted().to_json(), other)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"format": "system/1"}', '{"format": "sensor/1"}', '{"format": "system/9"}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"format": "system/1"}', '{"format": "sensor/1"}', '{"format": "system/9"}']
+)
 def test_a_damaged_file_is_refused_in_one_line(text):
     with pytest.raises(FileError, match="allowed") as refusal:
         FittedSystem.from_json(text, SIMULATOR)

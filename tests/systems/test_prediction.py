@@ -1,4 +1,4 @@
-"""Predictions of a fitted simulator: of recorded runs by their posterior, of new ones by what is believed of any run."""
+"""Predictions of a fitted simulator: of recorded runs by their posterior, of new ones as of any run."""
 
 import dataclasses
 

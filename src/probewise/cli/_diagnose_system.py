@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import say
 from probewise.cli._output import check_out_directory, staged
@@ -13,6 +13,7 @@ from probewise.cli._simulator import read_tables, refuse_beside
 
 if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
+    from probewise.systems import RunTable
 
 __all__ = ["diagnose_simulator"]
 
@@ -70,7 +71,7 @@ def write_results(diagnosis: Diagnosis, folder: Path) -> None:
     write_fitted_system(repaired_of(diagnosis), folder / "repaired.json")
     write_fitted_system(calibrated_of(diagnosis), folder / "calibrated.json")
     if diagnosis.next_measurement is not None:
-        asked = diagnosis.next_measurement.plan
+        asked = cast("RunTable", diagnosis.next_measurement.plan)
         (folder / diagnosis.apparatus.words.next_plan).write_text(write_run_table(asked), encoding="utf-8")
 
 

@@ -38,7 +38,7 @@ def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
         value = getattr(arguments, name)
         if value is not None and value is not False:
             option = f"--{name.replace('_', '-')}"
-            raise ParameterError(option, str(value), "nothing beside --simulator, which stands for what took the readings")
+            raise ParameterError(option, str(value), "nothing beside --simulator, which takes its place")
 
 
 def read_tables(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:

@@ -19,7 +19,12 @@ __all__ = ["VERB"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
-    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it; with --simulator any table")
+    parser.add_argument(
+        "plan",
+        type=a_path,
+        metavar="PLAN.csv",
+        help="plan or recording, its JSON beside it; with --simulator any table",
+    )
     parser.add_argument(
         "--sensor",
         type=a_path,

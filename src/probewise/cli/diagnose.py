@@ -142,4 +142,9 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *
         write_bytes_atomically(folder / name, png)
 
 
-VERB = Verb("diagnose", "Find which physics a sensor model, or a simulator of your own, leaves out of recordings.", add_arguments, run)
+VERB = Verb(
+    "diagnose",
+    "Find which physics a sensor model, or a simulator of your own, leaves out of recordings.",
+    add_arguments,
+    run,
+)

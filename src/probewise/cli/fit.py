@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.systems import read_simulator, samples_csv, write_fitted_system
 
     if arguments.simulator is None:
-        raise ParameterError("--simulator", None, "FILE.py, the simulator to fit; a light sensor is fitted by calibrate")
+        raise ParameterError("--simulator", None, "FILE.py, the simulator; a light sensor is fitted by calibrate")
     out = check_out_directory(arguments.out)
     simulator = read_simulator(arguments.simulator)
     table, notes = read_tables(simulator, arguments.tables)
@@ -57,4 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-VERB = Verb("fit", "Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.", add_arguments, run)
+VERB = Verb(
+    "fit", "Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.", add_arguments, run
+)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+
 from probewise.cli._common import Verb, a_path, add_common, say
 from probewise.cli._output import check_out_file
 from probewise.cli._simulator import add_simulator
@@ -18,7 +19,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S.json",
         help="sensor model, as calibrate and diagnose write it; with --simulator a repaired.json or calibrated.json",
     )
-    parser.add_argument("plan", type=a_path, metavar="PLAN.csv", help="plan or recording, its JSON beside it; with --simulator any table")
+    parser.add_argument(
+        "plan",
+        type=a_path,
+        metavar="PLAN.csv",
+        help="plan or recording, its JSON beside it; with --simulator any table",
+    )
     parser.add_argument("--out", type=a_path, required=True, metavar="P.csv", help="where the prediction goes")
     add_simulator(parser)
     add_common(parser)

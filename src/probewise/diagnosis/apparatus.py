@@ -29,8 +29,8 @@ class Words:
     """How sentences speak of an apparatus: what it is that is calibrated, and how to get a signal where there is none.
 
     `settles_nothing` says of two aliased effects that no reading tells them apart; `run` is what rows that belong
-    together are called; `next_plan` is the file of the readings to take next, `model` that of the repaired model; `no_cure` says that no further
-    rows would show an effect.
+    together are called; `next_plan` is the file of the readings to take next, `model` that of the repaired model;
+    `no_cure` says that no further rows would show an effect.
     """
 
     null: str

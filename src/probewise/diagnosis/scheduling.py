@@ -40,6 +40,6 @@ class Command(Protocol):
 
 
 def rows_of(commands: Sequence[Command]) -> list[IntArray]:
-    """Number the rows of each command, where all are set behind each other."""
+    """Give the row numbers of each command, where all are set behind each other."""
     ends = np.cumsum([len(command.plan) for command in commands])
     return [np.arange(end - len(command.plan), end) for end, command in zip(ends.tolist(), commands, strict=True)]

@@ -27,8 +27,8 @@ from probewise.effects.noise import CorrelatedNoise, DriftingNoise, SignalDepend
 from probewise.effects.noise_law import NoiseRows, draw_readings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
-from probewise.effects.rails import BentRails, MissingTooth
 from probewise.effects.predictive_mixture import PredictiveMixture
+from probewise.effects.rails import BentRails, MissingTooth
 from probewise.effects.readings import Hysteresis, Lag
 from probewise.effects.reflection import Reflection
 from probewise.effects.response import Nonlinearity

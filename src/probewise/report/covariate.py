@@ -11,9 +11,15 @@ from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.report.words import unit_name
 
 __all__ = [
+    "category_names",
+    "covariate_label",
+    "covariate_unit",
+    "covariate_values",
+    "covariate_words",
+    "family_words",
     "label_of",
     "words_and_unit",
-    "category_names", "covariate_label", "covariate_unit", "covariate_values", "covariate_words", "family_words"]
+]
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}

@@ -336,7 +336,8 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
         (
             figure(
                 drawn["gain.svg"],
-                f"Gain in log predictive density of each held-out {diagnosis.apparatus.words.run}, both models fitted to the others: blue where "
+                f"Gain in log predictive density of each held-out {diagnosis.apparatus.words.run}, both models fitted "
+                "to the others: blue where "
                 "the repaired model predicts better, orange where worse. Grey: mean of all, with standard error.",
             ),
         )
@@ -381,7 +382,8 @@ def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ..
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
         figure(
             drawn["noise.svg"],
-            f"Residuals after the repair, if any. Above: correlation within {diagnosis.apparatus.words.run}s by the number of readings between. "
+            "Residuals after the repair, if any. Above: correlation within "
+            f"{diagnosis.apparatus.words.run}s by the number of readings between. "
             "Middle: scatter by predicted reading. Below: how many lie how far out, on a logarithmic scale.",
         ),
     )

@@ -39,7 +39,9 @@ def _along(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]
     own = fit.fitted.simulator
     time = f"{plan.time} ({own.time_unit})" if plan.has_time else "row of the table"
     out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
-    varying = {name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd) and np.nanstd(v) > 0}
+    varying = {
+        name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd) and np.nanstd(v) > 0
+    }
     return (*out, *list(varying.items())[: _MOST_COLUMNS - len(out)])
 
 
@@ -63,7 +65,7 @@ def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     return page(
         f"Fit of {own.source}",
         answer=answer(fit),
-        key_figure=figure(drawn["predicted.svg"], "Recorded against predicted readings; on the line they are the same."),
+        key_figure=figure(drawn["predicted.svg"], "Recorded against predicted readings; on the line they agree."),
         sections=[
             Section("Posterior", (table(("parameter", "median", "95 % interval"), rows),)),
             Section(

@@ -96,7 +96,6 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_by_change(diagnosis))
     if not found:
-        unit = diagnosis.recording.plan.instrumentation.unit
         return Witness(np.array(diagnosis.repair.before.readings), label_of(diagnosis, "level"))
     sizes = [chance.means(diagnosis, witness, after=False).stands_out for witness in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
@@ -160,7 +159,9 @@ def _folded(diagnosis: Diagnosis) -> list[Witness]:
         if found.get("period_mm", 0.0) > 0:
             out.append((plan.x_mm, found["period_mm"], "X", "mm"))
     return [
-        Witness(np.mod(values, period), f"{name} within one period of {period:.4g} {unit}" + (f" ({unit})" if unit else ""))
+        Witness(
+            np.mod(values, period), f"{name} within one period of {period:.4g} {unit}" + (f" ({unit})" if unit else "")
+        )
         for values, period, name, unit in out
         if np.ptp(values) > _LEAST_PERIODS * period
     ]

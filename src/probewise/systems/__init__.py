@@ -30,6 +30,6 @@ __all__ = [
     "samples_csv",
     "table_for",
     "write_fitted_system",
-    "write_system_prediction",
     "write_run_table",
+    "write_system_prediction",
 ]

@@ -148,7 +148,7 @@ class Caller:
 
 
 class CountedCalls:
-    """Progress that says beside each stage how often `simulate` has been called; its last stage is told anew at every call.
+    """Progress that says beside each stage how often `simulate` has been called, anew at every call.
 
     Parameters
     ----------
@@ -164,6 +164,7 @@ class CountedCalls:
         caller.on_call = self._again
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        """Tell how far a stage is."""
         self._now = stage, done, total, note
         self._again()
 

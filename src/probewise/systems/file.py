@@ -63,7 +63,9 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
         hint = f"; was {like[0]} meant to be {error.name}?" if like else ""
         raise FileError(path, found, error.allowed + hint) from error
     except (TypeError, ValueError, AttributeError, LookupError) as error:
-        raise FileError(path, f"what it says does not fit together ({_briefly(error)})", f"these names: {', '.join(_NAMES)}") from error
+        raise FileError(
+            path, f"what it says does not fit together ({_briefly(error)})", f"these names: {', '.join(_NAMES)}"
+        ) from error
 
 
 def _run(code: CodeType, path: Path) -> dict[str, Any]:

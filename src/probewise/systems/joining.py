@@ -21,7 +21,7 @@ _FILE = "file"
 def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
     """Set tables behind each other: the first one's columns, and runs of two tables stay two runs.
 
-    A column that another table lacks is missing there. Where no column names the runs, one is added: each table is a run.
+    A column that another table lacks is missing there. Where no column names the runs, each table is one.
 
     Parameters
     ----------
@@ -48,11 +48,14 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
         return tables[0], ()
     first, notes = tables[0], []
     for source, table in zip(sources[1:], tables[1:], strict=True):
-        notes += [f"{source} has no column {name}: missing there" for name in first.columns if name not in table.columns]
+        notes += [
+            f"{source} has no column {name}: missing there" for name in first.columns if name not in table.columns
+        ]
         beyond = [name for name in table.columns if name not in first.columns]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
     columns = {
-        name: _joined(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources) for name in first.columns
+        name: _joined(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
+        for name in first.columns
     }
     run = first.run or _unused(_FILE, columns)
     columns[run] = np.array(list(_runs(tables, sources, named=first.run is not None)))

@@ -17,9 +17,7 @@ __all__ = ["mistake_in"]
 _LONGEST = 160
 
 
-def mistake_in(
-    what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]
-) -> FileError:
+def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]) -> FileError:
     """Tell of an error that `simulate`, `rates` or `observe` raises wherever it is called.
 
     Parameters
@@ -40,7 +38,9 @@ def mistake_in(
     if isinstance(error, KeyError):
         names = ", ".join(columns)
         states = f", states {', '.join(simulator.law.states)}" if simulator.law is not None else ""
-        allowed = f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
+        allowed = (
+            f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
+        )
     elif texts and isinstance(error, TypeError | ValueError):
         shown = ", ".join(f"{name} ({_first_text(columns[name])!r})" for name in texts[:4])
         allowed = f"calculations with columns of numbers; these hold texts: {shown}"

@@ -74,7 +74,9 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     elif readings.dtype != np.float64:
         bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_float(cell)), 0)
         found = f"{readings[bad]!s} in row {bad + 2}"
-        raise ParameterError(f"reading {simulator.reading!r}", found, "a number in each row, or nothing where it is missing")
+        raise ParameterError(
+            f"reading {simulator.reading!r}", found, "a number in each row, or nothing where it is missing"
+        )
     return RunRecording(cast(Plan, own), np.array(readings), simulator.source)
 
 
@@ -137,10 +139,14 @@ def predict_system(
             sd = fitted.noise_sd[first : first + per_block][there, None]
             mixture.add(mean[there], _noise_level(fitted, chain, block[there], mean[there], sd, own))
     if n_failed == n_samples:
-        raise ParameterError("simulate" if system.caller else "rates", "no finite reading", "finite readings of these rows for some of the samples")
+        raise ParameterError(
+            "simulate" if system.caller else "rates",
+            "no finite reading",
+            "finite readings of these rows for some of the samples",
+        )
     if n_failed:
         warnings.warn(
-            f"{n_failed} of {n_samples} samples are left out: the simulator gives no finite readings of these rows for them",
+            f"{n_failed} of {n_samples} samples are left out: the simulator gives no finite readings for them",
             DoubtfulResultWarning,
             stacklevel=2,
         )
@@ -148,7 +154,7 @@ def predict_system(
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         warnings.warn(
-            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a column is missing there",
+            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a column is missing",
             DoubtfulResultWarning,
             stacklevel=2,
         )
@@ -157,7 +163,9 @@ def predict_system(
 
 def _lost(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
     """Find rows that cannot be predicted because a column is missing there, (n_points,)."""
-    missing = np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
+    missing = (
+        np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
+    )
     if not np.any(missing):
         return np.zeros(len(table), dtype=np.bool_)
     there = np.isfinite(chain.predict(theta[:_FEW], table))
@@ -171,7 +179,11 @@ def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any
         lacking = _columns_read(fitted.effects, fitted.known.table) - set(table.columns)
         if lacking:
             name = min(lacking)
-            raise ParameterError("columns", name, f"a table with this column, which an effect of the model reads; it has {', '.join(table.columns)}")
+            raise ParameterError(
+                "columns",
+                name,
+                f"a table with this column, which an effect of the model reads; it has {', '.join(table.columns)}",
+            )
         new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
         forms = forms_again(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
     out = []
@@ -242,7 +254,7 @@ def write_system_prediction(prediction: SystemPrediction, path: str | os.PathLik
         If the file cannot be written.
     """
     predicted = {"mean": prediction.mean, "sd": prediction.sd, "log_density": prediction.log_density}
-    columns = {
+    columns: dict[str, Sequence[str]] = {
         name: [number_text(v) if values.dtype == np.float64 else str(v) for v in values.tolist()]
         for name, values in {**prediction.table.columns, **predicted}.items()
     }

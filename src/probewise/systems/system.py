@@ -71,7 +71,9 @@ class System:
         """
         declared = simulator.noise.sd
         if isinstance(declared, str) and declared not in table.covariates:
-            raise ParameterError('noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}")
+            raise ParameterError(
+                'noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}"
+            )
         for name in simulator.controls:
             if name not in table.columns:
                 raise ParameterError("controls", name, f"a column of the table: {', '.join(table.columns)}")
@@ -124,7 +126,9 @@ class System:
         if not readings and wrong is not None:
             raise mistake_in("rates", wrong, self.simulator, columns) from wrong
         if not np.isfinite(readings).any():
-            raise ParameterError("rates", "NaN at every place of the prior that was tried", "finite states and readings")
+            raise ParameterError(
+                "rates", "NaN at every place of the prior that was tried", "finite states and readings"
+            )
 
     @cached_property
     def marginals(self) -> dict[str, Marginal]:
@@ -297,7 +301,11 @@ class SystemChain:
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
     def _moved(
-        self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], theta: FloatArray, plan: RunTable
+        self,
+        parameters: Mapping[str, FloatArray],
+        columns: Mapping[str, NDArray[Any]],
+        theta: FloatArray,
+        plan: RunTable,
     ) -> FloatArray:
         """Integrate the law with its effects; NaN for samples at which it raises an error."""
         law = self.system.simulator.law

@@ -14,9 +14,9 @@ from probewise.diagnosis.advice.next_scans import PredictiveNormal, Rival, mutua
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.light_sensor.commands import commands, excerpts
+from probewise.diagnosis.light_sensor.scheduling import in_turn, one_after_another, put_off
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
-from probewise.diagnosis.light_sensor.scheduling import in_turn, one_after_another, put_off
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan

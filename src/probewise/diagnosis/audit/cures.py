@@ -18,8 +18,8 @@ from probewise.diagnosis.audit.detectability import (
     nats_between,
 )
 from probewise.diagnosis.light_sensor.commands import commands
-from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.light_sensor.scheduling import Scan, behind, put_off
+from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan

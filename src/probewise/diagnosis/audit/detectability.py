@@ -87,7 +87,9 @@ class PlanTemplates:
         """
         extent = Extent(*expected.levels, plan)
         maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
-        return cls.of_built(expected, plan, {name: effect for name, effect in maybe.items() if effect is not None}, most=most)
+        return cls.of_built(
+            expected, plan, {name: effect for name, effect in maybe.items() if effect is not None}, most=most
+        )
 
     @classmethod
     def of_built(

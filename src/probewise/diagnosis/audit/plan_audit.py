@@ -306,10 +306,10 @@ def audit_recorded(
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
-    judged, cosines = judged(
+    effects_seen, cosines = judged(
         PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
     )
-    return PlanAudit(plan, "the sensor as calibrated from these readings", judged, cosines, (), judged)
+    return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
 
 
 def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:

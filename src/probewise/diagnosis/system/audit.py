@@ -77,7 +77,11 @@ def _middle(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, st
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
         if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-9 * max(float(np.abs(predicted).max()), 1e-300):
-            at = "the middle of the prior" if k == 0 else "a place of the prior beside its middle, where readings stand still"
+            at = (
+                "the middle of the prior"
+                if k == 0
+                else "a place of the prior beside its middle, where readings stand still"
+            )
             return z, predicted, at
     raise ParameterError("the table", "one reading in all rows", "rows over which what the simulator predicts changes")
 
@@ -103,7 +107,9 @@ def _reasons(about: About) -> dict[str, str]:
     out |= {"offset_per_run": one_run, "gain_per_run": one_run, "nonlinearity": nothing, "saturation": nothing}
     out |= {"hysteresis": "the readings move one way only"}
     out |= dict.fromkeys(("lag", "delay", "settling", "interference"), timeless)
-    out |= {f"sensitivity:{c}": "the column does not vary" for c in table.covariates if c not in (own.reading, own.noise.sd)}
+    out |= {
+        f"sensitivity:{c}": "the column does not vary" for c in table.covariates if c not in (own.reading, own.noise.sd)
+    }
     for column in driving_columns(about):
         out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
         out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}

@@ -88,7 +88,7 @@ def _changes(table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, fl
         "up and down": (
             "swept from {low} to {high} and back", lambda low, high: low + (high - low) * (1 - np.abs(2 * share - 1)),
         ),
-        "steps": ("switched between {low} and {high}, twice", lambda low, high: np.where((4 * share).astype(int) % 2 == 0, low, high)),
+        "steps": ("switched between {low} and {high}, twice", lambda low, high: np.where(4 * share % 2 < 1, low, high)),
         "low": ("held at {low}", lambda low, high: np.full(n, low)),
         "middle": ("held at {middle}", lambda low, high: np.full(n, 0.5 * (low + high))),
         "high": ("held at {high}", lambda low, high: np.full(n, high)),

@@ -91,7 +91,7 @@ def prepare_system(
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
-def without_lost_rows(system: System, recording: Recording) -> Recording:
+def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
     """Leave out readings of rows in which a column is missing, so that nothing can be predicted there, and note it.
 
     Raises
@@ -133,7 +133,7 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameters tried: taken to be impossible")
     if caller.interpolated:
         names = ", ".join(sorted(caller.interpolated))
-        out.append(f"simulate takes no array of {names}: where it varies by row, it is interpolated between fixed values")
+        out.append(f"simulate takes no array of {names}: readings are interpolated between fixed values of it")
     return tuple(out)
 
 

@@ -142,7 +142,9 @@ def fit_simulator(
     table = table_for(simulator, table)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, bound=False)
     if prepared.too_little:
-        found = f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"
+        found = (
+            f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"
+        )
         raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
     null, noise = _weighed(prepared)
     samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
@@ -225,7 +227,9 @@ def _by_nested_sampling(
 def _told(progress: Progress) -> Callable[[nested.State], None]:
     def tell(state: nested.State) -> None:
         to_come = state.log_z_remaining - state.log_z
-        progress("nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")
+        progress(
+            "nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come"
+        )
 
     return tell
 

@@ -28,7 +28,15 @@ def predicted_and_recorded(
     ax = ax if ax is not None else stack_of_axes([4.2])[0]
     there = np.isfinite(readings)
     ax.errorbar(
-        predicted[there], readings[there], yerr=sd[there], fmt="o", ms=3, lw=0.8, color=BLUE, alpha=0.6, label="readings, ± 1 sd"
+        predicted[there],
+        readings[there],
+        yerr=sd[there],
+        fmt="o",
+        ms=3,
+        lw=0.8,
+        color=BLUE,
+        alpha=0.6,
+        label="readings, ± 1 sd",
     )
     ends = [min(predicted[there].min(), readings[there].min()), max(predicted[there].max(), readings[there].max())]
     ax.plot(ends, ends, color=BLACK, lw=0.9, label="as predicted")

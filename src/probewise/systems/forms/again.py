@@ -40,12 +40,12 @@ class _AsRecorded(About):
     known: Recorded | None = None
 
     @property
-    def predicted(self) -> FloatArray:  # type: ignore[override]
+    def predicted(self) -> FloatArray:
         assert self.known is not None
         return self.known.predicted
 
     @property
-    def states(self) -> dict[str, FloatArray]:  # type: ignore[override]
+    def states(self) -> dict[str, FloatArray]:
         assert self.known is not None
         return dict(self.known.states)
 
@@ -64,7 +64,9 @@ def recorded(about: About) -> Recorded:
     return Recorded(about.table, about.predicted, about.states)
 
 
-def forms_again(names: Iterable[str], simulator: Simulator, known: Recorded, *, more_runs: Iterable[str] = ()) -> dict[str, Form]:
+def forms_again(
+    names: Iterable[str], simulator: Simulator, known: Recorded, *, more_runs: Iterable[str] = ()
+) -> dict[str, Form]:
     """Bind forms as they were bound about a recording, by name; names that are no form's are left out.
 
     Parameters

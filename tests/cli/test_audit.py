@@ -17,6 +17,7 @@ def no_constant(name):
     raise ValueError(f"{name} is no JSON number")
 
 
+@pytest.mark.slow
 def test_an_audit_names_the_aliases_of_one_way_scans_and_the_scans_that_cure_them(recording_file, tmp_path, capsys):
     out = tmp_path / "new" / "audit"
     assert run("audit", recording_file, "--out", out) == 0

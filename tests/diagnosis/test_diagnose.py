@@ -90,6 +90,7 @@ def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value
     assert len(seen) - len(left) == n_asked
 
 
+@pytest.mark.slow
 def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     """A lamp that fades and a sensor that sinks look the same here: the one in the vocabulary speaks for both."""
     found = diagnose(recording("two_way", hidden.GainDrift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
@@ -98,6 +99,7 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     assert found.judged.unknown_probability < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
     """What differs between ways to come holds hysteresis and more; were it not spoken for, a tenth would be unknown."""
@@ -129,6 +131,7 @@ def test_backlash_is_named_measured_located_and_repaired():
     assert sensor.names[-1] == "backlash.width_mm"
 
 
+@pytest.mark.slow
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
     monkeypatch.setattr("probewise.diagnosis.judgement.global_test.global_p_value", lambda *_: 0.2)
     found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
@@ -139,6 +142,7 @@ def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_
     assert np.mean(amp != 0) == pytest.approx(found.hypotheses[0].probability, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
     plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)
@@ -152,6 +156,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     assert found.hypotheses[0].probability > 0.7
 
 
+@pytest.mark.slow
 def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     """Both shift every edge alike, and so does a tilt; scans that also go back tell them apart."""
     found = diagnose(recording("paper", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
@@ -281,6 +286,7 @@ def test_no_usable_reading_is_an_error_that_says_so():
         diagnose(nothing, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_an_earlier_sensor_is_taken_as_the_prior():
     first = clean_diagnosis()
     sensor = first.repaired.fitted_sensor(first.recording, rng=np.random.default_rng(0))
@@ -292,6 +298,7 @@ def test_an_earlier_sensor_is_taken_as_the_prior():
     np.testing.assert_allclose(ratio, math.sqrt(0.5), rtol=0.25)
 
 
+@pytest.mark.slow
 def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named():
     """To first order the SSF's width takes a scale up; at a third it does not, though no template shows that."""
     found = diagnose(recording("paper", hidden.PositionScale(-0.3, 0.0)), rng=np.random.default_rng(0))
@@ -300,6 +307,7 @@ def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named(
     assert scale.probability > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "name"),
     [(hidden.PlaceStep(-0.8, 1.4), "missing_tooth"), (hidden.StickSlip(0.5, 6.0, 0.3), "stick_slip")],
@@ -312,6 +320,7 @@ def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
     assert name in [candidate["name"] for candidate in document["unknown_candidates"][:2]]
 
 
+@pytest.mark.slow
 def test_a_tone_that_slides_is_no_memory_of_the_noise():
     plain = recording("paper")
     turns = (plain.plan.time_s - plain.plan.time_s[0]) / np.ptp(plain.plan.time_s)
@@ -338,6 +347,7 @@ def test_what_has_a_name_of_our_own_is_unknown_and_its_repair_predicts():
     assert found.improvement.p_value_after > 0.001
 
 
+@pytest.mark.slow
 def test_readings_beyond_the_declared_range_do_not_stop_it():
     """A gradient drives the dark end below what the instrument can read: those rows are lost, the rest is diagnosed."""
     plan = paper_plan()
@@ -349,6 +359,7 @@ def test_readings_beyond_the_declared_range_do_not_stop_it():
     assert "ambient_gradient" in found.combination
 
 
+@pytest.mark.slow
 def test_rounding_coarser_than_the_fit_is_still_rounding():
     full = recording("paper")
     found = diagnose(
@@ -358,6 +369,7 @@ def test_rounding_coarser_than_the_fit_is_still_rounding():
     assert "quantisation" in found.combination
 
 
+@pytest.mark.slow
 def test_what_a_free_ssf_takes_up_whole_is_no_effect_until_the_sensor_is_known():
     """A turned sensor has a turned SSF, a blurred edge a blurred one."""
     plan = two_way_plan()
@@ -373,6 +385,7 @@ def test_what_a_free_ssf_takes_up_whole_is_no_effect_until_the_sensor_is_known()
     assert blur.is_of_the_ssf(higher)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_known_shows_that_it_was_turned():
     """As by a clean diagnosis; the alarm is not silenced by fine structure that the sensor is known not to have."""
     rng = np.random.default_rng(0)
@@ -395,6 +408,7 @@ def asked_about(monkeypatch, of: Recording) -> tuple[list, float, Diagnosis]:
     return *seen[0], found
 
 
+@pytest.mark.slow
 def test_all_that_is_likely_is_a_rival_in_the_noise_of_the_first(monkeypatch):
     """One way only, backlash is an edge that lies elsewhere is a tilt; of a large one the null makes noise."""
     rivals, sd, found = asked_about(monkeypatch, recording("paper", hidden.Backlash(1.2), seed=2))
@@ -407,6 +421,7 @@ def test_all_that_is_likely_is_a_rival_in_the_noise_of_the_first(monkeypatch):
     assert np.std(found.repair.before.residuals) > 1.2 * NOISE_SD
 
 
+@pytest.mark.slow
 def test_where_nothing_is_found_a_rival_is_imagined_that_would_have_been_seen_here(monkeypatch):
     (null, imagined), _, found = asked_about(monkeypatch, recording("paper", seed=2))
     assert found.verdict == "clean"
@@ -417,6 +432,7 @@ def test_where_nothing_is_found_a_rival_is_imagined_that_would_have_been_seen_he
     assert 1.5 < np.linalg.norm(apart) < 6.0
 
 
+@pytest.mark.slow
 def test_what_is_imagined_is_not_ruled_out_by_the_readings_taken(monkeypatch):
     """One edge in little noise: the sensor takes up nearly all, and what takes it up is no straight line."""
     edge = noise_free("paper")

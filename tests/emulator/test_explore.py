@@ -61,6 +61,7 @@ def test_the_robot_finds_the_circle_under_every_fault_and_loses_nothing(
         assert (np.diff([reading.covariates["battery_mv"] for reading in run.journal]) < 0).all()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_measurements_as_on_the_simulated_arm(asked: Experiment, tmp_path: Path) -> None:
     """Both begin at the same place, read the same there, and end at the same circle.
 

@@ -93,6 +93,7 @@ def test_joined_proposals_get_their_shares_of_the_draws_and_of_the_density() -> 
     assert density[grid[:, 0] < 0].sum() / density.sum() == pytest.approx(0.7, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 def test_eighteen_modes_of_few_live_points_are_not_claimed() -> None:
     """Of eggbox's modes 100 live points lose some: refined evidences either keep to their error or are doubted."""
@@ -162,6 +163,7 @@ def _line(seed: int, n: int = 6) -> Line:
     return Line(x, slope * x + offset + 0.1 * rng.standard_normal(n))
 
 
+@pytest.mark.slow
 def test_three_readings_one_by_one_keep_the_evidence() -> None:
     """Twenty seeds, three updates each, against the closed form: scatter as claimed, far sharper than the run's."""
     after_each, sharp, fell_back = [], [], 0

@@ -76,6 +76,7 @@ def test_merged_runs_are_one_run_with_the_live_points_of_all(
     assert "8, ln Z agree" in merged.summary()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plateau", "naive steps", "shells 2-D"])
 def test_merged_evidence_is_right_and_its_error_falls_as_the_root_of_the_number_of_runs(
     name: str, rng: np.random.Generator

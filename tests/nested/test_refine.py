@@ -12,6 +12,7 @@ from probewise.nested import NestedResult, pareto_k, refine, run, update
 FALSE_ALARM = 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plateau", "Rosenbrock 2-D", "Gaussian 4-D"])
 def test_the_refined_evidence_scatters_as_it_says(name: str) -> None:
     """Mean and spread of twelve standardised errors, each with a false-alarm rate of 1e-4."""
@@ -44,6 +45,7 @@ def test_a_tail_of_equal_weights_has_a_shape_too() -> None:
     assert np.isfinite(pareto_k(weights))
 
 
+@pytest.mark.slow
 def test_an_update_agrees_with_a_run_from_scratch() -> None:
     before, after = problem("Gaussian 2-D"), problem("Rosenbrock 2-D")
     fell_back = []

@@ -45,6 +45,7 @@ def _by_quadrature(of, low, high, n=1501):
     return math.log(np.exp(log_p - log_p.max()).sum() * (x[1] - x[0]) * (y[1] - y[0])) + float(log_p.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("of", "low", "high"), [(_bent, (-6, -1), (6, 36)), (_two, (-3, -1), (3, 1))], ids=["bent", "two"]
 )
@@ -59,6 +60,7 @@ def test_the_evidence_is_the_same_and_sharper(of, low, high):
     assert second.n_calls < first.n_calls
 
 
+@pytest.mark.slow
 def test_its_posterior_is_the_same():
     problem, rng = Problem(WIDE, _two), np.random.default_rng(6)
     first = nested.run(problem, rng=rng, n_live=200)

@@ -45,6 +45,7 @@ def test_a_run_that_may_not_go_on_is_a_miss(study):
         assert table[row].reached.value == 0
 
 
+@pytest.mark.slow
 def test_other_processes_come_to_the_same(study, tmp_path):
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         other = run_study(ROWS, path=tmp_path / "trials.jsonl", executor=pool, **BRIEF)
@@ -71,6 +72,7 @@ def test_wrong_files_and_numbers_are_refused(study, tmp_path):
         run_study([REFERENCE], path=tmp_path / "none.jsonl")
 
 
+@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_loses_and_counts_twice_nothing(study, tmp_path):
     """Two workers on this machine; one is killed as soon as the first run has ended."""
     distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")

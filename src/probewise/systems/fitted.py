@@ -18,7 +18,8 @@ from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
 from probewise.recordings import strict_json, write_text_atomically
-from probewise.recordings.table import csv_text, number_text, read_text
+from probewise.recordings.table import csv_text, number_text
+from probewise.recordings.text import read_text
 from probewise.systems.forms.again import Recorded
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable

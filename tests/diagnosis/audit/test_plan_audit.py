@@ -84,6 +84,7 @@ def test_going_both_ways_tells_play_from_an_edge_that_lies_elsewhere():
     assert sights_of(thinned(two_way_plan(), 8))[2] < 0.1
 
 
+@pytest.mark.slow
 def test_what_a_cure_claims_is_seen_after_all_of_it():
     audit = audit_plan(thinned(paper_plan()))
     before, after = ({e.name: e.detectability for e in effects} for effects in (audit.effects, audit.after))
@@ -108,6 +109,7 @@ def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
     assert _cured_at(steps[:1]) == {}
 
 
+@pytest.mark.slow
 def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
     """A sensor that looks beside itself, and an edge that lies elsewhere."""
     audit = audit_plan(paper_plan())

@@ -172,6 +172,7 @@ def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     assert logsumexp(each + nodes.log_weights) == pytest.approx(wanted, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_sd", [0.3, 0.7])
 def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise_sd):
     """Where nine readings of ten say the same, what rounding leaves follows the place, and was taken for physics."""
@@ -182,6 +183,7 @@ def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise
     assert sigma == pytest.approx(noise_sd, rel=0.5)
 
 
+@pytest.mark.slow
 def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
     found = diagnose(rounded(0.4, 1, hidden.AmbientGradient(0.15, 0.0)), rng=np.random.default_rng(0))
     assert found.combination == ("ambient_gradient", "quantisation")
@@ -190,6 +192,7 @@ def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
     assert dataclasses.asdict(found.improvement)["log_evidence"] > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_sd", [0.9, 1.4])
 def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):
     found = diagnose(as_declared(rounded(noise_sd, 1)), rng=np.random.default_rng(0))
@@ -199,6 +202,7 @@ def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(nois
     assert sigma == pytest.approx(np.hypot(noise_sd, STEP / np.sqrt(12)), rel=0.15)
 
 
+@pytest.mark.slow
 def test_lost_readings_are_found_among_coarsely_rounded_ones():
     whole = rounded(0.4, 1)
     readings = whole.readings.copy()
@@ -207,6 +211,7 @@ def test_lost_readings_are_found_among_coarsely_rounded_ones():
     assert (found.verdict, found.combination) == ("noise", ("dropouts",))
 
 
+@pytest.mark.slow
 def test_where_no_three_readings_follow_each_other_nothing_says_that_a_step_is_coarse():
     """Every second reading is missing, and the step is a sixtieth of the noise."""
     whole = paper_plan()

@@ -95,6 +95,7 @@ def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
     np.testing.assert_array_equal(drawn[7], 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect",
     [None, CorrelatedNoise(), SignalDependentNoise(), DriftingNoise(), Outliers()],
@@ -208,6 +209,7 @@ def test_the_rough_sd_needs_no_model():
     assert rough_sd(recording) == pytest.approx(SD, rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("declared", [True, False])
 def test_lost_readings_are_found_among_rounded_ones(declared):
     """Where most readings are just as rounded predictions are, their spread is nothing, and still not all are far."""

@@ -15,6 +15,7 @@ PLAN = two_way_plan()
 SD = 0.45
 
 
+@pytest.mark.slow
 def test_two_bumps_in_time_are_both_repaired():
     """No other scan tells of what is local in time; readings on both sides of a block do."""
     world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.evidence.laplace import weigh
@@ -19,6 +20,7 @@ from probewise.sensor import total_variation
 PLAN = two_way_plan()
 
 
+@pytest.mark.slow
 def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     free = FreeForm.about(default_sensor(Extent(10.0, 60.0, PLAN), 1))
     rng = np.random.default_rng(5)

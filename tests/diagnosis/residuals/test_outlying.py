@@ -73,6 +73,7 @@ def spotted(rows: np.ndarray) -> Recording:
     return Recording(plan, readings)
 
 
+@pytest.mark.slow
 def test_outliers_anywhere_are_noise_and_at_one_end_of_a_scan_they_are_not():
     anywhere = diagnose(spotted(np.random.default_rng(4).choice(404, 12, replace=False)), rng=np.random.default_rng(0))
     assert anywhere.verdict == "noise"

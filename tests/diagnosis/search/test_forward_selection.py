@@ -19,6 +19,7 @@ def diagnosed(number: int) -> tuple[Case, Diagnosis]:
     return case, diagnose(case.recording, rng=np.random.default_rng(number))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number",
     [
@@ -38,6 +39,7 @@ def test_the_right_name_gets_a_fair_fit(number):
     assert found.combination == case.truth.combination
 
 
+@pytest.mark.slow
 def test_a_prediction_leaves_open_what_a_clean_verdict_does(tmp_path):
     """A scale of position that was missed, at one in ten, is in the model; a new pattern may lie where it matters."""
     case, found = diagnosed(2670)

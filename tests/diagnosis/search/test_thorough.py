@@ -69,6 +69,7 @@ def test_a_line_weighs_what_quadrature_says():
     assert null.agree
 
 
+@pytest.mark.slow
 def test_the_null_is_always_weighed_too(stepped):
     found, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
     assert {"ambient_step", "clean"} <= {w.label for w in weighings}
@@ -76,6 +77,7 @@ def test_the_null_is_always_weighed_too(stepped):
     assert found.posterior.probabilities == stepped.posterior.probabilities
 
 
+@pytest.mark.slow
 def test_where_no_density_fits_the_runs_themselves_become_sharp(stepped, monkeypatch):
     monkeypatch.setattr(thorough.nested, "refine", lambda *_, **__: SimpleNamespace(sound=False))
     monkeypatch.setattr(thorough, "_SHARP", 0.1)
@@ -96,6 +98,7 @@ def stub_of_the_whole_prior(monkeypatch, change):
     monkeypatch.setattr(thorough, "nested", SimpleNamespace(**{**vars(nested), "run": run}))
 
 
+@pytest.mark.slow
 def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, monkeypatch):
     """It is said where the evidences agree, too."""
     stub_of_the_whole_prior(monkeypatch, lambda result: replace(result, log_z=result.log_z + 30.0))

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         scene,
         sensor,
         study,
+        systems,
         world,
     )
     from probewise.calibration import read_sensor
@@ -84,6 +85,7 @@ __all__ = [
     "scene",
     "sensor",
     "study",
+    "systems",
     "world",
 ]
 

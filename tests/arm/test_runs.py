@@ -154,6 +154,7 @@ def test_nobody_to_press_enter_is_told_of(bricks, plan_file, tmp_path, monkeypat
     assert bricks["opened"][0].at_rest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["naive", pytest.param("ssf", marks=pytest.mark.slow)])
 def test_exploring_with_a_brick_goes_on_after_its_line_died(model, bricks, sensor_file, tmp_path, capsys):
     """Each line of the journal is a reading, once, with the orientation that the base gave it."""

@@ -190,6 +190,7 @@ def test_a_simulated_recording_holds_the_readings_of_its_truth() -> None:
     assert abs(recording.readings[:20].mean() - truth.black) < 1.0
 
 
+@pytest.mark.slow
 def test_orders_run_elsewhere_give_the_same_result(recording):
     """Every order has a stream of its own: here one after another, there on an executor."""
     here, there = (

@@ -46,6 +46,7 @@ def test_without_a_directory_nothing_is_written(recording_file, tmp_path, capsys
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_a_calibrated_sensor_makes_a_common_rotation_visible(recording_file, sensor_file, tmp_path):
     out = tmp_path / "audit"
     assert run("audit", recording_file, "--sensor", sensor_file, "--out", out, "--quiet") == 0

@@ -24,6 +24,7 @@ def explore(sensor_file, tmp_path, quick_frames):
     return call
 
 
+@pytest.mark.slow
 def test_the_sensor_may_be_learnt_along(explore, capsys):
     status, lines = explore("--learn-sensor", "--max-readings", 1)
     assert status == 0
@@ -82,6 +83,7 @@ def at_14_mm(sensor_file):
     write_sensor(replace(read_sensor(sensor_file), instrumentation=Instrumentation(height_mm=14.0)), sensor_file)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("at_14_mm")
 def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept(explore, capsys):
     more = ("--orientations", "0,90", "--heights", "10,14", "--repeats", "2", "--utility", "per-second")

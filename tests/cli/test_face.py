@@ -108,6 +108,7 @@ def test_a_verb_and_the_function_behind_it_have_the_same_defaults():
         assert posing[parameter].default == inspect.signature(verbs.explore).parameters[parameter].default
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 def test_a_seed_calibrates_the_same_sensor_in_python_and_on_the_command_line(
     recording_file, recording, tmp_path, monkeypatch

@@ -67,6 +67,7 @@ def journal_file(sensor_file, tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_robot_says_in_mid_run_that_its_sensor_model_is_wrong(journal_file, sensor_file, tmp_path, capsys):
     out = tmp_path / "out"
     assert run("diagnose", journal_file, "--sensor", sensor_file, "--out", out) == 0

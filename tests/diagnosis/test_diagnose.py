@@ -71,6 +71,7 @@ def test_a_recording_without_effects_is_clean():
     assert found.report.noise.parameters[0].interval95[0] < NOISE_SD < found.report.noise.parameters[0].interval95[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seen", "p_value", "n_asked"),
     [

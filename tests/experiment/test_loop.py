@@ -218,6 +218,7 @@ for info in explore(arm, small["small_experiment"](), rng=np.random.default_rng(
 """
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_loses_no_reading(small, found, tmp_path):
     """SIGKILL while the fourth reading is being taken; the fifth is never asked for before the fourth is on disk."""
     journal = tmp_path / "journal.jsonl"

@@ -201,13 +201,10 @@ def test_the_naive_levels_come_from_known_black_and_white() -> None:
         Naive.estimated([10], [58, 60], sd_floor=0.3)
 
 
-def test_the_floor_is_that_of_rounding_and_never_a_share_of_the_span() -> None:
+def test_the_floor_is_that_of_rounding_or_a_thousandth_of_the_span() -> None:
     assert sd_floor(recording([10, 60], step=1)) == pytest.approx(1 / math.sqrt(12))
-    assert sd_floor(recording([0, 1000], step=1)) == pytest.approx(1 / math.sqrt(12))
-    assert sd_floor(recording([10.0, 12.5, 15.0, 60.0])) == pytest.approx(
-        2.5 / math.sqrt(12)
-    )  # the lattice they are on
-    assert sd_floor(recording([10, 60])) < 1e-9
+    assert sd_floor(recording([10, 60])) == pytest.approx(0.05)
+    assert sd_floor(recording([0, 1000], step=1)) == pytest.approx(1.0)
     assert sd_ceiling(recording([10, 60])) == 50
     assert reading_span(recording([5, 5], min=0, max=100)) == 100
     assert reading_span(recording([5, 5])) == 1

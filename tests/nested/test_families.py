@@ -53,6 +53,7 @@ def z_sd(found: list[NestedResult], *, with_memory: bool) -> float:
     )
 
 
+@pytest.mark.slow
 def test_chains_that_remember_have_an_error_that_knows_it() -> None:
     """Right errors leave these limits once in a thousand; without the memory the error would be far outside."""
     n = 40

@@ -112,6 +112,9 @@ FIGURES = {
     "reliability_diagram": lambda s: plots.reliability_diagram(
         [Bin(0.15, share([True] * 3 + [False] * 17)), Bin(0.5, share([True] * 11 + [False] * 9))]
     ),
+    "predicted_and_recorded": lambda s: plots.predicted_and_recorded(
+        np.arange(40.0), np.arange(40.0) + 0.3, np.ones(40), label="temp_c", unit="degC"
+    ),
     "confusion_matrix": lambda s: plots.confusion_matrix(["a", "b"], ["a", "b"], np.array([[3, 1], [0, 4]])),
 }
 

@@ -7,18 +7,22 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectFound, Hypothesis
+from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.effects import EFFECTS, NUISANCES, VOCABULARY
+from probewise.recordings import Instrumentation
 from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words
 from probewise.report.headline import MOST_WORDS, headline
 
 NAMES = sorted(VOCABULARY)
+PLAN = SimpleNamespace(instrumentation=Instrumentation())
 
 
 def found(verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares=None, n=408, few=False, beside=()):
     named = [EffectFound(name, 0.9, 20.0 - k, "", ()) for k, name in enumerate((*combination, *beside))]
     stated = [Hypothesis(tuple(names), 0.9 / max(len(rivals), 1)) for names in rivals]
     return SimpleNamespace(
-        recording=SimpleNamespace(usable=np.ones(n, dtype=bool), readings=np.arange(float(n))),
+        recording=SimpleNamespace(usable=np.ones(n, dtype=bool), readings=np.arange(float(n)), plan=PLAN),
+        apparatus=LightSensor(),
         verdict=verdict,
         combination=tuple(combination),
         p_value=p_value,

@@ -11,8 +11,6 @@ from probewise.effects import lattice_step
 from probewise.inference.student_t import StudentT
 from probewise.recordings.plan import Recording
 
-_DIGITS = 1e-12  # of the largest reading: what arithmetic leaves of it
-
 __all__ = ["reading_span", "sd_ceiling", "sd_floor", "student_t"]
 
 
@@ -29,15 +27,13 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_floor(recording: Recording) -> float:
-    """Least sd a reading can have: that of rounding to the declared step, or to the lattice on which all readings lie.
+    """Least sd a reading can have: that of rounding to the declared step, or a share of the span.
 
-    Without the lattice's, levels that happen to be on it too would leave no residual, and a law with a tail would take
-    that for the noise. Where there is no lattice the floor is that of the numbers themselves, never a share of the
-    span: a good instrument's noise may be a millionth of it.
+    Where no step is declared, that of the lattice on which all readings lie: without it, levels that happen to be on
+    the lattice too would leave no residual, and a law with a tail would take that for the noise.
     """
-    readings = recording.readings[recording.usable]
-    step = recording.plan.instrumentation.step or lattice_step(readings)
-    return max(step / math.sqrt(12.0), _DIGITS * float(np.abs(readings).max(initial=0.0)), 1e-300)
+    step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
+    return max(step / math.sqrt(12.0), recording.least_share_of_span * reading_span(recording))
 
 
 def sd_ceiling(recording: Recording) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -263,6 +263,9 @@ class Recording(ShowsItself):
     `usable` is False where a reading is missing or outside the declared range; such rows
     stay in the plan (lag and backlash need them) and are left out of every likelihood.
     """
+
+    least_share_of_span: ClassVar[float] = 1e-3
+    """Of the span of the readings: no light sensor's noise is less."""
 
     plan: Plan
     readings: FloatArray

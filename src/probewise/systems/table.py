@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +125,9 @@ class RunTable:
 @dataclass(frozen=True, eq=False)
 class RunRecording(Recording):
     """A table and its readings, in the place of a plan and its readings: it offers what the diagnosis asks of both."""
+
+    least_share_of_span: ClassVar[float] = 1e-12
+    """Of the span of the readings: what arithmetic leaves of it; a good instrument's noise may be a millionth."""
 
     def _require_plan(self) -> None:
         if not isinstance(self.plan, RunTable):

@@ -40,6 +40,6 @@ def predicted_and_recorded(
     )
     ends = [min(predicted[there].min(), readings[there].min()), max(predicted[there].max(), readings[there].max())]
     ax.plot(ends, ends, color=BLACK, lw=0.9, label="as predicted")
-    ax.legend(frameon=False, loc="upper left", fontsize="small")
+    ax.legend(frameon=False, loc="upper left", fontsize=9)
     tidy(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
     return ax

@@ -1,0 +1,71 @@
+"""From parameters to noise-free readings, with what is left out: input and clock, parameters, law, reading."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.forms.form import Now, Placed
+from probewise.world.systems.kind import Kind
+from probewise.world.systems.motion import travel
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["Trace", "now_at_rows", "read", "simulate"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Noise-free readings and the states behind them, (n_samples, n_points)."""
+
+    readings: FloatArray
+    states: Mapping[str, FloatArray]
+
+
+def simulate(kind: Kind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()) -> Trace:
+    """Simulate a system.
+
+    Parameters
+    ----------
+    kind
+        The system.
+    rows
+        Where and when it is read.
+    parameters
+        (n_samples or 1, 1 or n_points) each.
+    effects
+        Forms with numbers (n_samples or 1, 1).
+    """
+    placed = [(form, {name: np.atleast_2d(v) for name, v in numbers.items()}) for form, numbers in effects]
+    columns = {name: values[None, :] for name, values in rows.columns.items()}
+    for form, numbers in placed:
+        if form.side == "input" and not (form.late and kind.law is not None):
+            columns = form.act(columns, rows, numbers)
+    inner = [(form, n) for form, n in placed if form.side in ("parameter", "rate") or (form.late and kind.law is not None)]
+    n_samples = max(len(v) for v in (*parameters.values(), *columns.values(), *(v for _, n in placed for v in n.values())))
+    if kind.law is not None:
+        states = travel(kind, rows, parameters, columns, inner)
+        readings = np.asarray(kind.law.read(states, parameters, columns))
+    else:
+        assert kind.formula is not None
+        states, p = {}, dict(parameters)
+        now = now_at_rows(rows)
+        for form, numbers in inner:
+            p[form.target] = p[form.target] + form.act(now, numbers)
+        readings = np.asarray(kind.formula(p, columns))
+    readings = np.array(np.broadcast_to(readings, (n_samples, len(rows))))
+    return Trace(read(readings, rows, placed), states)
+
+
+def read(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> FloatArray:
+    """Apply what acts on the readings alone, in its order."""
+    for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
+        readings = form.act(readings, rows, numbers)
+    return readings
+
+
+def now_at_rows(rows: SystemRows) -> Now:
+    """Give the moments of all rows."""
+    return Now(rows.t[None, :], rows.since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))

@@ -1,0 +1,166 @@
+"""Least squares on the world's own simulation: what is left of an effect when the nominal model is refitted in full."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError
+from probewise.world.systems.chain import simulate
+from probewise.world.systems.forms.form import Form, Numbers, Placed
+from probewise.world.systems.kind import Kind
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["Beside", "Fitted", "Model", "free_numbers", "left_over", "numbers_of"]
+
+_STEP = 1e-4  # of a coordinate, for derivatives
+_FORM_STEP = 0.1  # of a form's own
+
+
+def free_numbers(form: Form) -> tuple[str, ...]:
+    """Name the numbers that a fit may change: not the moment of a step, nor values of runs that are not there."""
+    return tuple(name for name, step in form.steps.items() if step > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A form in a model: where its numbers start, and which of them are fitted."""
+
+    form: Form
+    start: Mapping[str, float]
+    free: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), sum of squares in sds."""
+
+    at: FloatArray
+    readings: FloatArray
+    slopes: FloatArray
+    squares: float
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A nominal model with forms beside it, as a function of coordinates.
+
+    Coordinates are those of the shared parameters, of each `per_run` parameter in every run of the rows, and the free
+    numbers of the forms in units of their steps.
+    """
+
+    kind: Kind
+    rows: SystemRows
+    beside: Sequence[Beside] = field(default=())
+
+    @cached_property
+    def _runs(self) -> list[int]:
+        return [int(self.rows.run[own[0]]) for own in self.rows.by_run]
+
+    @property
+    def n_nominal(self) -> int:
+        """Number of coordinates of the nominal model."""
+        return len(self.kind.shared) + len(self.kind.per_run) * len(self._runs)
+
+    def coordinates(self, shared: Mapping[str, float], by_run: Mapping[str, FloatArray]) -> FloatArray:
+        """Return coordinates of true parameters (n_runs of the case,), the forms' numbers as they start."""
+        own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared]
+        each = [self.kind.priors[name].coordinate(by_run[name][self._runs]) for name in self.kind.per_run]
+        numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.beside for name in b.free]
+        return np.concatenate([np.ravel(own), *each, numbers])
+
+    def parameters(self, x: FloatArray) -> dict[str, FloatArray]:
+        """Parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points) of a run's own."""
+        out, n = {}, len(self.kind.shared)
+        for k, name in enumerate(self.kind.shared):
+            out[name] = self.kind.priors[name].value(x[:, k : k + 1])
+        at = np.searchsorted(self._runs, self.rows.run)
+        for name in self.kind.per_run:
+            out[name] = self.kind.priors[name].value(x[:, n : n + len(self._runs)])[:, at]
+            n += len(self._runs)
+        return out
+
+    def effects(self, x: FloatArray) -> list[Placed]:
+        """Forms with their numbers at coordinates."""
+        out, n = [], self.n_nominal
+        for b in self.beside:
+            numbers: dict[str, FloatArray] = {name: np.full((len(x), 1), value) for name, value in b.start.items()}
+            for name in b.free:
+                numbers[name] = x[:, n : n + 1] * b.form.steps[name] * _FORM_STEP
+                n += 1
+            out.append((b.form, numbers))
+        return out
+
+    def predict(self, x: FloatArray) -> FloatArray:
+        """Noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
+        return simulate(self.kind, self.rows, self.parameters(x), self.effects(x)).readings
+
+    def with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Readings (n_points,) and their slopes (n_points, n_coordinates); what is a run's own is changed in all at once."""
+        n_shared, n_runs = len(self.kind.shared), len(self._runs)
+        moves = [np.eye(len(x))[k] for k in range(n_shared)]
+        for j in range(len(self.kind.per_run)):
+            moves.append(np.isin(np.arange(len(x)), n_shared + j * n_runs + np.arange(n_runs)).astype(float))
+        moves += [np.eye(len(x))[k] for k in range(self.n_nominal, len(x))]
+        sizes = np.where([np.flatnonzero(m)[0] >= self.n_nominal for m in moves], 1.0, _STEP)
+        steps = np.array(moves) * sizes[:, None]
+        found = self.predict(np.concatenate([x[None], x + steps, x - steps]))
+        n = len(moves)
+        slopes = (found[1 : 1 + n] - found[1 + n :]) / (2 * sizes[:, None])
+        out = np.zeros((len(self.rows), len(x)))
+        for move, slope in zip(moves, slopes, strict=True):
+            columns = np.flatnonzero(move)
+            if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal:
+                out[:, columns[0]] = slope
+            else:
+                for column, run in zip(columns, self._runs, strict=True):
+                    here = self.rows.run == run
+                    out[here, column] = slope[here]
+        return found[0], out
+
+    def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> Fitted:
+        """Fit readings (n_points,) by least squares from a start.
+
+        Raises
+        ------
+        NotConvergedError
+            If the fit leaves the finite numbers.
+        """
+        last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+        sd = self.kind.sd
+
+        def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            key = x.tobytes()
+            if key not in last:
+                last.clear()
+                last[key] = self.with_slopes(x)
+            return last[key]
+
+        try:
+            with np.errstate(all="ignore"):
+                found = least_squares(
+                    lambda x: (both(x)[0] - readings) / sd, start, jac=lambda x: both(x)[1] / sd, x_scale="jac",
+                    xtol=1e-9, ftol=1e-10, gtol=1e-9, max_nfev=max_calls,
+                )  # fmt: skip
+                f, slopes = both(found.x)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise NotConvergedError(f"a fit of the {self.kind.name} left the finite numbers") from error
+        return Fitted(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
+
+
+def left_over(change: FloatArray, slopes: FloatArray) -> FloatArray:
+    """Take out of changes (n_points, ...) what slopes (n_points, n) can take up."""
+    scale = np.sqrt(np.sum(slopes**2, axis=0))
+    basis, values, _ = np.linalg.svd(slopes / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    basis = basis[:, values > 1e-8 * values.max(initial=1e-300)]
+    return np.asarray(change - basis @ (basis.T @ change))
+
+
+def numbers_of(values: Mapping[str, float]) -> Numbers:
+    """Make numbers of one setting."""
+    return {name: np.array([[value]]) for name, value in values.items()}

@@ -1,0 +1,103 @@
+"""What may be wrong with what drives a system: offset, gain, ceiling, dead zone, play, waves, dead time; and its clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.forms.form import Form, Numbers
+from probewise.world.systems.forms.modulations import one_by_one, wave_bank, wave_joined
+from probewise.world.systems.forms.readings import earlier
+from probewise.world.systems.forms.scene import Scene, log_uniform
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["forms_of_inputs", "play"]
+
+Change = Callable[[FloatArray, SystemRows, Numbers], Any]
+
+
+def forms_of_inputs(scene: Scene) -> Iterator[Form]:
+    """List what may be wrong with each column that drives the system, and with the clock."""
+    for column in scene.kind.drives:
+        yield from _of_column(scene, column)
+    time = scene.rows.time
+    # A clock that runs wrong is seen where the law, or the formula, asks for the time.
+    if time is not None and (scene.kind.law is not None or scene.kind.time_anew):
+        yield _linear("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
+
+
+def _on(column: str, change: Change) -> Callable[[Mapping[str, FloatArray], SystemRows, Numbers], dict[str, Any]]:
+    return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
+
+
+def _linear(name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]) -> Form:
+    return Form(
+        name, "input", _on(column, change), lambda a, drawn: {"a": a}, lambda rng: {}, [[{"a": first}]], one_by_one,
+        {"a": first}, first, limit, covariates, uses=(),
+    )  # fmt: skip
+
+
+def _sized(
+    name: str, number: str, change: Change, column: str, tried: FloatArray, covariates: tuple[str, ...], late: str = ""
+) -> Form:
+    return Form(
+        name, "input", _on(column, change), lambda a, drawn: {number: a}, lambda rng: {},
+        [[{number: float(size)}] for size in tried], lambda group, amounts: dict(group[0]),
+        {number: 0.02 * float(tried[len(tried) // 2])}, float(tried[len(tried) // 2]), float(tried[-1]), covariates,
+        signed=False, late=late,
+    )  # fmt: skip
+
+
+def _of_column(scene: Scene, column: str) -> Iterator[Form]:
+    values, spread = scene.rows.columns[column], scene.spread(column)
+    low, high = float(values.min()), float(values.max())
+    span, own = high - low, (column, "level")
+    yield _linear(f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own)
+    yield _linear(f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own)
+    levels = high - span * np.geomspace(0.004, 0.5, 12)
+    yield Form(
+        f"input_saturation:{column}", "input", _on(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        lambda a, drawn: {"level": high - a}, lambda rng: {}, [[{"level": float(level)}] for level in levels],
+        lambda group, amounts: dict(group[0]), {"level": 0.01 * span}, 0.05 * span, 0.6 * span, own, signed=False,
+    )  # fmt: skip
+    sizes = span * np.geomspace(1e-4, 0.3, 10)
+    if low <= 0.1 * span:
+        yield _sized(f"dead_zone:{column}", "width", lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
+                     column, sizes, own)  # fmt: skip
+    moves = np.concatenate([np.diff(values[rows]) for rows in scene.rows.by_run])
+    if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
+        yield _sized(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
+    if len(np.unique(values)) > 20:
+        waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
+
+        def wavy(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+            return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
+
+        first = 0.01 * spread
+        bank = [[{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")]
+        yield Form(
+            f"periodic_error:{column}", "input", _on(column, wavy), lambda a, drawn: {"a": a, **drawn},
+            lambda rng: {"period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)), "phase": float(rng.uniform(0, 2 * np.pi))},
+            bank, wave_joined, {"a": first, "period": 0.002 * span, "phase": 0.05}, first, 0.2 * span, own,
+        )  # fmt: skip
+    if scene.rows.time is not None:
+        taus = scene.rows.gap * np.geomspace(0.05, 6, 12 if scene.kind.law is None else 5)
+        yield _sized(f"input_delay:{column}", "tau_s", lambda c, rows, v: earlier(c, rows, np.maximum(v["tau_s"], 0.0)), column, taus,
+                     ("previous", column), late=column)  # fmt: skip
+
+
+def play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    """Follow a column with play: nothing moves until it is taken up; a run begins as if it had come the way it goes on."""
+    half = 0.5 * np.maximum(v["width"][:, 0], 0.0)
+    out = np.empty((max(len(c), len(half)), c.shape[1]))
+    for own in rows.by_run:
+        moves = np.diff(c[0, own])
+        ways = moves[moves != 0]
+        at = c[:, own[0]] - half * (np.sign(ways[0]) if ways.size else 0.0)
+        for row in own:
+            at = np.minimum(np.maximum(at, c[:, row] - half), c[:, row] + half)
+            out[:, row] = at
+    return out

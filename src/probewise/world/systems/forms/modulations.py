@@ -1,0 +1,147 @@
+"""How something varies: along time, at a moment, from run to run, with a column, as a wave, as it settles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.forms.form import Bank, Now, Numbers
+from probewise.world.systems.forms.scene import Scene, log_uniform
+
+__all__ = ["Modulation", "along_time", "by_run", "one_by_one", "settling", "step", "waves", "with_column", "wave_bank", "wave_joined"]
+
+
+@dataclass(frozen=True, eq=False)
+class Modulation:
+    """A function of the moment, in proportion to an amplitude; names as in `Form`."""
+
+    over: Callable[[Now, Numbers], Any]
+    sized: Callable[[float, dict[str, float]], dict[str, float]]
+    draw: Callable[[np.random.Generator], dict[str, float]]
+    bank: Callable[[float], Bank]
+    join: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
+    steps: Callable[[float], Mapping[str, float]]
+    covariates: tuple[str, ...]
+    reach: float
+    uses: tuple[str, ...] = ()
+    breaks: Callable[[Numbers], FloatArray] | None = None
+
+
+def _nothing(rng: np.random.Generator) -> dict[str, float]:
+    return {}
+
+
+def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+    """Scale the amplitude of the one member of a group."""
+    return {**group[0], "a": group[0]["a"] * float(amounts[0])}
+
+
+def _plain(over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()) -> Modulation:
+    return Modulation(
+        over, lambda a, drawn: {"a": a}, _nothing, lambda a: [[{"a": a}]], one_by_one, lambda a: {"a": a}, covariates, reach, uses
+    )
+
+
+def along_time(scene: Scene) -> Modulation:
+    """In proportion to time as printed."""
+    names = ("time",) if scene.rows.time in (None, "time") else ("time", str(scene.rows.time))
+    return _plain(lambda now, v: v["a"] * now.t, names, float(np.abs(scene.rows.t).max()))
+
+
+def with_column(scene: Scene, column: str) -> Modulation:
+    """In proportion to a column, from its mean over the recording."""
+    middle = scene.middle(column)
+    return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), scene.spread(column), (column,))
+
+
+def step(scene: Scene) -> Modulation:
+    """A step at a moment; at a row where there is no time."""
+    at, timed = ("at_s", True) if scene.rows.time is not None else ("at_row", False)
+    moments = np.quantile(np.unique(scene.rows.t), np.linspace(0.02, 0.98, 40))
+
+    def over(now: Now, v: Numbers) -> Any:
+        return v["a"] * ((now.t if timed else now.row) > v[at])
+
+    return Modulation(
+        over,
+        lambda a, drawn: {"a": a, **drawn},
+        lambda rng: {at: scene.moment(rng)},
+        lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
+        one_by_one,
+        lambda a: {"a": a, at: 0.0},
+        ("time", str(scene.rows.time)) if timed else ("row",),
+        1.0,
+        breaks=(lambda v: np.asarray(v[at])) if timed else None,
+    )
+
+
+def by_run(scene: Scene) -> Modulation:
+    """From run to run; the amplitude scales values drawn at random, those of the runs kept back too."""
+    n = scene.rows.n_runs
+    names = [f"values[{k}]" for k in range(n)]
+    present = [int(scene.rows.run[own[0]]) for own in scene.rows.by_run]
+
+    def over(now: Now, v: Numbers) -> Any:
+        values = np.concatenate([np.atleast_2d(v[name]) for name in names], axis=1)
+        return values[:, now.run]
+
+    def join(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+        return {name: float(sum(m * each[name] for m, each in zip(amounts, group, strict=True))) for name in names}
+
+    return Modulation(
+        over,
+        lambda a, drawn: {name: a * drawn[name] for name in names},
+        lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
+        lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
+        join,
+        lambda a: {name: (a if k in present else 0.0) for k, name in enumerate(names)},
+        ("run",),
+        1.0,
+    )
+
+
+def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
+    """Sine and cosine at each rate."""
+    return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
+
+
+def wave_joined(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+    """Join the amounts of sine and cosine into amplitude and phase."""
+    sine, cosine = amounts * group[0]["a"]
+    return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
+
+
+def waves(scene: Scene, n: int) -> Modulation:
+    """One sinusoid in time, up to one in four rows; n rates are looked at."""
+    rows = scene.rows
+    slowest, fastest = 1.5 / rows.duration, 0.25 / rows.gap
+    return Modulation(
+        lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
+        lambda a, drawn: {"a": a, **drawn},
+        lambda rng: {"hz": log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
+        lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.gap, n), "hz"),
+        wave_joined,
+        lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
+        ("time", str(rows.time)),
+        1.0,
+    )
+
+
+def settling(scene: Scene) -> Modulation:
+    """What dies away after the start of each run."""
+    longest = float(scene.rows.since_start.max())
+    taus = np.geomspace(scene.rows.gap, longest, 12)
+    return Modulation(
+        lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
+        lambda a, drawn: {"a": a, **drawn},
+        lambda rng: {"tau_s": log_uniform(rng, 3 * scene.rows.gap, 0.4 * longest)},
+        lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
+        one_by_one,
+        lambda a: {"a": a, "tau_s": 0.05 * longest},
+        ("time", "run", str(scene.rows.time)),
+        1.0,
+    )

@@ -1,0 +1,138 @@
+"""What may be wrong with the reading: offset, gain, bend, ceiling, hysteresis, lag, dead time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.chain import now_at_rows
+from probewise.world.systems.forms import modulations
+from probewise.world.systems.forms.form import Form, Numbers
+from probewise.world.systems.forms.modulations import Modulation
+from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["GAIN", "OFFSET", "added_to_readings", "earlier", "forms_of_readings", "way_of"]
+
+GAIN, OFFSET, _BEND, _LAG, _CEILING = range(5)
+_N_WAVES = 240
+
+
+def forms_of_readings(scene: Scene) -> Iterator[Form]:
+    """List every form of the reading."""
+    yield from _varying(scene)
+    yield from _bent(scene)
+    yield from _behind(scene)
+
+
+def added_to_readings(scene: Scene, name: str, how: Modulation, *, gain: bool = False) -> Form:
+    """Bind a modulation to the reading, as an offset or a gain about 0."""
+
+    def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        change = how.over(now_at_rows(rows), v)
+        return np.asarray(y * (1 + change) if gain else y + change)
+
+    typical = float(np.sqrt(np.mean(scene.readings**2))) if gain else 1.0
+    first = scene.sd / typical / how.reach
+    return Form(
+        name, "reading", act, how.sized, how.draw, how.bank(first), how.join, how.steps(first), first, 1e4 * first,
+        how.covariates, order=GAIN if gain else OFFSET,
+    )  # fmt: skip
+
+
+def _varying(scene: Scene) -> Iterator[Form]:
+    timed = scene.rows.time is not None
+    both = {"step": modulations.step(scene)}
+    if timed:
+        both["drift"] = modulations.along_time(scene)
+    if len(scene.rows.by_run) > 1:
+        both["per_run"] = modulations.by_run(scene)
+    for kind, how in both.items():
+        yield added_to_readings(scene, f"offset_{kind}", how)
+        yield added_to_readings(scene, f"gain_{kind}", how, gain=True)
+    for column in scene.logged:
+        yield added_to_readings(scene, f"sensitivity:{column}", modulations.with_column(scene, column))
+    if timed:
+        yield added_to_readings(scene, "interference", modulations.waves(scene, _N_WAVES))
+        yield added_to_readings(scene, "settling", modulations.settling(scene))
+
+
+def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
+    """Sign of the way readings (n_samples, n_points) are moving; a rest keeps the last way, the first row the next."""
+    out = np.zeros_like(y)
+    for own in rows.by_run:
+        for i in range(len(y)):
+            signs = np.sign(np.diff(y[i, own]))
+            moving = np.flatnonzero(signs)
+            if not moving.size:
+                continue
+            last = moving[np.clip(np.searchsorted(moving, np.arange(len(signs)), side="right") - 1, 0, None)]
+            out[i, own] = np.concatenate([[signs[moving[0]]], signs[last]])
+    return out
+
+
+def _bent(scene: Scene) -> Iterator[Form]:
+    low, high, sd = float(scene.readings.min()), float(scene.readings.max()), scene.sd
+    yield Form(
+        "hysteresis", "reading", lambda y, rows, v: y + v["a"] * way_of(y, rows), lambda a, drawn: {"a": a}, lambda rng: {},
+        [[{"a": sd}]], modulations.one_by_one, {"a": sd}, sd, 1e3 * sd, ("previous",), order=OFFSET,
+    )  # fmt: skip
+
+    def bend(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        z = (y - low) / (high - low)
+        return np.asarray(y + v["a"] * (high - low) * (np.sign(z) * np.abs(z) ** v["power"] - z))
+
+    first = sd / (high - low)
+    yield Form(
+        "nonlinearity", "reading", bend, lambda a, drawn: {"a": a, **drawn},
+        lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))},
+        [[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)], modulations.one_by_one,
+        {"a": first, "power": 0.05}, first, 0.5, ("level",), order=_BEND, beside={"lo": low, "hi": high},
+    )  # fmt: skip
+    for upper in (True, False):
+        end, sign = (high, -1.0) if upper else (low, 1.0)
+        levels = end + sign * (high - low) * np.geomspace(0.004, 0.5, 14)
+        yield Form(
+            "saturation" if upper else "saturation (floor)", "reading",
+            lambda y, rows, v, upper=upper: (np.minimum if upper else np.maximum)(y, v["level"]),
+            lambda a, drawn, end=end, sign=sign: {"level": end + sign * a}, lambda rng: {},
+            [[{"level": float(level)}] for level in levels], lambda group, amounts: dict(group[0]),
+            {"level": 0.01 * (high - low)}, 2 * sd, 0.5 * (high - low), ("level",), signed=False, order=_CEILING,
+        )  # fmt: skip
+
+
+def earlier(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
+    """Take values (n or 1, n_points) as they were earlier by tau (n or 1, 1), on straight lines within runs."""
+    n = max(len(values), len(tau))
+    values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
+    out = np.empty(values.shape)
+    for own in rows.by_run:
+        t = rows.t[own]
+        for i in range(n):
+            out[i, own] = np.interp(t - tau[i, 0], t, values[i, own])
+    return out
+
+
+def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    tau = np.maximum(np.broadcast_to(v["tau_s"], (max(len(y), len(v["tau_s"])), 1)), 1e-12)
+    out = np.array(np.broadcast_to(y, (len(tau), y.shape[1])))
+    for own in rows.by_run:
+        for before, row in zip(own[:-1], own[1:], strict=True):
+            stays = np.exp(-(rows.t[row] - rows.t[before]) / tau[:, 0])
+            out[:, row] = stays * out[:, before] + (1 - stays) * out[:, row]
+    return out
+
+
+def _behind(scene: Scene) -> Iterator[Form]:
+    if scene.rows.time is None:
+        return
+    gap = scene.rows.gap
+    acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: earlier(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
+    for name, (act, least) in acts.items():
+        yield Form(
+            name, "reading", act, lambda a, drawn: {"tau_s": a}, lambda rng: {},
+            [[{"tau_s": float(tau)}] for tau in gap * np.geomspace(least, 12, 10)], lambda group, amounts: dict(group[0]),
+            {"tau_s": 0.02 * gap}, 0.45 * gap, 15 * gap, ("previous",), signed=False, order=_LAG,
+        )  # fmt: skip

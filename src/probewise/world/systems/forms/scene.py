@@ -1,0 +1,72 @@
+"""Where forms are bound: a system about its true parameters, and the rows that are not kept back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.kind import Kind
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["Scene", "log_uniform"]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A system about its true parameters.
+
+    Parameters
+    ----------
+    kind, rows
+        The system, and the rows that a diagnosis sees.
+    parameters
+        True ones, (1, 1) or (1, n_points).
+    readings, states
+        Noise-free and without any effect, (n_points,).
+    """
+
+    kind: Kind
+    rows: SystemRows
+    parameters: Mapping[str, FloatArray]
+    readings: FloatArray
+    states: Mapping[str, FloatArray]
+
+    @property
+    def sd(self) -> float:
+        """Sd of a reading."""
+        return self.kind.sd
+
+    @property
+    def logged(self) -> tuple[str, ...]:
+        """Columns that something may depend on: all but the time."""
+        return tuple(name for name in self.rows.columns if name != self.rows.time)
+
+    def middle(self, column: str) -> float:
+        """Mean of a column."""
+        return float(self.rows.columns[column].mean())
+
+    def spread(self, column: str) -> float:
+        """Sd of a column."""
+        return float(self.rows.columns[column].std())
+
+    def speed(self, state: str) -> float:
+        """Rms rate of a state, from its values at the rows."""
+        found = []
+        for own in self.rows.by_run:
+            gaps = np.diff(self.rows.t[own])
+            found.append(np.diff(self.states[state][own])[gaps > 0] / gaps[gaps > 0])
+        return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+    def moment(self, rng: np.random.Generator) -> float:
+        """Draw a time, or a row, well inside the recording."""
+        at = float(np.quantile(self.rows.t, rng.uniform(0.2, 0.8)))
+        return math.floor(at) + 0.5 if self.rows.time is None else at
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return math.exp(rng.uniform(math.log(low), math.log(high)))

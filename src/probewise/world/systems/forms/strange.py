@@ -1,0 +1,151 @@
+"""Effects that are on no list: products, leaks, switches, one-sided springs, memories."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.chain import now_at_rows
+from probewise.world.systems.forms.form import Form, Numbers
+from probewise.world.systems.forms.inside import pushing
+from probewise.world.systems.forms.modulations import one_by_one
+from probewise.world.systems.forms.readings import OFFSET
+from probewise.world.systems.forms.scene import Scene, log_uniform
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["STRANGE", "strangers"]
+
+STRANGE = (
+    "product", "square_wave", "switch", "one_sided_spring", "leak", "memory", "two_settlings", "column_times_state", "chirp",
+    "fading_bend",
+)  # fmt: skip
+"""What strangers are called before their targets."""
+
+
+def strangers(scene: Scene, rng: np.random.Generator) -> Iterator[Form]:
+    """Bind every stranger to columns and states drawn for it."""
+    columns = [str(name) for name in rng.permutation(scene.logged)]
+    first, second = columns[0], columns[1]
+    yield _product(scene, first, second)
+    yield _switch(scene, first, float(rng.uniform(0.55, 0.8)))
+    yield _memory(scene, first)
+    yield _fading(scene, first)
+    if scene.rows.time is not None:
+        yield _square(scene, rng)
+        yield _chirp(scene)
+        yield _two_settlings(scene)
+    if scene.kind.law is not None:
+        state = str(rng.choice(list(scene.states)))
+        yield _spring(scene, state)
+        yield _leak(scene, state)
+        yield _driven(scene, state, first)
+
+
+def _added(
+    scene: Scene, name: str, shape: str, over: object, covariates: tuple[str, ...], drawn: dict[str, float] | None = None
+) -> Form:
+    def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        return np.asarray(y + v["a"] * over(y, rows, v))  # type: ignore[operator]
+
+    sd = scene.sd
+    return Form(
+        f"strange_{name}", "reading", act, lambda a, more: {"a": a, **more}, lambda rng: dict(drawn or {}), [[{"a": sd}]], one_by_one,
+        {"a": sd}, sd, 1e4 * sd, covariates, order=OFFSET, shape=shape,
+    )  # fmt: skip
+
+
+def _product(scene: Scene, one: str, other: str) -> Form:
+    a, b = scene.middle(one), scene.middle(other)
+    scale = scene.spread(one) * scene.spread(other)
+    return _added(
+        scene, f"product:{one}:{other}", "y + a (C - mean C)(D - mean D) / (sd C sd D)",
+        lambda y, rows, v: (rows.columns[one] - a) * (rows.columns[other] - b) / scale, (one, other, "time", "run"),
+    )  # fmt: skip
+
+
+def _switch(scene: Scene, column: str, share: float) -> Form:
+    at = float(np.quantile(scene.rows.columns[column], share))
+    return _added(
+        scene, f"switch:{column}", "y + a 1(C > c)", lambda y, rows, v: 1.0 * (rows.columns[column] > at), (column, "time", "run")
+    )
+
+
+def _memory(scene: Scene, column: str) -> Form:
+    """What has been summed up since the start of the run, soft-limited."""
+    middle, spread = scene.middle(column), scene.spread(column)
+
+    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        out = np.empty(len(rows))
+        for own in rows.by_run:
+            out[own] = np.tanh(np.cumsum(np.abs(rows.columns[column][own] - middle)) / spread / 12)
+        return out
+
+    return _added(scene, f"memory:{column}", "y + a tanh(sum of abs(C - mean C) since the start of the run)", over, ("time", "run", column))
+
+
+def _fading(scene: Scene, column: str) -> Form:
+    middle, spread, low, high = scene.middle(column), scene.spread(column), float(scene.readings.min()), float(scene.readings.max())
+
+    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        z = np.clip((y - low) / (high - low), 0, 1)
+        return np.asarray(4 * z * (1 - z) * (rows.columns[column] - middle) / spread)
+
+    return _added(scene, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", over, (column, "level"))
+
+
+def _square(scene: Scene, rng: np.random.Generator) -> Form:
+    hz = log_uniform(rng, 4 / scene.rows.duration, 0.06 / scene.rows.gap)
+
+    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)
+
+    return _added(scene, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(scene.rows.time)), {"hz": hz})
+
+
+def _chirp(scene: Scene) -> Form:
+    begin, end = float(scene.rows.t.min()), float(scene.rows.t.max())
+
+    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        z = (rows.t - begin) / (end - begin)
+        return np.asarray(np.sin(2 * np.pi * (3 * z + 8 * z**2)))
+
+    return _added(scene, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(scene.rows.time)))
+
+
+def _two_settlings(scene: Scene) -> Form:
+    longest = float(scene.rows.since_start.max())
+
+    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        since = now_at_rows(rows).since[0]
+        return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
+
+    return _added(scene, "two_settlings", "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))", over, ("time", "run", str(scene.rows.time)))
+
+
+def _spring(scene: Scene, state: str) -> Form:
+    at = float(np.quantile(scene.states[state], 0.6))
+    size = float(np.ptp(scene.states[state]))
+    return pushing(
+        scene, f"strange_one_sided_spring:{state}", state, lambda s, now, v: -np.maximum(s[state] - at, 0.0), size,
+        (f"state:{state}", "level", "time"), shape="-a max(S - s, 0) in the rate of S",
+    )  # fmt: skip
+
+
+def _leak(scene: Scene, state: str) -> Form:
+    scale = 0.3 * float(np.abs(scene.states[state]).max())
+
+    def push(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
+        return np.asarray(-np.expm1(np.clip(s[state] / scale, -30, 12)))
+
+    return pushing(scene, f"strange_leak:{state}", state, push, 20.0, (f"state:{state}", "level", "time"), shape="-a (exp(S / s) - 1) in the rate of S")
+
+
+def _driven(scene: Scene, state: str, column: str) -> Form:
+    middle, spread, most = scene.middle(column), scene.spread(column), float(np.abs(scene.states[state]).max())
+    return pushing(
+        scene, f"strange_column_times_state:{state}:{column}", state,
+        lambda s, now, v: -(now.u[column] - middle) / spread * s[state] ** 2 / most**2, 1.0,
+        (column, f"state:{state}", "time", "run", "level"), uses=(column,), shape="-a (C - mean C) S^2 in the rate of S",
+    )  # fmt: skip

@@ -1,0 +1,336 @@
+"""A law in continuous time, solved between the rows of every run by SciPy's integrator of eighth order.
+
+All samples and all runs go along together. Dry friction and bounds change the law at moments of their own: where one
+falls between two rows, that way is gone again, one sample and one run at a time, to the moment itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import NotConvergedError
+from probewise.world.systems.forms.form import Form, Now, Placed
+from probewise.world.systems.kind import Kind
+from probewise.world.systems.rows import SystemRows
+
+__all__ = ["travel"]
+
+_RTOL, _ATOL = 1e-8, 1e-10
+_LOOKS = np.array([0.25, 0.5, 0.75, 1.0])  # of the way between two rows: has something come to rest, or broken loose?
+_REST = 1e-9  # of a state that friction acts on: below it is at rest
+_MOST_EVENTS = 200  # between two rows
+
+
+def travel(
+    kind: Kind,
+    rows: SystemRows,
+    parameters: Mapping[str, FloatArray],
+    columns: Mapping[str, FloatArray],
+    effects: Sequence[Placed],
+) -> dict[str, FloatArray]:
+    """Solve a law: every state at every row, (n_samples, n_points).
+
+    Parameters
+    ----------
+    kind
+        The system.
+    rows
+        Its rows.
+    parameters
+        (n_samples or 1, 1 or n_points).
+    columns
+        As the system feels them, (n_samples or 1, n_points), the time among them.
+    effects
+        Forms on parameters and rates, and those that delay a column.
+    """
+    return _Trip(kind, rows, parameters, columns, effects).together()
+
+
+@dataclass(frozen=True, eq=False)
+class _Trip:
+    kind: Kind
+    rows: SystemRows
+    parameters: Mapping[str, FloatArray]
+    columns: Mapping[str, FloatArray]
+    effects: Sequence[Placed]
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Row at each place of each run, (n_places, n_runs); a short run waits at its end."""
+        longest = max(len(own) for own in self.rows.by_run)
+        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.rows.by_run]
+        return np.stack(filled, axis=1)
+
+    @cached_property
+    def n_samples(self) -> int:
+        arrays = [*self.parameters.values(), *self.columns.values()]
+        arrays += [np.atleast_2d(v) for _, numbers in self.effects for v in numbers.values()]
+        return max(len(v) for v in arrays)
+
+    @cached_property
+    def _rows_of_run(self) -> dict[int, IntArray]:
+        return {int(self.rows.run[own[0]]): own for own in self.rows.by_run}
+
+    @cached_property
+    def late(self) -> dict[str, FloatArray]:
+        return {form.late: numbers["tau_s"] for form, numbers in self.effects if form.late}
+
+    @cached_property
+    def needed(self) -> tuple[str, ...]:
+        uses = (column for form, _ in self.effects for column in form.uses)
+        return tuple(dict.fromkeys((*self.kind.drives, *uses)))
+
+    def start(self) -> FloatArray:
+        """States at the first row of each run, (n_states, n_samples, n_runs)."""
+        law = self.kind.law
+        assert law is not None
+        out = []
+        for given in law.start.values():
+            at = self._of_run(self.parameters[given]) if isinstance(given, str) else np.full((1, 1), float(given))
+            out.append(np.broadcast_to(at, (self.n_samples, self.places.shape[1])))
+        return np.array(out)
+
+    def _of_run(self, values: FloatArray) -> FloatArray:
+        return values if values.shape[1] == 1 else values[:, self.places[0]]
+
+    def moment(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Now]]:
+        """Give parameters and columns at a share of the way from place k to the next."""
+        here, there = self.places[k, runs], self.places[k + 1, runs]
+        first = self.places[0, runs]
+        law, time = self.kind.law, self.rows.time
+        assert law is not None and time is not None
+        t, printed = self.columns[time], self.rows.t
+        ends = {}
+        for name in self.needed:
+            if name in self.late:
+                continue
+            values = self.columns[name]
+            holds = name in self.kind.drives and not law.linear
+            ends[name] = (values[:, here], 0.0 if holds else values[:, there] - values[:, here])
+        run = self.rows.run[here]
+        base = {name: v if v.shape[1] == 1 else v[:, here] for name, v in self.parameters.items()}
+        varying = [(form, numbers) for form, numbers in self.effects if form.side == "parameter"]
+
+        def at(share: float) -> tuple[dict[str, Any], Now]:
+            u: dict[str, Any] = {name: low + share * rise for name, (low, rise) in ends.items()}
+            u[time] = t[:, here] + share * (t[:, there] - t[:, here])
+            now_t = (printed[here] + share * (printed[there] - printed[here]))[None, :]
+            for name, tau in self.late.items():
+                u[name] = self._earlier(name, now_t - tau, run)
+            now = Now(now_t, now_t - printed[first], u, run, np.zeros(1))
+            p: dict[str, Any] = dict(base)
+            for form, numbers in varying:
+                p[form.target] = p[form.target] + form.act(now, numbers)
+            return p, now
+
+        return at
+
+    def _earlier(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
+        """Look a column up at earlier moments, (n_samples, n_runs): held, or on the straight line; its first before."""
+        law = self.kind.law
+        assert law is not None
+        out = np.empty(t.shape)
+        for j, number in enumerate(run):
+            own = self._rows_of_run[int(number)]
+            times, values = self.rows.t[own], self.columns[name][0, own]
+            if law.linear:
+                out[:, j] = np.interp(t[:, j], times, values)
+            else:
+                out[:, j] = values[np.clip(np.searchsorted(times, t[:, j] + 1e-12, side="right") - 1, 0, None)]
+        return out
+
+    def rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Now) -> dict[str, Any]:
+        law = self.kind.law
+        assert law is not None
+        out = law.rates(s, p, now.u)
+        for form, numbers in self.effects:
+            if form.side == "rate" and not (form.sticks or form.stops):
+                out[form.target] = out[form.target] + form.act(s, now, numbers)
+        return out
+
+    def breaks(self, k: int) -> list[float]:
+        """Shares of the way from place k to the next at which something jumps, with 0 and 1."""
+        here, there = self.places[k], self.places[k + 1]
+        begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
+        moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
+        if self.late:
+            for tau in self.late.values():
+                moments.append((self.rows.t[:, None] + np.ravel(tau)).ravel())
+        if not moments:
+            return [0.0, 1.0]
+        joined = np.concatenate([np.ravel(m) for m in moments])
+        shares = (joined[:, None] - begin)[:, gap > 0] / gap[gap > 0]
+        inside = np.unique(np.round(shares[(shares > 1e-9) & (shares < 1 - 1e-9)], 9))
+        return [0.0, *inside.tolist(), 1.0]
+
+    def together(self) -> dict[str, FloatArray]:
+        law = self.kind.law
+        assert law is not None
+        names, places = list(law.start), self.places
+        s = self.bounded(self.start().copy(), names)
+        kept = np.empty((*s.shape, len(places)))
+        kept[..., 0] = s
+        for k in range(len(places) - 1):
+            s = self._through_gap(s, k, names)
+            kept[..., k + 1] = s
+        return self._at_rows(names, kept)
+
+    def _through_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
+        """Go from place k of all runs to the next, (n_states, n_samples, n_runs); friction and bounds as they are at its start."""
+        time = self.rows.time
+        assert time is not None
+        t = self.columns[time]
+        gap, at, hard = t[:, self.places[k + 1]] - t[:, self.places[k]], self.moment(k), self.hard
+
+        def free(share: float, y: FloatArray) -> dict[str, Any]:
+            p, now = at(share)
+            return self.rates(dict(zip(names, y, strict=True)), p, now)
+
+        edges, begun = self.breaks(k), s
+        again = np.zeros(s.shape[1:], dtype=bool)
+        for low, high in zip(edges[:-1], edges[1:], strict=True):
+            # A hair inside: what jumps at an end belongs to the other side of it.
+            hair = 1e-8 if len(edges) > 2 else 0.0
+            begin, end = low + hair, high - hair
+            at_begin = free(begin, s) if hard else {}
+            modes = [_mode(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
+
+            def slope(share: float, flat: FloatArray, modes: Any = modes, shape: Any = s.shape) -> FloatArray:
+                found = free(share, flat.reshape(shape))
+                for (form, size), mode in zip(hard, modes, strict=True):
+                    found[form.target] = np.where(mode == 0, 0.0, found[form.target] - (size * mode if form.sticks else 0.0))
+                return np.stack([np.broadcast_to(found[name] * gap, shape[1:]) for name in names]).ravel()
+
+            solved = solve_ivp(
+                slope, (begin, end), s.ravel(), method="DOP853", rtol=_RTOL, atol=_ATOL, first_step=end - begin,
+                t_eval=begin + (end - begin) * _LOOKS if hard else None,
+            )  # fmt: skip
+            if not solved.success:
+                raise NotConvergedError(f"the law of the {self.kind.name} cannot be solved: {solved.message}")
+            for x, y in zip(solved.t, solved.y.T, strict=True) if hard else ():
+                own = y.reshape(s.shape)
+                rates = free(x, own)
+                for (form, size), mode in zip(hard, modes, strict=True):
+                    again |= _ended(form, size, mode, own[names.index(form.target)], rates[form.target])
+            s = solved.y[:, -1].reshape(s.shape)
+        for i, j in np.argwhere(again):
+            s[:, i, j] = self._only(int(i)).one_gap(begun[:, i, j], k, int(j), names)
+        return s
+
+    @property
+    def hard(self) -> list[tuple[Any, FloatArray]]:
+        """Dry friction and bounds with their sizes (n_samples, 1)."""
+        return [(f, np.atleast_2d(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
+
+    def _at_rows(self, names: list[str], kept: FloatArray) -> dict[str, FloatArray]:
+        out = {}
+        for name, values in zip(names, kept, strict=True):
+            found = np.empty((self.n_samples, len(self.rows)))
+            for j, own in enumerate(self.rows.by_run):
+                found[:, own] = values[:, j, : len(own)]
+            out[name] = found
+        return out
+
+    def _only(self, i: int) -> _Trip:
+        def one(v: Any) -> Any:
+            v = np.atleast_2d(v)
+            return v[i : i + 1] if len(v) > 1 else v
+
+        return _Trip(
+            self.kind,
+            self.rows,
+            {name: one(v) for name, v in self.parameters.items()},
+            {name: one(v) for name, v in self.columns.items()},
+            [(form, {name: one(v) for name, v in numbers.items()}) for form, numbers in self.effects],
+        )
+
+    def bounded(self, s: FloatArray, names: list[str]) -> FloatArray:
+        """Begin no state beyond its bound."""
+        for form, size in self.hard:
+            if form.stops:
+                k = names.index(form.target)
+                s[k] = np.minimum(s[k], size)
+        return s
+
+    def one_gap(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
+        """Go from place k of run j to the next with one sample, by friction and bounds as they are at each moment."""
+        time = self.rows.time
+        assert time is not None
+        t = self.columns[time]
+        gap = float(t[0, self.places[k + 1, j]] - t[0, self.places[k, j]])
+        at = self.moment(k, slice(j, j + 1))
+        hard = [(form, float(size[0, 0])) for form, size in self.hard]
+
+        def free(share: float, y: FloatArray) -> dict[str, float]:
+            p, now = at(share)
+            found = self.rates(dict(zip(names, y, strict=True)), p, now)
+            return {name: float(np.ravel(v)[0]) for name, v in found.items()}
+
+        edges = self.breaks(k)
+        for low, high in zip(edges[:-1], edges[1:], strict=True):
+            share, forced = low, dict[int, int]()
+            for _ in range(_MOST_EVENTS):
+                rates = free(share, s)
+                modes = [
+                    forced.get(m, int(_mode(f, size, s[names.index(f.target)], rates[f.target]))) for m, (f, size) in enumerate(hard)
+                ]
+
+                def slope(x: float, y: FloatArray, modes: Any = modes) -> FloatArray:
+                    found = free(x, y)
+                    for (form, size), mode in zip(hard, modes, strict=True):
+                        found[form.target] = 0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
+                    return gap * np.array([found[name] for name in names])
+
+                solved = solve_ivp(
+                    slope, (share, high), s, method="DOP853", rtol=_RTOL, atol=_ATOL, first_step=high - share,
+                    events=[_event(f, size, mode, names, free) for (f, size), mode in zip(hard, modes, strict=True)],
+                )  # fmt: skip
+                s, share = solved.y[:, -1].copy(), float(solved.t[-1])
+                if solved.status != 1 or share >= high:
+                    break
+                forced = {}
+                for m, ((f, size), found, mode) in enumerate(zip(hard, solved.t_events, modes, strict=True)):
+                    if found.size and mode != 0:  # at rest, or at the bound
+                        s[names.index(f.target)] = 0.0 if f.sticks else size
+                    elif found.size:  # breaks loose
+                        forced[m] = int(np.sign(free(share, s)[f.target])) if f.sticks else 1
+            else:
+                raise NotConvergedError(f"the law of the {self.kind.name} sticks and slips without end")
+        return s
+
+
+def _mode(form: Form, size: Any, value: Any, rate: Any) -> Any:
+    """Of friction the way a state is moving, 0 at rest; of a bound 1 while free, 0 while held."""
+    if form.sticks:
+        return np.where(value != 0, np.sign(value), np.where(np.abs(rate) > size, np.sign(rate), 0.0))
+    return np.where((value >= size) & (rate > 0), 0, 1)
+
+
+def _ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
+    """Tell whether a mode has come to its end."""
+    if form.sticks:
+        return np.where(mode == 0, np.abs(rate) > size, value * mode < 0)
+    return np.where(mode == 0, rate < 0, value > size)
+
+
+def _event(form: Form, size: float, mode: int, names: list[str], free: Any) -> Any:
+    """Look for the end of a mode: it comes to rest, breaks loose, reaches the bound, or leaves it."""
+    i = names.index(form.target)
+    if form.sticks:
+        if mode == 0:
+            found, direction = (lambda x, y: abs(free(x, y)[form.target]) - size), 1.0
+        else:
+            found, direction = (lambda x, y: y[i] + mode * _REST), -float(mode)  # it may set out from 0
+    elif mode == 0:
+        found, direction = (lambda x, y: free(x, y)[form.target]), -1.0
+    else:
+        found, direction = (lambda x, y: y[i] - size), 1.0
+    found.terminal, found.direction = True, direction  # type: ignore[attr-defined]
+    return found

@@ -1,0 +1,169 @@
+"""What else would explain the same: forms that, refitted together with the system, come within a few nats of noise-free readings.
+
+First on straight lines, for every form at once; then by a fit in full of those that come near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError
+from probewise.world.systems.chain import read, simulate
+from probewise.world.systems.fit import Beside, Fitted, Model, free_numbers, left_over
+from probewise.world.systems.forms.form import Form, Placed, as_numbers
+from probewise.world.systems.forms.scene import Scene
+
+__all__ = ["TELLING_NATS", "rivals_of", "short_name", "templates_of"]
+
+TELLING_NATS = 3.0
+"""Below it nobody could tell two explanations apart."""
+
+_NEAR = 12.0  # nats on straight lines from which a fit in full is worth while
+_COSINE = 0.9
+_MOST_FITS = 10
+_CHUNK = 160  # settings that are simulated together
+_NEUTRAL = {"level": np.inf, "period": 1.0}
+
+
+def short_name(form: Form) -> str:
+    """Name in the vocabulary."""
+    return form.name.removesuffix(" (floor)")
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    form: Form
+    start: dict[str, float]
+    nats: float
+
+
+def rivals_of(
+    scene: Scene, forms: Sequence[Form], target: FloatArray, fitted: Fitted, model: Model, without: frozenset[str]
+) -> dict[str, float]:
+    """Find what explains noise-free readings as well.
+
+    Parameters
+    ----------
+    scene
+        The system.
+    forms
+        Those to try.
+    target
+        Noise-free readings with the effect, (n_points,).
+    fitted, model
+        The fit to them of all but the effect: the nominal model, with what else is there beside it.
+    without
+        Names not to try.
+
+    Returns
+    -------
+    Nats that the readings would lose, by name, those below TELLING_NATS, the best first.
+    """
+    left = left_over((target - fitted.readings) / scene.sd, fitted.slopes)
+    near = _screened(scene, [f for f in forms if short_name(f) not in without], left, fitted, model)
+    found: dict[str, float] = {}
+    for candidate in near:
+        wider = Model(scene.kind, scene.rows, [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))])
+        own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
+        try:
+            nats = 0.5 * wider.fit(target, np.concatenate([fitted.at, own]), max_calls=10).squares
+        except NotConvergedError:
+            continue
+        name = short_name(candidate.form)
+        found[name] = min(nats, found.get(name, np.inf))
+    close = {name: nats for name, nats in found.items() if nats < TELLING_NATS}
+    return dict(sorted(close.items(), key=lambda item: item[1]))
+
+
+def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model) -> list[_Candidate]:
+    """List what comes near on straight lines, at most a few fits' worth, a form's best two starts."""
+    size = float(left @ left)
+    out = []
+    for form, changes in templates_of(scene, forms, fitted, model).items():
+        own = []
+        groups = [list(group) for group in form.bank]
+        at = 0
+        for group in groups:
+            columns = left_over(changes[at : at + len(group)].T / scene.sd, fitted.slopes)
+            at += len(group)
+            good = np.isfinite(columns).all(axis=0) & (np.sqrt(np.sum(columns**2, axis=0)) > 1e-6)
+            if not good.any():
+                continue
+            columns = np.where(good, np.nan_to_num(columns), 0.0)
+            amounts, *_ = np.linalg.lstsq(columns, left, rcond=1e-9)
+            rest = left - columns @ amounts
+            nats = 0.5 * float(rest @ rest)
+            if nats < _NEAR or 1 - 2 * nats / size > _COSINE**2:
+                own.append(_Candidate(form, form.join(group, amounts), nats))
+        out += sorted(own, key=lambda c: c.nats)[:2]
+    return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
+
+
+def templates_of(scene: Scene, forms: Sequence[Form], fitted: Fitted, model: Model) -> dict[Form, FloatArray]:
+    """Change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
+    settings = {form: [each for group in form.bank for each in group] for form in forms}
+    x = fitted.at[None, :]
+    parameters, beside = model.parameters(x), model.effects(x)
+    inner = [e for e in beside if e[0].side != "reading"]
+    outer = [e for e in beside if e[0].side == "reading"]
+    bare = simulate(scene.kind, scene.rows, parameters, inner).readings
+    out: dict[Form, FloatArray] = {}
+    with np.errstate(all="ignore"):
+        for form in forms:
+            if form.side == "reading":
+                numbers = as_numbers(settings[form])
+                out[form] = read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)]) - fitted.readings
+        alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or scene.kind.law is None)]
+        for form in alone:
+            found = _simulated(scene, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))
+            out[form] = found - fitted.readings
+        together = [f for f in forms if f.side != "reading" and f not in alone]
+        for chunk in _chunks(together, settings):
+            out |= _at_once(scene, chunk, settings, fitted, model)
+    return out
+
+
+def _chunks(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]]) -> list[list[Form]]:
+    out: list[list[Form]] = []
+    n = _CHUNK
+    for form in forms:
+        if n + len(settings[form]) > _CHUNK:
+            out.append([])
+            n = 0
+        out[-1].append(form)
+        n += len(settings[form])
+    return out
+
+
+def _at_once(
+    scene: Scene, forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]], fitted: Fitted, model: Model
+) -> dict[Form, FloatArray]:
+    """Simulate many forms in one go, each neutral but in samples of its own."""
+    ends = np.cumsum([len(settings[form]) for form in forms])
+    total, x = int(ends[-1]), fitted.at[None, :]
+    placed = []
+    for form, end in zip(forms, ends, strict=True):
+        own = as_numbers(settings[form])
+        numbers = {}
+        for name, values in own.items():
+            whole = np.full((total, 1), _NEUTRAL.get(name, 0.0))
+            whole[end - len(values) : end] = values
+            numbers[name] = whole
+        # To look for it, a column that comes late may be read off between rows: a fit in full will see to its jumps.
+        placed.append((replace(form, late=""), numbers))
+    found = _simulated(scene, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
+    if len(forms) > 1 and not np.isfinite(found).all():  # one of them runs away, and takes the others with it
+        return {form: each for own in forms for form, each in _at_once(scene, [own], settings, fitted, model).items()}
+    return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
+
+
+def _simulated(scene: Scene, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int) -> FloatArray:
+    """Simulate; NaN where a law runs away."""
+    try:
+        return simulate(scene.kind, scene.rows, parameters, effects).readings
+    except NotConvergedError:
+        return np.full((n, len(scene.rows)), np.nan)

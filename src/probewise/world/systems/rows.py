@@ -1,0 +1,71 @@
+"""The rows of a recording of a system: columns, time and runs, as they are printed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+
+__all__ = ["SystemRows"]
+
+
+@dataclass(frozen=True, eq=False)
+class SystemRows:
+    """Rows in the order in which they were taken; every array is (n_points,).
+
+    Parameters
+    ----------
+    columns
+        Columns of numbers by name, the time among them.
+    run
+        Number of each row's run, counted over all runs of a case, also those kept back.
+    time
+        Name of the column of time; None where none was recorded.
+    n_runs
+        Number of runs of the case.
+    """
+
+    columns: Mapping[str, FloatArray]
+    run: IntArray
+    time: str | None
+    n_runs: int
+
+    def __len__(self) -> int:
+        return len(self.run)
+
+    @cached_property
+    def t(self) -> FloatArray:
+        """Time as printed, or the row's number where none was recorded."""
+        return np.arange(float(len(self))) if self.time is None else self.columns[self.time]
+
+    @cached_property
+    def by_run(self) -> Sequence[IntArray]:
+        """Row numbers of each run that has rows here."""
+        found = (np.flatnonzero(self.run == k) for k in range(self.n_runs))
+        return [rows for rows in found if rows.size]
+
+    @cached_property
+    def since_start(self) -> FloatArray:
+        """Time since the first row of the run."""
+        out = np.empty(len(self))
+        for rows in self.by_run:
+            out[rows] = self.t[rows] - self.t[rows[0]]
+        return out
+
+    @cached_property
+    def gap(self) -> float:
+        """Time from a row to the next of its run, the median."""
+        return float(np.median(np.concatenate([np.diff(self.t[rows]) for rows in self.by_run])))
+
+    @property
+    def duration(self) -> float:
+        """Time from the earliest row to the latest."""
+        return float(np.ptp(self.t))
+
+    def take(self, kept: FloatArray | IntArray) -> SystemRows:
+        """Keep these rows; runs keep their numbers."""
+        return replace(self, columns={name: values[kept] for name, values in self.columns.items()}, run=self.run[kept])

@@ -1,0 +1,24 @@
+"""All forms that are bound to a system."""
+
+from __future__ import annotations
+
+from probewise.world.systems.forms.form import Form
+from probewise.world.systems.forms.inputs import forms_of_inputs
+from probewise.world.systems.forms.inside import forms_of_parameters, forms_of_rates
+from probewise.world.systems.forms.readings import forms_of_readings
+from probewise.world.systems.forms.scene import Scene
+
+__all__ = ["FAMILIES", "forms_of"]
+
+FAMILIES = (
+    "offset_drift", "offset_step", "offset_per_run", "gain_drift", "gain_step", "gain_per_run", "nonlinearity", "saturation",
+    "hysteresis", "lag", "delay", "settling", "interference", "sensitivity", "input_offset", "input_gain", "input_delay",
+    "input_saturation", "dead_zone", "periodic_error", "backlash", "clock_drift", "drifts", "steps", "differs", "depends",
+    "damping", "drag", "friction", "forcing", "periodic_forcing", "cubic", "quadratic", "coupling", "limit",
+)  # fmt: skip
+"""Names before their targets."""
+
+
+def forms_of(scene: Scene) -> list[Form]:
+    """List every form of the vocabulary that this system has a target for; a floor is a saturation too."""
+    return [*forms_of_readings(scene), *forms_of_inputs(scene), *forms_of_parameters(scene), *forms_of_rates(scene)]

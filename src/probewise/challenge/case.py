@@ -20,7 +20,7 @@ from probewise.world.challenge import Case, Hidden, Ruler, draw_case, stratum_of
 from probewise.world.challenge.candidates import Setting
 from probewise.world.concealed import Disturbs, Quantisation
 
-__all__ = ["Task", "run_case"]
+__all__ = ["Task", "run_case", "said"]
 
 _OWN = 1_000  # child of the case's seed sequence that the drawing has no use for
 _LEAST_PROBABILITY = 1e-3
@@ -120,7 +120,7 @@ def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
     named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
     region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
     return {
-        **_said(diagnosis),
+        **said(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
         "parameters": {h.name: parameters_within(h, found[h.name]) for h in named},
@@ -131,7 +131,8 @@ def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
     }
 
 
-def _said(diagnosis: Diagnosis) -> dict[str, Any]:
+def said(diagnosis: Diagnosis) -> dict[str, Any]:
+    """List what a diagnosis states, as scoring asks for it."""
     return {
         "verdict": diagnosis.verdict,
         "p_value": diagnosis.p_value,
@@ -149,4 +150,4 @@ def _settled(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapp
     if asked is None:
         return None
     more = case.world.simulate(asked.plan, rng=rng)
-    return {"readings": len(more), **_said(diagnose([case.recording, more], rng=rng))}
+    return {"readings": len(more), **said(diagnose([case.recording, more], rng=rng))}

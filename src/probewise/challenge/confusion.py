@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,13 @@ __all__ = ["confusion"]
 OUTSIDE, SEVERAL = "outside", "several"
 
 
-def confusion(results: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
+def confusion(
+    results: Sequence[Mapping[str, Any]], *, label: Callable[[str], str] = str
+) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
     """Count what was said where nothing, one effect, or something outside the vocabulary was concealed.
 
-    An alias of the truth counts as the truth. Only names that occur have a row or a column.
+    An alias of the truth counts as the truth. Only names that occur have a row or a column; `label` may put several
+    into one.
 
     Returns
     -------
@@ -30,12 +33,13 @@ def confusion(results: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], tu
     for result in results:
         if result["kind"] in ("clean", "single", "outside"):
             truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
-            counts[truth, _said(result, truth)] += 1
+            counts[label(truth), label(_said(result, truth))] += 1
     order = ["clean", *SINGLES, OUTSIDE]
     said_order = ["clean", *SINGLES, "unknown", SEVERAL]
     said = {s for _, s in counts}
     columns = tuple([s for s in said_order if s in said] + sorted(said - set(said_order)))
-    truths = tuple(t for t in order if any(t == found for found, _ in counts))
+    concealed = {t for t, _ in counts}
+    truths = tuple([t for t in order if t in concealed] + sorted(concealed - set(order)))
     return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
 
 

@@ -20,6 +20,8 @@ def run_challenge(
     n_cases: int,
     *,
     seed: int,
+    work: Callable[[Task], Mapping[str, Any]] = run_case,
+    of: str = "",
     path: str | os.PathLike[str],
     executor: Executor | None = None,
     progress: Progress = silent,
@@ -32,6 +34,10 @@ def run_challenge(
         How many, from case 0 on. More may be asked for later: what the file holds is not done again.
     seed
         The sealed seed: with the number of a case it decides all about it.
+    work
+        What does a case.
+    of
+        What the cases are of, where it is no light sensor: campaigns of different things do not mix.
     path
         The campaign's file.
     executor
@@ -52,10 +58,10 @@ def run_challenge(
         raise ParameterError("n_cases", n_cases, "1 or more")
     tasks = [Task(seed, number) for number in range(n_cases)]
     results = run_campaign(
-        run_case,
+        work,
         {task.key: task for task in tasks},
         path=path,
-        settings={"challenge": __version__, "seed": seed},
+        settings={"challenge": __version__, "seed": seed} | ({"of": of} if of else {}),
         executor=executor,
         progress=progress,
         noun="cases",

@@ -24,7 +24,7 @@ __all__ = [
     "stated",
 ]
 
-NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation"}
+NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation", "random_walk", "noise_per_run"}
 """Effects on the noise."""
 
 HONEST_NATS = 3.0

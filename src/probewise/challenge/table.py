@@ -33,7 +33,18 @@ from probewise.challenge.yardstick import (
     set_size_by_likeness,
 )
 
-__all__ = ["Decision", "Row", "by_effect", "score"]
+__all__ = [
+    "Decision",
+    "Row",
+    "alarms",
+    "by_effect",
+    "covering",
+    "merged_size",
+    "names_physics",
+    "score",
+    "singles",
+    "surely_wrong",
+]
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
 Result: TypeAlias = Mapping[str, Any]
@@ -93,10 +104,10 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
 
 def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
     """Tell of each single effect of a size how often it was detected at alpha .01, and named first."""
-    singles = _singles([r for r in results if "failed" not in r], size)
+    singles = singles([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
-    return {name: (_alarms(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
+    return {name: (alarms(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
 
 
 def _clean(done: list[Result]) -> list[Row]:
@@ -104,14 +115,14 @@ def _clean(done: list[Result]) -> list[Row]:
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
     return [
-        Row("false alarms, clean, alpha .05", _alarms(white, 0.05), 0.04, 0.06),
-        Row("false alarms, clean, alpha .01", _alarms(white, 0.01), 0.006, 0.015),
-        Row("false alarms, other noise, alpha .05", _alarms(other, 0.05), most=0.06),
-        *(Row(f"  {m}", _alarms([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
-        Row("physics named, clean", share([_names_physics(r) for r in clean]), most=0.005),
+        Row("false alarms, clean, alpha .05", alarms(white, 0.05), 0.04, 0.06),
+        Row("false alarms, clean, alpha .01", alarms(white, 0.01), 0.006, 0.015),
+        Row("false alarms, other noise, alpha .05", alarms(other, 0.05), most=0.06),
+        *(Row(f"  {m}", alarms([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
+        Row("physics named, clean", share([names_physics(r) for r in clean]), most=0.005),
         Row(
             "physics named, one Gaussian more",
-            share([_names_physics(r) for r in done if r["kind"] == "ssf_order"]),
+            share([names_physics(r) for r in done if r["kind"] == "ssf_order"]),
             most=0.01,
         ),
     ]
@@ -120,7 +131,7 @@ def _clean(done: list[Result]) -> list[Row]:
 def _detection(done: list[Result]) -> list[Row]:
     targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
     rows = [
-        Row(f"detection, alpha .01, lambda {size:g}", _alarms(_seen_as_physics(_singles(done, size)), 0.01), least)
+        Row(f"detection, alpha .01, lambda {size:g}", alarms(_seen_as_physics(singles(done, size)), 0.01), least)
         for size, least in targets.items()
     ]
     each = [detected for detected, _ in by_effect(_seen_as_physics(done)).values()]
@@ -130,12 +141,12 @@ def _detection(done: list[Result]) -> list[Row]:
 
 def _naming(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
-    found = {size: share([leading_name_right(r) for r in _singles(done, size)]) for size in targets}
+    found = {size: share([leading_name_right(r) for r in singles(done, size)]) for size in targets}
     falls = [_fall(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
     for size, least in targets.items():
-        like = [name_by_likeness(r["hidden"][0]) for r in _singles(done, size)]
+        like = [name_by_likeness(r["hidden"][0]) for r in singles(done, size)]
         rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
         rows.append(Row(f"  by likeness to the hardest rival, lambda {size:g}", mean(like)))
     return [
@@ -156,7 +167,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
     covered = [any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in done]
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
-        singles = _singles(done, size)
+        singles = singles(done, size)
         like = [set_size_by_likeness(r["hidden"][0]) for r in singles]
         rows += [
             Row(
@@ -164,18 +175,18 @@ def _probabilities(done: list[Result]) -> list[Row]:
                 mean([float(len(r["credible_set"])) for r in singles]),
                 most=most,
             ),
-            Row(f"  the truth and its aliases as one, lambda {size:g}", mean([_merged_size(r) for r in singles])),
+            Row(f"  the truth and its aliases as one, lambda {size:g}", mean([merged_size(r) for r in singles])),
             Row(f"  by likeness, aliases as one, lambda {size:g}", mean(like)),
         ]
     return [
         Row("95 % credible set holds the truth", share(covered), 0.95),
         *rows,
         Row("expected calibration error", calibration_error(done), most=0.02),
-        Row("wrong name stated above .9", share([_surely_wrong(r) for r in done]), most=0.005),
+        Row("wrong name stated above .9", share([surely_wrong(r) for r in done]), most=0.005),
     ]
 
 
-def _merged_size(result: Result) -> float:
+def merged_size(result: Result) -> float:
     """Count the hypotheses of a credible set, the right one and what so many readings cannot tell from it as one."""
     right = sum(fits(names_of(label), answers(result, merged=True)) for label in result["credible_set"])
     return float(len(result["credible_set"]) - max(right - 1, 0))
@@ -183,8 +194,8 @@ def _merged_size(result: Result) -> float:
 
 def _places(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.8, 20.0: 0.9}
-    local = {size: [r["overlap"] for r in _singles(done, size) if r["overlap"] is not None] for size in targets}
-    shown = [r for r in _singles(done, 8.0) if on_mean(r)]
+    local = {size: [r["overlap"] for r in singles(done, size) if r["overlap"] is not None] for size in targets}
+    shown = [r for r in singles(done, 8.0) if on_mean(r)]
     first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
@@ -199,12 +210,12 @@ def _intervals(done: list[Result]) -> list[Row]:
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
     sensors = [interval for r in gaussian for interval in r["sensor"].values()]
     return [
-        Row("95 % intervals of effect parameters cover", _covering(stated_of), 0.93, 0.97),
-        Row("95 % intervals of SSF and levels cover", _covering(sensors), 0.93),
+        Row("95 % intervals of effect parameters cover", covering(stated_of), 0.93, 0.97),
+        Row("95 % intervals of SSF and levels cover", covering(sensors), 0.93),
     ]
 
 
-def _covering(intervals: list[list[float]]) -> Estimate:
+def covering(intervals: list[list[float]]) -> Estimate:
     return share([low <= truth <= high for truth, low, high in intervals])
 
 
@@ -282,7 +293,7 @@ def _aliases(done: list[Result]) -> list[Row]:
     settled = [r | r["settled"] if r["settled"] else r for r in aliased]
     return [
         Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
-        Row("aliased pair: sure of the wrong name", share([_surely_wrong(r) for r in aliased]), most=0.01),
+        Row("aliased pair: sure of the wrong name", share([surely_wrong(r) for r in aliased]), most=0.01),
         Row("right name after the advised readings", share([stated(r)[1] for r in settled]), 0.95),
         Row(
             "  readings advised, of those that repeating the plan needs",
@@ -304,7 +315,7 @@ def _time(done: list[Result]) -> list[Row]:
     ]
 
 
-def _singles(done: Sequence[Result], size: float) -> list[Result]:
+def singles(done: Sequence[Result], size: float) -> list[Result]:
     return [r for r in done if r["kind"] == "single" and r["size"] == size]
 
 
@@ -318,11 +329,11 @@ def _on_mean(results: Sequence[Result]) -> list[Result]:
     return [r for r in results if on_mean(r)]
 
 
-def _alarms(results: Sequence[Result], alpha: float) -> Estimate:
+def alarms(results: Sequence[Result], alpha: float) -> Estimate:
     return share([r["p_value"] <= alpha for r in results])
 
 
-def _names_physics(result: Result) -> bool:
+def names_physics(result: Result) -> bool:
     return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
@@ -330,7 +341,7 @@ def _mean_names(result: Result) -> list[str]:
     return [name for name in leading(result, clean=True)[0] if name not in NOISE]
 
 
-def _surely_wrong(result: Result) -> bool:
+def surely_wrong(result: Result) -> bool:
     probability, right = stated(result)
     names = leading(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

@@ -24,6 +24,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="recordings, always the first of the seed's; 60 are one of each kind, 6000 the whole table (default 60)",
     )
+    parser.add_argument(
+        "--systems",
+        action="store_true",
+        help="recordings of twelve kinds of system, each with its owner's file, instead of a light sensor's",
+    )
     add_executor(parser)
     add_common(parser)
 
@@ -31,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the challenge and write its table."""
     from probewise._progress import progress_shown
-    from probewise.challenge import run_challenge, score
+    from probewise.challenge import run_case, run_challenge, score
+    from probewise.challenge.systems import run_system_case, score_systems
     from probewise.recordings import write_text_atomically
     from probewise.report import challenge as report
 
@@ -44,14 +50,23 @@ def run(arguments: argparse.Namespace) -> int:
         progress_shown(quiet=arguments.quiet) as progress,
         executor_of(arguments) as executor,
     ):
-        results = run_challenge(arguments.cases, seed=arguments.seed, path=cases, executor=executor, progress=progress)
-    rows = score(results)
-    command = shlex.join(["probewise", "challenge", "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
+        results = run_challenge(
+            arguments.cases,
+            seed=arguments.seed,
+            work=run_system_case if arguments.systems else run_case,
+            of="systems" if arguments.systems else "",
+            path=cases,
+            executor=executor,
+            progress=progress,
+        )
+    rows = score_systems(results) if arguments.systems else score(results)
+    of = ["--systems"] if arguments.systems else []
+    command = shlex.join(["probewise", "challenge", *of, "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
-        write_text_atomically(stage / "report.html", report.write_page(results, command=command))
+        write_text_atomically(stage / "report.html", report.write_page(results, command=command, systems=arguments.systems))
     say(report.answer(rows, len(results)), quiet=arguments.quiet)
     say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

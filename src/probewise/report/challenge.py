@@ -9,6 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probewise.challenge import Estimate, Row, by_effect, confusion, reliability, score
+from probewise.challenge.scoring import answers, fits, leading, leading_name_right
+from probewise.challenge.systems import family_of, score_systems
+from probewise.challenge.systems.table import gains_of
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
 from probewise.report.terms import explained, terms_of
@@ -69,17 +72,23 @@ def table_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def write_page(results: Results, *, command: str) -> str:
-    """Write the whole page; `command` is what made it."""
-    rows = score(results)
+def write_page(results: Results, *, command: str, systems: bool = False) -> str:
+    """Write the whole page; `command` is what made it, and `systems` says that the cases are of systems."""
+    rows = score_systems(results) if systems else score(results)
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (table_of_rows(rows), _legend()))]
     if done:
         drawn = figure(
-            png(confusion_matrix(*confusion(done))),
-            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as it.",
+            png(confusion_matrix(*confusion(done, label=family_of if systems else str))),
+            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as it."
+            + (" Targets are left out." if systems else ""),
         )
-        sections += [Section("What is taken for what", (drawn,)), Section("Each effect at lambda 8", (_effects(done),))]
+        sections.append(Section("What is taken for what", (drawn,)))
+        sections.append(
+            Section("Case by case", (_cases(results),))
+            if systems
+            else Section("Each effect at lambda 8", (_effects(done),))
+        )
     failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
     if failures:
         sections.append(Section("Cases that failed", (definition_list(failures),)))
@@ -104,6 +113,40 @@ def _effects(done: Results) -> Markup:
             (name, str(detected.n), *(f"{_value(e)} ({_interval(e)})" for e in (detected, named)))
             for name, (detected, named) in by_effect(done).items()
         ),
+    )
+
+
+def _cases(results: Results) -> Markup:
+    return table(
+        (
+            "case",
+            "system",
+            "concealed",
+            "lambda",
+            "said",
+            "probability",
+            "right",
+            "held-out gain, of the right model's (nats)",
+        ),
+        (_case(number, result) for number, result in enumerate(results)),
+    )
+
+
+def _case(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
+    concealed = " and ".join(h["name"] for h in result.get("hidden", ())) or result.get("noise_model", "")
+    begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
+    if "failed" in result:
+        return (*begun, f"failed: {result['failed']}", "", "no", "")
+    names, probability = leading(result, clean=True)
+    right = leading_name_right(result) if result["hidden"] else fits(names, answers(result, merged=True))
+    gains = gains_of(result, "right")
+    said = " and ".join(names) or "clean"
+    return (
+        *begun,
+        said,
+        f"{probability:.2f}",
+        "yes" if right else "no",
+        "" if gains is None else f"{gains[0]:.1f} of {gains[1]:.1f}",
     )
 
 

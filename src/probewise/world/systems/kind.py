@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.special import ndtri
 
 from probewise._arrays import FloatArray
 
@@ -65,13 +66,14 @@ class Prior:
         """Return the value at a coordinate."""
         return np.exp(np.clip(coordinate, -60.0, 60.0)) if self.shape == "log" else np.asarray(coordinate * self.width)
 
-    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw n values."""
+    def spread(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw n values, one from each of n parts of equal mass, in random order."""
+        u = (rng.permutation(n) + rng.random(n)) / n
         if self.shape == "normal":
-            return self.a + self.b * rng.standard_normal(n)
+            return np.asarray(self.a + self.b * ndtri(u))
         if self.shape == "log":
-            return np.exp(rng.uniform(math.log(self.a), math.log(self.b), n))
-        return rng.uniform(self.a, self.b, n)
+            return np.exp(math.log(self.a) + u * math.log(self.b / self.a))
+        return self.a + u * (self.b - self.a)
 
 
 @dataclass(frozen=True)
@@ -123,8 +125,12 @@ class Kind:
         Whether time begins anew in each run.
     logged
         Columns that do nothing.
-    controls
-        Columns that the owner can set.
+    n_runs, per_run
+        Number of runs that are not kept back, and the parameters with a value in each.
+    reading_decimals
+        Decimals of a reading.
+    tells_states
+        Whether the owner's file gives a law's states and rates, or has a loop of its own.
     """
 
     name: str
@@ -148,6 +154,7 @@ class Kind:
     n_runs: int = 5
     per_run: tuple[str, ...] = ()
     reading_decimals: int = 4
+    tells_states: bool = True
 
     @property
     def shared(self) -> tuple[str, ...]:

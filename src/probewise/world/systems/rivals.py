@@ -67,7 +67,11 @@ def rivals_of(
     near = _screened(scene, [f for f in forms if short_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
     for candidate in near:
-        wider = Model(scene.kind, scene.rows, [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))])
+        wider = Model(
+            scene.kind,
+            scene.rows,
+            [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))],
+        )
         own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
         try:
             nats = 0.5 * wider.fit(target, np.concatenate([fitted.at, own]), max_calls=10).squares
@@ -116,7 +120,10 @@ def templates_of(scene: Scene, forms: Sequence[Form], fitted: Fitted, model: Mod
         for form in forms:
             if form.side == "reading":
                 numbers = as_numbers(settings[form])
-                out[form] = read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)]) - fitted.readings
+                out[form] = (
+                    read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)])
+                    - fitted.readings
+                )
         alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or scene.kind.law is None)]
         for form in alone:
             found = _simulated(scene, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))

@@ -21,4 +21,5 @@ FAMILIES = (
 
 def forms_of(scene: Scene) -> list[Form]:
     """List every form of the vocabulary that this system has a target for; a floor is a saturation too."""
-    return [*forms_of_readings(scene), *forms_of_inputs(scene), *forms_of_parameters(scene), *forms_of_rates(scene)]
+    of_rates = forms_of_rates(scene) if scene.kind.tells_states else ()
+    return [*forms_of_readings(scene), *forms_of_inputs(scene), *forms_of_parameters(scene), *of_rates]

@@ -77,11 +77,13 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
             return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
         first = 0.01 * spread
-        bank = [[{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")]
+        bank = [
+            [{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")
+        ]
         yield Form(
             f"periodic_error:{column}", "input", _on(column, wavy), lambda a, drawn: {"a": a, **drawn},
             lambda rng: {"period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)), "phase": float(rng.uniform(0, 2 * np.pi))},
-            bank, wave_joined, {"a": first, "period": 0.002 * span, "phase": 0.05}, first, 0.2 * span, own,
+            bank, wave_joined, {"a": first, "period": 0.002 * span, "phase": 0.05}, first, 0.2 * span, own, signed=False,
         )  # fmt: skip
     if scene.rows.time is not None:
         taus = scene.rows.gap * np.geomspace(0.05, 6, 12 if scene.kind.law is None else 5)

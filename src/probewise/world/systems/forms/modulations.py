@@ -12,7 +12,18 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Bank, Now, Numbers
 from probewise.world.systems.forms.scene import Scene, log_uniform
 
-__all__ = ["Modulation", "along_time", "by_run", "one_by_one", "settling", "step", "waves", "with_column", "wave_bank", "wave_joined"]
+__all__ = [
+    "Modulation",
+    "along_time",
+    "by_run",
+    "one_by_one",
+    "settling",
+    "step",
+    "waves",
+    "with_column",
+    "wave_bank",
+    "wave_joined",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +40,7 @@ class Modulation:
     reach: float
     uses: tuple[str, ...] = ()
     breaks: Callable[[Numbers], FloatArray] | None = None
+    signed: bool = True
 
 
 def _nothing(rng: np.random.Generator) -> dict[str, float]:
@@ -40,9 +52,19 @@ def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[s
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
-def _plain(over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()) -> Modulation:
+def _plain(
+    over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
+) -> Modulation:
     return Modulation(
-        over, lambda a, drawn: {"a": a}, _nothing, lambda a: [[{"a": a}]], one_by_one, lambda a: {"a": a}, covariates, reach, uses
+        over,
+        lambda a, drawn: {"a": a},
+        _nothing,
+        lambda a: [[{"a": a}]],
+        one_by_one,
+        lambda a: {"a": a},
+        covariates,
+        reach,
+        uses,
     )
 
 
@@ -86,7 +108,7 @@ def by_run(scene: Scene) -> Modulation:
     present = [int(scene.rows.run[own[0]]) for own in scene.rows.by_run]
 
     def over(now: Now, v: Numbers) -> Any:
-        values = np.concatenate([np.atleast_2d(v[name]) for name in names], axis=1)
+        values = np.concatenate(np.broadcast_arrays(*(np.atleast_2d(v[name]) for name in names)), axis=1)
         return values[:, now.run]
 
     def join(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
@@ -128,6 +150,7 @@ def waves(scene: Scene, n: int) -> Modulation:
         lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
         ("time", str(rows.time)),
         1.0,
+        signed=False,
     )
 
 

@@ -38,7 +38,7 @@ def added_to_readings(scene: Scene, name: str, how: Modulation, *, gain: bool = 
     first = scene.sd / typical / how.reach
     return Form(
         name, "reading", act, how.sized, how.draw, how.bank(first), how.join, how.steps(first), first, 1e4 * first,
-        how.covariates, order=GAIN if gain else OFFSET,
+        how.covariates, signed=how.signed, order=GAIN if gain else OFFSET,
     )  # fmt: skip
 
 

@@ -1,0 +1,135 @@
+"""One case of a challenge on systems: drawn, written as its owner would bring it, diagnosed blind, held against the truth."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from probewise.challenge.case import Task, said
+from probewise.challenge.systems.held_out import log_densities_of_runs
+from probewise.diagnosis import Diagnosis, EffectFound
+from probewise.diagnosis.system.diagnose import diagnose_system
+from probewise.errors import DoubtfulResultWarning, ProbewiseError
+from probewise.systems import read_run_table, read_simulator
+from probewise.world.systems import SystemCase, SystemEffect, draw_system_case, system_stratum_of, write_system_case
+
+__all__ = ["run_system_case"]
+
+_OWN = 1_000  # child of the case's seed sequence that the drawing has no use for
+
+
+def run_system_case(task: Task) -> dict[str, Any]:
+    """Draw a case, diagnose it from its two files alone, and say what was stated and what is true.
+
+    Returns
+    -------
+    A JSON object. A case that could not be drawn or whose diagnosis failed has "failed", the reason, and "at",
+    "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
+    """
+    stratum, _ = system_stratum_of(task.number)
+    result: dict[str, Any] = asdict(stratum)
+    at = "drawing"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what is doubtful is scored like the rest
+        try:
+            case = draw_system_case(task.seed, task.number)
+            result |= _truth(case)
+            at = "diagnosis"
+            result |= _diagnosed(case, task)
+        # A campaign outlives the case that breaks the diagnosis, and tells of it.
+        except (
+            ProbewiseError,
+            ArithmeticError,
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            NotImplementedError,
+        ) as error:
+            result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
+    return result
+
+
+def _truth(case: SystemCase) -> dict[str, Any]:
+    kind = case.drawn.kind
+    of_noise = {"white": [], "quantised": [], "t4": ["outliers"]}.get(case.noise.name, [case.noise.name])
+    names = [effect.name for effect in case.effects]
+    strange = any(not effect.in_vocabulary for effect in case.effects)
+    return {
+        "system": kind.name,
+        "law": kind.law is not None,
+        "noise_model": case.noise.name,
+        "noise_text": case.noise_text,
+        "readings": len(case.drawn.kept),
+        "truth": ["unknown"] if strange else sorted([*names, *of_noise]),
+        "hidden": [_effect(effect) for effect in case.effects],
+        "alias": None,
+        "cosine": case.cosine,
+    }
+
+
+def _effect(effect: SystemEffect) -> dict[str, Any]:
+    """Tell of one effect; a rival that loses so many nats has that cosine to it."""
+    squared = effect.size_lambda**2
+    return {
+        "name": effect.name,
+        "size_lambda": effect.size_lambda,
+        "on_noise": False,
+        "in_vocabulary": effect.in_vocabulary,
+        "shows_in": list(effect.covariates),
+        "cosines": {name: math.sqrt(max(1 - 2 * nats / squared, 0.0)) for name, nats in effect.rivals.items()},
+        "parameters": {name: value for name, value in effect.parameters.items() if isinstance(value, float)},
+    }
+
+
+def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
+    blind, later = (
+        np.random.default_rng(child)
+        for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(2)
+    )
+    with tempfile.TemporaryDirectory() as directory:
+        file, table, test, _ = write_system_case(case, directory)
+        simulator = read_simulator(file)
+        seen, kept_back = (read_run_table(path, time=simulator.time, run=simulator.run) for path in (table, test))
+        begun_s = time.process_time()
+        diagnosis = diagnose_system(simulator, seen, rng=blind)
+        cpu_s = time.process_time() - begun_s
+    found = {effect.name: effect for effect in diagnosis.effects}
+    named = [e for e in case.effects if e.name in diagnosis.combination and e.name in found]
+    return {
+        **said(diagnosis),
+        "where": [place.covariate for place in diagnosis.where],
+        "parameters": {e.name: _within(e.parameters, found[e.name]) for e in named},
+        "formula": _has_formula(diagnosis),
+        "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
+        "cpu_s": cpu_s,
+    }
+
+
+def _within(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
+    """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high]; a phase counts by its nearest turn.
+
+    Values of runs are left out: what they have in common is the simulator's as well.
+    """
+    out = {}
+    for stated in found.parameters:
+        truth = parameters.get(stated.name)
+        if not isinstance(truth, float):
+            continue
+        low, high = stated.interval95
+        if stated.unit == "rad":
+            truth += 2 * math.pi * round(((low + high) / 2 - truth) / (2 * math.pi))
+        out[stated.name] = [truth, low, high]
+    return out
+
+
+def _has_formula(diagnosis: Diagnosis) -> bool:
+    """Tell whether what has no name was given a formula."""
+    return any(getattr(effect, "expression", "") for effect in getattr(diagnosis.repaired.chain, "effects", ()))

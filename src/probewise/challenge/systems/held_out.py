@@ -1,0 +1,91 @@
+"""What null, repaired, right and true model make of runs that a diagnosis of a system never saw."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis import Diagnosis, ModelSamples
+from probewise.errors import NotConvergedError
+from probewise.systems import RunTable
+from probewise.systems.system import SystemChain
+from probewise.world.systems import SystemCase, right_predictions
+
+__all__ = ["log_densities_of_runs", "predicted_runs"]
+
+_N_SAMPLES = 200
+_N_OF_A_RUN = (
+    4000  # where something is a run's own: its prior is wide, and the density at a reading must not hang on a few draws
+)
+_LOG_ROOT = 0.5 * math.log(2 * math.pi)
+
+
+def log_densities_of_runs(
+    case: SystemCase, diagnosis: Diagnosis, later: RunTable, *, rng: np.random.Generator
+) -> dict[str, dict[str, float]]:
+    """Sum the log predictive densities of each run kept back, in nats.
+
+    "null" and "repaired" are the diagnosis's own models. "right", where something is concealed, is the model with just that,
+    fitted to the same readings by the world itself. "true" knows the noise-free reading.
+
+    Returns
+    -------
+    By run, "inside" the regime of those that were seen and "beyond" it, then by model.
+    """
+    fitting, *drawing = rng.spawn(3)
+    readings = later.covariates[case.drawn.kind.reading]
+    sd = case.drawn.kind.sd
+    rows = np.flatnonzero(case.drawn.rows.run >= case.drawn.rows.n_runs - 2)
+    scores = {
+        "null": _log_density(*predicted_runs(diagnosis.null, later, rng=drawing[0]), readings),
+        "true": _log_density(case.noise_free[None, rows], np.array([sd]), readings),
+    }
+    same = diagnosis.repaired is diagnosis.null
+    scores["repaired"] = (
+        scores["null"] if same else _log_density(*predicted_runs(diagnosis.repaired, later, rng=drawing[1]), readings)
+    )
+    if case.effects:
+        try:
+            right = right_predictions(case, _N_OF_A_RUN if case.drawn.kind.per_run else _N_SAMPLES, rng=fitting)
+            scores["right"] = _log_density(right, np.full(len(right), sd), readings)
+        except NotConvergedError:
+            pass  # then nobody could have fitted it, and the share has no case
+    run = case.drawn.rows.run[rows]
+    names = {case.drawn.rows.n_runs - 2: "inside", case.drawn.rows.n_runs - 1: "beyond"}
+    return {
+        name: {model: float(own[run == k].sum()) for model, own in scores.items() if np.isfinite(own[run == k]).all()}
+        for k, name in names.items()
+    }
+
+
+def predicted_runs(
+    samples: ModelSamples, table: RunTable, *, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Predict runs that were not seen: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
+
+    What is a run's own is drawn from its prior.
+    """
+    chain = cast(SystemChain, samples.chain)
+    wider = replace(chain, system=chain.system.with_runs(table))
+    of_run = {name: prior for name, prior in wider.system.marginals.items() if name not in chain.names}
+    n = _N_OF_A_RUN if of_run else _N_SAMPLES
+    chosen = rng.permutation(np.arange(n) % len(samples.theta))
+    known = dict(zip(chain.names, samples.theta[chosen].T, strict=True))
+    # One from each of n parts of equal mass: a prior is covered evenly.
+    spread = {name: prior.from_unit((rng.permutation(n) + rng.random(n)) / n) for name, prior in of_run.items()}
+    theta = np.stack([(known | spread)[name] for name in wider.names], axis=1)
+    with np.errstate(all="ignore"):
+        predicted = np.concatenate([wider.predict(part, table) for part in np.array_split(theta, max(n // 500, 1))])
+    return predicted, samples.noise_sd[chosen]
+
+
+def _log_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
+    """Log of the mean density over samples, (n_points,)."""
+    z = (readings - predicted) / sd[:, None]
+    each = -0.5 * z**2 - np.log(sd)[:, None] - _LOG_ROOT
+    return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))

@@ -1,0 +1,166 @@
+"""The table of a challenge on systems: each row what was aimed at, what was found, and whether that decides it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.challenge.estimates import mean, resampled, share
+from probewise.challenge.reliability import calibration_error
+from probewise.challenge.scoring import answers, fits, is_outside, leading, leading_name_right, names_of
+from probewise.challenge.table import Row, alarms, covering, merged_size, names_physics, singles, surely_wrong
+
+__all__ = ["family_of", "gains_of", "score_systems"]
+
+Result = Mapping[str, Any]
+
+_MOST_NATS = 100.0  # of a recording's held-out gain
+_LEAST_NATS = 3.0  # of the right model's gain, for a share of it to say anything
+_AS_GOOD = 0.8  # of the true law's held-out gain
+_RUNS = ("inside", "beyond")
+
+
+def family_of(name: str) -> str:
+    """Return a name without its target."""
+    return "+".join(part.split(":")[0] for part in name.split("+"))
+
+
+def score_systems(results: Sequence[Result]) -> tuple[Row, ...]:
+    """Score the results of `run_system_case`; a case that failed counts in the last row alone."""
+    done = [r for r in results if "failed" not in r]
+    return (
+        *_clean(done),
+        *_naming(done),
+        *_probabilities(done),
+        *_intervals(done),
+        *_held_out(done),
+        *_strange(done),
+        *_time(done),
+        Row("cases that failed", share(["failed" in r for r in results])),
+    )
+
+
+def _clean(done: list[Result]) -> list[Row]:
+    clean = [r for r in done if r["kind"] == "clean"]
+    white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
+    models = sorted({r["noise_model"] for r in other})
+    return [
+        Row("false alarms, clean, alpha .05", alarms(white, 0.05), 0.03, 0.06),
+        Row("false alarms, other noise, alpha .05", alarms(other, 0.05), most=0.06),
+        *(Row(f"  {m}", alarms([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
+        Row("physics named, clean", share([names_physics(r) for r in white]), most=0.005),
+        Row("physics named, other noise", share([names_physics(r) for r in other]), most=0.005),
+        Row("noise told as it is, other noise", share([leading(r, clean=True)[0] == tuple(r["truth"]) for r in other])),
+    ]
+
+
+def _naming(done: list[Result]) -> list[Row]:
+    targets = {6.0: -math.inf, 8.0: 0.9, 12.0: 0.95, 20.0: 0.98}
+    shown = singles(done, 12.0)
+    pairs = [r for r in done if r["kind"] == "pair"]
+    return [
+        *(
+            Row(
+                f"right name and target first, lambda {size:g}",
+                share([leading_name_right(r) for r in singles(done, size)]),
+                least,
+            )
+            for size, least in targets.items()
+        ),
+        Row(
+            "right covariate first, lambda 12",
+            share([bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]),
+            0.95,
+        ),
+        Row("two effects, lambda 12 each: both named", share([leading_name_right(r) for r in pairs]), 0.85),
+    ]
+
+
+def _probabilities(done: list[Result]) -> list[Row]:
+    own = singles(done, 12.0)
+
+    def holds(r: Result) -> bool:
+        return any(fits(names_of(label), answers(r, merged=True)) for label in r["credible_set"])
+
+    return [
+        Row("95 % credible set holds the truth or its alias, lambda 12", share([holds(r) for r in own]), 0.95),
+        Row("  the same, all cases", share([holds(r) for r in done])),
+        Row(
+            "size of the credible set, the truth and its aliases as one, lambda 12",
+            mean([merged_size(r) for r in own]),
+            most=1.4,
+        ),
+        Row("wrong name stated above .9", share([_surely_wrong(r) for r in done]), most=0.01),
+        Row("expected calibration error", calibration_error(done)),
+    ]
+
+
+def _surely_wrong(result: Result) -> bool:
+    """Tell whether a name that not even an alias excuses is stated above .9."""
+    return surely_wrong(result) and not fits(leading(result, clean=True)[0], answers(result, merged=True))
+
+
+def _intervals(done: list[Result]) -> list[Row]:
+    stated = [interval for r in done for own in r["parameters"].values() for interval in own.values()]
+    return [Row("95 % intervals of effect parameters cover", covering(stated), 0.92, 0.98)]
+
+
+def gains_of(result: Result, best: str) -> tuple[float, float] | None:
+    """Return what the repaired and the best model gain over the null in the runs kept back, at most 100 nats each; None without one."""
+    own = [result["held_out"][run] for run in _RUNS]
+    if any(model not in scores for scores in own for model in ("null", "repaired", best)):
+        return None
+    repaired, most = (sum(scores[model] - scores["null"] for scores in own) for model in ("repaired", best))
+    return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
+
+
+def _shares(results: Sequence[Result]) -> FloatArray:
+    gains = [g for g in (gains_of(r, "right") for r in results) if g is not None and g[1] >= _LEAST_NATS]
+    return np.array([[repaired / right] for repaired, right in gains]).reshape(-1, 1)
+
+
+def _held_out(done: list[Result]) -> list[Row]:
+    named = [r for r in done if r["kind"] in ("single", "pair")]
+    clean = [g[0] for g in (gains_of(r, "true") for r in done if r["kind"] == "clean") if g is not None]
+    every = [g[0] for g in (gains_of(r, "true") for r in done) if g is not None]
+    return [
+        Row("held-out runs: median share of the right model's gain", resampled(_shares(named), _median), 0.95),
+        Row("held-out worse than the null by over 3 nats", share([bool(g < -3.0) for g in every])),
+        Row("  of clean ones", share([bool(g < -3.0) for g in clean])),
+    ]
+
+
+def _median(rows: FloatArray) -> float:
+    return float(np.median(rows))
+
+
+def _strange(done: list[Result]) -> list[Row]:
+    outside = [r for r in done if r["kind"] == "outside"]
+    inside = [r for r in done if r["kind"] != "outside"]
+    good = [_as_good(r) for r in outside]
+    told = [g or r["verdict"] == "unknown" for g, r in zip(good, outside, strict=True)]
+    return [
+        Row("not on the list, lambda 20: unknown, or as good as the true law", share(told), 0.9),
+        Row("  by a formula or a name", share(good), 0.6),
+        Row("  a formula found", share([bool(r["formula"]) for r in outside])),
+        Row("false unknown", share([r["verdict"] == "unknown" for r in inside if not is_outside(r)])),
+    ]
+
+
+def _as_good(result: Result) -> bool:
+    """Tell whether a name or formula gains most of what the true law does; names that explain the same are as good."""
+    if fits(leading(result, clean=True)[0], answers(result, merged=True)) and result["verdict"] != "unknown":
+        return True
+    gains = gains_of(result, "right")
+    return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
+
+
+def _time(done: list[Result]) -> list[Row]:
+    return [
+        Row("processor time of a diagnosis, formula (s)", mean([r["cpu_s"] for r in done if not r["law"]]), most=5.0),
+        Row("processor time of a diagnosis, law (s)", mean([r["cpu_s"] for r in done if r["law"]]), most=20.0),
+    ]

@@ -1,0 +1,27 @@
+"""Systems that conceal something: a world that shares no code with the library's systems, for a challenge of them.
+
+What a person would bring, a table and a short file, comes from here with a truth that nobody sees; how laws are solved, forms
+act and fits are made is written a second time.
+"""
+
+from probewise.world.systems.cases import KINDS, Drawn, SystemCase, SystemEffect, draw_system, draw_system_case
+from probewise.world.systems.files import owners_file, truth_of, write_system_case
+from probewise.world.systems.noise import OTHER_NOISE
+from probewise.world.systems.right import right_predictions
+from probewise.world.systems.strata import SYSTEMS_WHEEL, system_stratum_of
+
+__all__ = [
+    "KINDS",
+    "OTHER_NOISE",
+    "SYSTEMS_WHEEL",
+    "Drawn",
+    "SystemCase",
+    "SystemEffect",
+    "draw_system",
+    "draw_system_case",
+    "owners_file",
+    "right_predictions",
+    "system_stratum_of",
+    "truth_of",
+    "write_system_case",
+]

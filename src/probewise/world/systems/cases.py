@@ -1,0 +1,336 @@
+"""Draw a case: a system, what it conceals, a recording, and what is kept back to test the diagnosis on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import NotConvergedError
+from probewise.world.challenge.sizing import amplitude_of_size
+from probewise.world.challenge.strata import Stratum
+from probewise.world.systems.chain import simulate
+from probewise.world.systems.fit import Beside, Fitted, Model, left_over, numbers_of
+from probewise.world.systems.formulas import FORMULAS
+from probewise.world.systems.forms.form import Form, Placed
+from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.strange import STRANGE, strangers
+from probewise.world.systems.kind import Kind
+from probewise.world.systems.laws import LAWS
+from probewise.world.systems.laying import lay_out
+from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of
+from probewise.world.systems.rivals import rivals_of, short_name
+from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.shows import covariates_of
+from probewise.world.systems.strata import system_stratum_of
+from probewise.world.systems.vocabulary import FAMILIES, forms_of
+
+__all__ = ["KINDS", "Drawn", "SystemCase", "SystemEffect", "draw_system", "draw_system_case"]
+
+KINDS: tuple[Kind, ...] = (*FORMULAS, *LAWS)
+"""Every kind of system."""
+
+_ATTEMPTS = 16
+_APART = 0.5  # cosine of the two of a pair, less
+_TOLERANCE = 0.004  # of a size
+_RUN_AWAY = 1e3  # times the largest reading
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A system that conceals nothing yet.
+
+    Parameters
+    ----------
+    kind, rows
+        The system, and all its rows, those kept back too.
+    shared, by_run
+        True parameters; those of a run's own (n_runs,).
+    """
+
+    kind: Kind
+    rows: SystemRows
+    shared: Mapping[str, float]
+    by_run: Mapping[str, FloatArray]
+
+    @cached_property
+    def kept(self) -> IntArray:
+        """Rows that are not kept back."""
+        return np.flatnonzero(self.rows.run < self.rows.n_runs - 2)
+
+    @cached_property
+    def seen(self) -> SystemRows:
+        """The rows that a diagnosis sees."""
+        return self.rows.take(self.kept)
+
+    @cached_property
+    def nominal(self) -> Model:
+        """The nominal model of them."""
+        return Model(self.kind, self.seen)
+
+    @cached_property
+    def at(self) -> FloatArray:
+        """Coordinates of the truth."""
+        return self.nominal.coordinates(self.shared, self.by_run)
+
+    @cached_property
+    def bare(self) -> Fitted:
+        """The noise-free readings without any effect, as a fit of the nominal model, with its slopes."""
+        readings, slopes = self.nominal.with_slopes(self.at)
+        return Fitted(self.at, readings, slopes, 0.0)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Where forms are bound."""
+        parameters = self.nominal.parameters(self.at[None, :])
+        trace = simulate(self.kind, self.seen, parameters)
+        return Scene(
+            self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
+        )
+
+    def everywhere(self, effects: Sequence[Placed]) -> FloatArray:
+        """Noise-free readings at all rows, (n_points,)."""
+        whole = Model(self.kind, self.rows)
+        with np.errstate(all="ignore"):
+            trace = simulate(
+                self.kind, self.rows, whole.parameters(whole.coordinates(self.shared, self.by_run)[None, :]), effects
+            )
+        return trace.readings[0]
+
+    def changed(self, effects: Sequence[Placed]) -> FloatArray:
+        """Noise-free readings at the rows that are seen, (n_points,)."""
+        with np.errstate(all="ignore"):
+            readings: FloatArray = simulate(
+                self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects
+            ).readings[0]
+        if not np.isfinite(readings).all():
+            raise NotConvergedError(f"the {self.kind.name} runs away")
+        return readings
+
+    def size(self, effects: Sequence[Placed]) -> float:
+        """Return lambda: what the nominal model leaves, refitted in full, in sds."""
+        return math.sqrt(self.nominal.fit(self.changed(effects), self.at).squares)
+
+
+@dataclass(frozen=True, eq=False)
+class SystemEffect:
+    """An effect with its numbers, how large it is, and what else explains the same, by name in nats."""
+
+    form: Form
+    values: Mapping[str, float]
+    size_lambda: float
+    rivals: Mapping[str, float]
+    covariates: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Name in the vocabulary, or the stranger's."""
+        return short_name(self.form)
+
+    @property
+    def in_vocabulary(self) -> bool:
+        """Whether a diagnosis can name it."""
+        return not self.form.shape
+
+    @property
+    def placed(self) -> Placed:
+        """The form with its numbers."""
+        return self.form, numbers_of(self.values)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters as in the vocabulary; `values` of all runs, those kept back last."""
+        values = [v for name, v in self.values.items() if name.startswith("values[")]
+        own = {name: v for name, v in self.values.items() if not name.startswith("values[")}
+        return {**own, **({"values": values} if values else {}), **self.form.beside}
+
+
+@dataclass(frozen=True, eq=False)
+class SystemCase:
+    """One case of a challenge on systems.
+
+    Parameters
+    ----------
+    seed, number, stratum
+        Which case it is.
+    drawn
+        The system.
+    effects
+        What it conceals.
+    noise
+        Its noise.
+    noise_text
+        What the owner's file says of the noise; empty for nothing.
+    labels
+        Names of the runs.
+    noise_free, readings
+        At all rows, (n_points,).
+    cosine
+        Of the surviving parts of a pair; None: no pair.
+    """
+
+    seed: int
+    number: int
+    stratum: Stratum
+    drawn: Drawn
+    effects: tuple[SystemEffect, ...]
+    noise: SystemNoise
+    noise_text: str
+    labels: tuple[str, ...]
+    noise_free: FloatArray
+    readings: FloatArray
+    cosine: float | None = None
+
+
+def draw_system(kind: Kind, *, rng: np.random.Generator) -> Drawn:
+    """Draw rows and true parameters of a kind."""
+    rows = lay_out(kind, rng=rng)
+    each = [kind.draw_run(rng) for _ in range(rows.n_runs)]
+    return Drawn(kind, rows, kind.draw(rng), {name: np.array([own[name] for own in each]) for name in kind.per_run})
+
+
+def draw_system_case(seed: int, number: int) -> SystemCase:
+    """Draw case `number` of a challenge on systems; it depends on the seed and the number alone.
+
+    Raises
+    ------
+    NotConvergedError
+        If nothing that was drawn for it can have the size wanted.
+    """
+    stratum, before = system_stratum_of(number)
+    drawing, noise = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
+    )
+    shuffled = np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES)
+    failure = NotConvergedError("nothing was tried")
+    for attempt in range(_ATTEMPTS):
+        family = str(shuffled[(before + (attempt // 8)) % len(shuffled)])
+        drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
+        try:
+            effects, cosine = _conceal(stratum, before, family, drawn, drawing)
+            everywhere = drawn.everywhere([effect.placed for effect in effects])
+            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.bare.readings).max():
+                raise NotConvergedError("what is kept back runs away")
+        except NotConvergedError as error:
+            failure = error
+            continue
+        return _recorded(seed, number, stratum, before, drawn, effects, cosine, everywhere, noise)
+    raise failure
+
+
+def _recorded(
+    seed: int, number: int, stratum: Stratum, before: int, drawn: Drawn, effects: tuple[SystemEffect, ...], cosine: float | None,
+    noise_free: FloatArray, rng: np.random.Generator,
+) -> SystemCase:  # fmt: skip
+    """Add noise, round as printed, and choose what the owner knows of it."""
+    kind = drawn.kind
+    name = OTHER_NOISE[before % len(OTHER_NOISE)] if stratum.other_noise else "white"
+    noise = noise_of(name, 12.0, noise_free[drawn.kept], drawn.seen, kind.sd, rng=rng)
+    readings = noise.draw(noise_free, drawn.rows, rng)
+    knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
+    step = noise.step
+    if step is None and knows == "step" and name == "white":
+        step = 10.0 ** math.floor(math.log10(kind.sd))
+    said = {"sd": kind.sd} if knows != "nothing" else {}
+    if step is not None:
+        readings, said = np.round(readings / step) * step, {**said, "step": step}
+    text = (
+        f"noise = {{{', '.join(f'{key!r}: {value:g}' for key, value in said.items())}}}".replace("'", '"')
+        if said
+        else ""
+    )
+    plain = bool(rng.random() < 0.5)
+    labels = tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.rows.n_runs))
+    return SystemCase(
+        seed,
+        number,
+        stratum,
+        drawn,
+        effects,
+        noise,
+        text,
+        labels,
+        noise_free,
+        np.round(readings, kind.reading_decimals),
+        cosine,
+    )
+
+
+def _conceal(
+    stratum: Stratum, before: int, family: str, drawn: Drawn, rng: np.random.Generator
+) -> tuple[tuple[SystemEffect, ...], float | None]:
+    """Draw once what a stratum wants to be concealed."""
+    if stratum.kind == "clean":
+        return (), None
+    forms = forms_of(drawn.scene)
+    if stratum.kind == "outside":
+        wanted = STRANGE[before % len(STRANGE)]
+        own = [f for f in strangers(drawn.scene, rng) if f.name.removeprefix("strange_").split(":")[0] == wanted]
+        one = _sized(_any_of(own, wanted, rng), stratum.size, drawn, rng)
+        return (_with_rivals(one, forms, drawn, ()),), None
+    if stratum.kind == "single":
+        own = [f for f in forms if short_name(f).split(":")[0] == family]
+        one = _sized(_any_of(own, family, rng), stratum.size, drawn, rng)
+        return (_with_rivals(one, forms, drawn, ()),), None
+    names = rng.choice(FAMILIES, 2, replace=False)
+    both = [_any_of([f for f in forms if short_name(f).split(":")[0] == name], str(name), rng) for name in names]
+    first, second = (_sized(form, stratum.size, drawn, rng) for form in both)
+    cosine = _cosine(drawn, first, second)
+    if abs(cosine) >= _APART:
+        raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
+    return (_with_rivals(first, forms, drawn, (second,)), _with_rivals(second, forms, drawn, (first,))), cosine
+
+
+def _any_of(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
+    if not forms:
+        raise NotConvergedError(f"this system has no target for {name}")
+    return forms[int(rng.integers(len(forms)))]
+
+
+def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) -> SystemEffect:
+    """Choose the amplitude at which a form has the size wanted."""
+    more = form.draw(rng)
+    sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
+
+    def placed(amplitude: float) -> list[Placed]:
+        return [(form, numbers_of(form.sized(sign * amplitude, more)))]
+
+    change = (drawn.changed(placed(form.first)) - drawn.bare.readings) / drawn.kind.sd
+    seen = float(np.linalg.norm(left_over(change, drawn.bare.slopes)))
+    if not seen > 1e-6:
+        raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
+    first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
+    amplitude = amplitude_of_size(
+        lambda a: drawn.size(placed(a)),
+        wanted,
+        first=first,
+        limit=form.limit,
+        tolerance=_TOLERANCE,
+        acceptable=0.01,
+        max_calls=14,
+    )
+    return SystemEffect(form, form.sized(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
+
+
+def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
+    a, b = (left_over(drawn.changed([e.placed]) - drawn.bare.readings, drawn.bare.slopes) for e in (one, other))
+    return float(a @ b / np.sqrt((a @ a) * (b @ b)))
+
+
+def _with_rivals(
+    effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]
+) -> SystemEffect:
+    """Look for what explains the same, with the others named beside it."""
+    target = drawn.changed([e.placed for e in (effect, *others)])
+    beside = [Beside(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
+    model = Model(drawn.kind, drawn.seen, beside)
+    start = model.coordinates(drawn.shared, drawn.by_run)
+    fitted = model.fit(target, start)
+    rivals = rivals_of(drawn.scene, forms, target, fitted, model, frozenset({effect.name, *(e.name for e in others)}))
+    left = (target - fitted.readings) / drawn.kind.sd
+    return replace(effect, rivals=rivals, covariates=covariates_of(effect.form, left, drawn.scene))

@@ -1,0 +1,97 @@
+"""Write a case as its owner would bring it, with the truth beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise.recordings import write_text_atomically
+from probewise.recordings.table import csv_text
+from probewise.world.systems.cases import SystemCase, SystemEffect
+
+__all__ = ["owners_file", "table_text", "truth_of", "write_system_case"]
+
+
+def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path, Path]:
+    """Write simulator.py, table.csv, table_test.csv and truth.json into a directory, and return their paths."""
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    seen = case.drawn.kept
+    later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
+    texts = {
+        "simulator.py": owners_file(case),
+        "table.csv": table_text(case, seen),
+        "table_test.csv": table_text(case, later),
+        "truth.json": json.dumps(truth_of(case), indent=1, allow_nan=False) + "\n",
+    }
+    for name, text in texts.items():
+        write_text_atomically(directory / name, text)
+    simulator, table, test, truth = (directory / name for name in texts)
+    return simulator, table, test, truth
+
+
+def owners_file(case: SystemCase) -> str:
+    """Return the text of the owner's file."""
+    return case.drawn.kind.text.replace("{noise}\n", f"{case.noise_text}\n" if case.noise_text else "")
+
+
+def table_text(case: SystemCase, rows: IntArray) -> str:
+    """Return these rows of the table as CSV."""
+    kind, laid = case.drawn.kind, case.drawn.rows
+    decimals = {**kind.decimals, **{c.name: c.decimals for c in kind.logged}, kind.reading: kind.reading_decimals}
+    columns: dict[str, list[str]] = {}
+    if kind.run is not None:
+        columns[kind.run] = [case.labels[k] for k in laid.run[rows]]
+    names = [n for n in (kind.time, *kind.drives) if n is not None]
+    values = {**laid.columns, kind.reading: case.readings}
+    for name in (*names, *(n for n in laid.columns if n not in names), kind.reading):
+        columns[name] = [f"{value:.{decimals[name]}f}" for value in values[name][rows].tolist()]
+    return csv_text(dict(columns))
+
+
+def truth_of(case: SystemCase) -> dict[str, Any]:
+    """Say everything that the recording does not."""
+    seen = case.drawn.kept
+    later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
+    pair = len(case.effects) == 2
+    effects = [_effect(effect) for effect in case.effects]
+    if case.noise.name not in ("white", "quantised", "t4"):
+        effects.append(
+            {
+                "name": case.noise.name,
+                "side": "noise",
+                "parameters": dict(case.noise.parameters),
+                "lambda": case.noise.size_lambda,
+            }
+        )
+    return {
+        "effects": effects,
+        "rivals": [] if pair or not case.effects else _named(case.effects[0]),
+        "rivals_of": {effect.name: _named(effect) for effect in case.effects} if pair else {},
+        "covariates": list(case.effects[0].covariates) if len(case.effects) == 1 else [],
+        "parameters": dict(case.drawn.shared),
+        "noise_sd": case.drawn.kind.sd,
+        "noise_free": case.noise_free[seen].tolist(),
+        "noise_free_test": case.noise_free[later].tolist(),
+        "system": case.drawn.kind.name,
+        "stratum": {"kind": case.stratum.kind, "size": case.stratum.size},
+        "noise": case.noise.name,
+        "seed": case.seed,
+        "number": case.number,
+    }
+
+
+def _effect(effect: SystemEffect) -> dict[str, Any]:
+    own = {"name": effect.name, "side": effect.form.side, "parameters": effect.parameters, "lambda": effect.size_lambda}
+    return (
+        own if effect.in_vocabulary else {**own, "side": "strange", "on_the_list": False, "formula": effect.form.shape}
+    )
+
+
+def _named(effect: SystemEffect) -> list[list[Any]]:
+    return [[name, round(nats, 3)] for name, nats in effect.rivals.items()]

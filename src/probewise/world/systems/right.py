@@ -1,0 +1,51 @@
+"""The model with just what is concealed, fitted to the same readings: nobody could have named better."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.cases import SystemCase
+from probewise.world.systems.chain import simulate
+from probewise.world.systems.fit import Beside, Model, free_numbers
+
+__all__ = ["right_predictions"]
+
+
+def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+    """Predict the rows kept back by posterior samples of the right model, (n_samples, n_rows).
+
+    Samples are of the Gaussian about the least-squares fit; what is a run's own, in runs not seen, is drawn from its prior.
+
+    Raises
+    ------
+    NotConvergedError
+        If the fit leaves the finite numbers.
+    """
+    drawn, kind = case.drawn, case.drawn.kind
+    beside = [Beside(e.form, e.values, free_numbers(e.form)) for e in case.effects]
+    model = Model(kind, drawn.seen, beside)
+    fitted = model.fit(case.readings[drawn.kept], model.coordinates(drawn.shared, drawn.by_run))
+    u, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
+    wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
+    x = fitted.at + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
+    later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
+    ahead = Model(kind, later, beside)
+    n_shared = len(kind.shared)
+    n_runs = len(later.by_run)
+    own = [
+        np.stack(
+            [kind.priors[name].coordinate(kind.priors[name].spread(n_samples, rng=rng)) for _ in range(n_runs)], axis=1
+        )
+        for name in kind.per_run
+    ]
+    parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
+    there = np.concatenate(parts, axis=1)
+    effects = ahead.effects(there)
+    for (form, numbers), b in zip(effects, beside, strict=True):
+        for name in numbers:
+            if name.startswith("values[") and name not in b.free:
+                numbers[name] = np.zeros((1, 1))  # a run that was not seen is taken as the others' middle
+        del form
+    with np.errstate(all="ignore"):
+        return simulate(kind, later, ahead.parameters(there), effects).readings

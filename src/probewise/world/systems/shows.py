@@ -1,0 +1,63 @@
+"""Along which covariates a residual shows as plainly as along any."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.world.systems.forms.form import Form
+from probewise.world.systems.forms.scene import Scene
+
+__all__ = ["covariates_of"]
+
+_BINS = 20
+_AS_PLAIN = 0.9  # of the plainest
+_PLAIN = 0.25  # of all squares: below it nothing shows
+
+
+def covariates_of(form: Form, left: FloatArray, scene: Scene) -> tuple[str, ...]:
+    """Name the covariates that a right answer may put first: the form's own, and what shows the noise-free residual as well.
+
+    Parameters
+    ----------
+    form
+        What is concealed.
+    left
+        What the nominal model leaves of it, (n_points,).
+    scene
+        The system.
+    """
+    rows = scene.rows
+    pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
+    pooled |= {"level": scene.readings, "previous": _change(scene)}
+    pooled |= {f"state:{name}": values for name, values in scene.states.items()}
+    if rows.time is not None:
+        pooled["time"] = rows.t
+    shares = {name: _share(left, _binned(values)) for name, values in pooled.items()}
+    if len(rows.by_run) > 1:
+        shares["run"] = _share(left, rows.run)
+    best = max(shares.values())
+    plain = [name for name, share in shares.items() if share >= _AS_PLAIN * best and share > _PLAIN]
+    return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
+
+
+def _change(scene: Scene) -> FloatArray:
+    out = np.zeros(len(scene.rows))
+    for own in scene.rows.by_run:
+        out[own[1:]] = np.diff(scene.readings[own])
+    return out
+
+
+def _binned(values: FloatArray) -> FloatArray:
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+    return np.asarray(np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
+
+
+def _share(left: FloatArray, groups: FloatArray) -> float:
+    """Share of the squares that means of groups explain, less what they would of noise."""
+    total, explained, n_groups = float(left @ left), 0.0, 0
+    for group in np.unique(groups):
+        own = left[groups == group]
+        explained += len(own) * float(own.mean()) ** 2
+        n_groups += 1
+    return explained / total - n_groups / len(left)

@@ -1,0 +1,33 @@
+"""How the cases of a campaign on systems are spread: half are clean."""
+
+from __future__ import annotations
+
+from probewise.world.challenge.strata import Stratum
+
+__all__ = ["SYSTEMS_WHEEL", "system_stratum_of"]
+
+SYSTEMS_WHEEL: tuple[Stratum, ...] = (
+    *[Stratum("clean")] * 6,
+    *[Stratum("clean", other_noise=True)] * 4,
+    Stratum("single", 6.0),
+    *[Stratum("single", 8.0)] * 2,
+    *[Stratum("single", 12.0)] * 2,
+    Stratum("single", 20.0),
+    *[Stratum("pair", 12.0)] * 2,
+    *[Stratum("outside", 20.0)] * 2,
+)
+"""Twenty turns of it are 400 cases."""
+
+_STRIDE = 7  # has no divisor in common with the wheel: cases in a row are of different kinds
+
+
+def system_stratum_of(number: int) -> tuple[Stratum, int]:
+    """Return the stratum of a case, and how many of its kind and noise, of whatever size, come before it."""
+    order = [SYSTEMS_WHEEL[k * _STRIDE % len(SYSTEMS_WHEEL)] for k in range(len(SYSTEMS_WHEEL))]
+
+    def alike(a: Stratum, b: Stratum) -> bool:
+        return (a.kind, a.other_noise) == (b.kind, b.other_noise)
+
+    turn, slot = divmod(number, len(order))
+    own = order[slot]
+    return own, turn * sum(alike(s, own) for s in order) + sum(alike(s, own) for s in order[:slot])

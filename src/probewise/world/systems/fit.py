@@ -20,6 +20,7 @@ __all__ = ["Beside", "Fitted", "Model", "free_numbers", "left_over", "numbers_of
 
 _STEP = 1e-4  # of a coordinate, for derivatives
 _FORM_STEP = 0.1  # of a form's own
+_FAR = 1e9  # sds
 
 
 def free_numbers(form: Form) -> tuple[str, ...]:
@@ -123,6 +124,16 @@ class Model:
                     out[here, column] = slope[here]
         return found[0], out
 
+    def _or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Readings with their slopes; where a law runs away, so far off that a fit turns back."""
+        try:
+            readings, slopes = self.with_slopes(x)
+        except NotConvergedError:
+            readings = np.full(len(self.rows), np.nan)
+        if not np.isfinite(readings).all():
+            return np.full(len(self.rows), _FAR * self.kind.sd), np.zeros((len(self.rows), len(x)))
+        return readings, np.nan_to_num(slopes)
+
     def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> Fitted:
         """Fit readings (n_points,) by least squares from a start.
 
@@ -138,7 +149,7 @@ class Model:
             key = x.tobytes()
             if key not in last:
                 last.clear()
-                last[key] = self.with_slopes(x)
+                last[key] = self._or_far(x)
             return last[key]
 
         try:

@@ -25,6 +25,7 @@ __all__ = ["travel"]
 _RTOL, _ATOL = 1e-8, 1e-10
 _LOOKS = np.array([0.25, 0.5, 0.75, 1.0])  # of the way between two rows: has something come to rest, or broken loose?
 _REST = 1e-9  # of a state that friction acts on: below it is at rest
+_MOST_CALLS = 600  # of a law between two rows: twelve are a step
 _MOST_EVENTS = 200  # between two rows
 
 
@@ -202,7 +203,13 @@ class _Trip:
             at_begin = free(begin, s) if hard else {}
             modes = [_mode(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
 
+            n_calls = 0
+
             def slope(share: float, flat: FloatArray, modes: Any = modes, shape: Any = s.shape) -> FloatArray:
+                nonlocal n_calls
+                n_calls += 1
+                if n_calls > _MOST_CALLS:
+                    raise NotConvergedError(f"the law of the {self.kind.name} runs away, or is too stiff, between two rows")
                 found = free(share, flat.reshape(shape))
                 for (form, size), mode in zip(hard, modes, strict=True):
                     found[form.target] = np.where(

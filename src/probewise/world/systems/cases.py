@@ -37,7 +37,7 @@ KINDS: tuple[Kind, ...] = (*FORMULAS, *LAWS)
 
 _ATTEMPTS = 16
 _APART = 0.5  # cosine of the two of a pair, less
-_TOLERANCE = 0.004  # of a size
+_TOLERANCE = 0.008  # of a size
 _RUN_AWAY = 1e3  # times the largest reading
 
 
@@ -89,25 +89,19 @@ class Drawn:
         """Where forms are bound."""
         parameters = self.nominal.parameters(self.at[None, :])
         trace = simulate(self.kind, self.seen, parameters)
-        return Scene(
-            self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
-        )
+        return Scene(self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()})
 
     def everywhere(self, effects: Sequence[Placed]) -> FloatArray:
         """Noise-free readings at all rows, (n_points,)."""
         whole = Model(self.kind, self.rows)
         with np.errstate(all="ignore"):
-            trace = simulate(
-                self.kind, self.rows, whole.parameters(whole.coordinates(self.shared, self.by_run)[None, :]), effects
-            )
+            trace = simulate(self.kind, self.rows, whole.parameters(whole.coordinates(self.shared, self.by_run)[None, :]), effects)
         return trace.readings[0]
 
     def changed(self, effects: Sequence[Placed]) -> FloatArray:
         """Noise-free readings at the rows that are seen, (n_points,)."""
         with np.errstate(all="ignore"):
-            readings: FloatArray = simulate(
-                self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects
-            ).readings[0]
+            readings: FloatArray = simulate(self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects).readings[0]
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
@@ -203,9 +197,7 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         If nothing that was drawn for it can have the size wanted.
     """
     stratum, before = system_stratum_of(number)
-    drawing, noise = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
-    )
+    drawing, noise = (np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2))
     shuffled = np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES)
     failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
@@ -239,25 +231,11 @@ def _recorded(
     said = {"sd": kind.sd} if knows != "nothing" else {}
     if step is not None:
         readings, said = np.round(readings / step) * step, {**said, "step": step}
-    text = (
-        f"noise = {{{', '.join(f'{key!r}: {value:g}' for key, value in said.items())}}}".replace("'", '"')
-        if said
-        else ""
-    )
+    text = f"noise = {{{', '.join(f'{key!r}: {value:g}' for key, value in said.items())}}}".replace("'", '"') if said else ""
     plain = bool(rng.random() < 0.5)
     labels = tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.rows.n_runs))
     return SystemCase(
-        seed,
-        number,
-        stratum,
-        drawn,
-        effects,
-        noise,
-        text,
-        labels,
-        noise_free,
-        np.round(readings, kind.reading_decimals),
-        cosine,
+        seed, number, stratum, drawn, effects, noise, text, labels, noise_free, np.round(readings, kind.reading_decimals), cosine
     )
 
 
@@ -306,13 +284,7 @@ def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) ->
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
     first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
     amplitude = amplitude_of_size(
-        lambda a: drawn.size(placed(a)),
-        wanted,
-        first=first,
-        limit=form.limit,
-        tolerance=_TOLERANCE,
-        acceptable=0.01,
-        max_calls=14,
+        lambda a: drawn.size(placed(a)), wanted, first=first, limit=form.limit, tolerance=_TOLERANCE, acceptable=0.01, max_calls=14
     )
     return SystemEffect(form, form.sized(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
 
@@ -322,9 +294,7 @@ def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 
-def _with_rivals(
-    effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]
-) -> SystemEffect:
+def _with_rivals(effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]) -> SystemEffect:
     """Look for what explains the same, with the others named beside it."""
     target = drawn.changed([e.placed for e in (effect, *others)])
     beside = [Beside(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]

@@ -156,7 +156,7 @@ class Model:
             with np.errstate(all="ignore"):
                 found = least_squares(
                     lambda x: (both(x)[0] - readings) / sd, start, jac=lambda x: both(x)[1] / sd, x_scale="jac",
-                    xtol=1e-9, ftol=1e-10, gtol=1e-9, max_nfev=max_calls,
+                    xtol=1e-6, ftol=1e-7, gtol=1e-7, max_nfev=max_calls,
                 )  # fmt: skip
                 f, slopes = both(found.x)
         except (ValueError, np.linalg.LinAlgError) as error:

@@ -212,9 +212,7 @@ class _Trip:
                     raise NotConvergedError(f"the law of the {self.kind.name} runs away, or is too stiff, between two rows")
                 found = free(share, flat.reshape(shape))
                 for (form, size), mode in zip(hard, modes, strict=True):
-                    found[form.target] = np.where(
-                        mode == 0, 0.0, found[form.target] - (size * mode if form.sticks else 0.0)
-                    )
+                    found[form.target] = np.where(mode == 0, 0.0, found[form.target] - (size * mode if form.sticks else 0.0))
                 return np.stack([np.broadcast_to(found[name] * gap, shape[1:]) for name in names]).ravel()
 
             solved = solve_ivp(
@@ -288,16 +286,13 @@ class _Trip:
             for _ in range(_MOST_EVENTS):
                 rates = free(share, s)
                 modes = [
-                    forced.get(m, int(_mode(f, size, s[names.index(f.target)], rates[f.target])))
-                    for m, (f, size) in enumerate(hard)
+                    forced.get(m, int(_mode(f, size, s[names.index(f.target)], rates[f.target]))) for m, (f, size) in enumerate(hard)
                 ]
 
                 def slope(x: float, y: FloatArray, modes: Any = modes) -> FloatArray:
                     found = free(x, y)
                     for (form, size), mode in zip(hard, modes, strict=True):
-                        found[form.target] = (
-                            0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
-                        )
+                        found[form.target] = 0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
                     return gap * np.array([found[name] for name in names])
 
                 solved = solve_ivp(

@@ -14,16 +14,7 @@ from probewise.world.systems.rows import SystemRows
 
 __all__ = ["OTHER_NOISE", "SystemNoise", "noise_of"]
 
-OTHER_NOISE = (
-    "correlated_noise",
-    "outliers",
-    "signal_dependent_noise",
-    "t4",
-    "random_walk",
-    "quantised",
-    "noise_per_run",
-    "dropouts",
-)
+OTHER_NOISE = ("correlated_noise", "outliers", "signal_dependent_noise", "t4", "random_walk", "quantised", "noise_per_run", "dropouts")
 """Kinds of noise that a clean recording may have beside white noise; "t4" and "quantised" are no names of the vocabulary."""
 
 
@@ -52,9 +43,7 @@ class SystemNoise:
     step: float | None = None
 
 
-def noise_of(
-    name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator
-) -> SystemNoise:
+def noise_of(name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator) -> SystemNoise:
     """Choose the strength of a noise such that it is as plain as an effect of size `wanted`."""
     whole = rows.n_runs
     match name:
@@ -84,15 +73,10 @@ def noise_of(
             power = _solved(lambda a: _of_variances(np.exp(2 * a * logs)[rows.run]), wanted, 1e-2, 3.0)
             own = np.exp(power * logs)
             return SystemNoise(
-                name,
-                lambda y, rows, rng: y + sd * own[rows.run] * rng.standard_normal(len(y)),
-                {"values": (sd * own).tolist()},
-                wanted,
+                name, lambda y, rows, rng: y + sd * own[rows.run] * rng.standard_normal(len(y)), {"values": (sd * own).tolist()}, wanted
             )
         case "outliers":
-            return SystemNoise(
-                name, lambda y, rows, rng: y + sd * _outlying(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0}
-            )
+            return SystemNoise(name, lambda y, rows, rng: y + sd * _outlying(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0})
         case "dropouts":
             return SystemNoise(
                 name, lambda y, rows, rng: np.where(rng.random(len(y)) < 0.02, 0.0, y + sd * rng.standard_normal(len(y))),
@@ -102,9 +86,7 @@ def noise_of(
             return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_t(4.0, len(y)), {"freedom": 4.0})
         case _:
             step = _round_number(2.0 * sd)
-            return SystemNoise(
-                "quantised", lambda y, rows, rng: y + sd * rng.standard_normal(len(y)), {"step": step}, step=step
-            )
+            return SystemNoise("quantised", lambda y, rows, rng: y + sd * rng.standard_normal(len(y)), {"step": step}, step=step)
 
 
 def _ar1(rows: SystemRows, rho: float, rng: np.random.Generator) -> FloatArray:
@@ -132,9 +114,7 @@ def _of_variances(variances: FloatArray) -> float:
 
 def _of_covariance(covariance: FloatArray) -> float:
     n = len(covariance)
-    keep = np.linalg.qr(np.concatenate([np.ones((n, 1)), np.eye(n)[:, :-1]], axis=1))[0][
-        :, 1:
-    ]  # a constant is no noise
+    keep = np.linalg.qr(np.concatenate([np.ones((n, 1)), np.eye(n)[:, :-1]], axis=1))[0][:, 1:]  # a constant is no noise
     own = keep.T @ covariance @ keep
     values = np.linalg.eigvalsh(own)
     return _of_variances(np.maximum(values, 1e-12))

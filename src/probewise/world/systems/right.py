@@ -34,9 +34,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     n_shared = len(kind.shared)
     n_runs = len(later.by_run)
     own = [
-        np.stack(
-            [kind.priors[name].coordinate(kind.priors[name].spread(n_samples, rng=rng)) for _ in range(n_runs)], axis=1
-        )
+        np.stack([kind.priors[name].coordinate(kind.priors[name].spread(n_samples, rng=rng)) for _ in range(n_runs)], axis=1)
         for name in kind.per_run
     ]
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]

@@ -24,7 +24,7 @@ TELLING_NATS = 3.0
 
 _NEAR = 12.0  # nats on straight lines from which a fit in full is worth while
 _COSINE = 0.9
-_MOST_FITS = 10
+_MOST_FITS = 6
 _CHUNK = 160  # settings that are simulated together
 _NEUTRAL = {"level": np.inf, "period": 1.0}
 
@@ -32,6 +32,10 @@ _NEUTRAL = {"level": np.inf, "period": 1.0}
 def short_name(form: Form) -> str:
     """Name in the vocabulary."""
     return form.name.removesuffix(" (floor)")
+
+
+def _is_hard(form: Form) -> bool:
+    return form.sticks or form.stops or bool(form.late)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +70,18 @@ def rivals_of(
     left = left_over((target - fitted.readings) / scene.sd, fitted.slopes)
     near = _screened(scene, [f for f in forms if short_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
+    hard = any(_is_hard(b.form) for b in model.beside)
     for candidate in near:
-        wider = Model(
-            scene.kind,
-            scene.rows,
-            [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))],
-        )
+        name = short_name(candidate.form)
+        if hard:  # fits beside dry friction or a bound take minutes: straight lines have to do
+            found[name] = min(candidate.nats, found.get(name, np.inf))
+            continue
+        wider = Model(scene.kind, scene.rows, [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))])
         own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
         try:
-            nats = 0.5 * wider.fit(target, np.concatenate([fitted.at, own]), max_calls=10).squares
+            nats = 0.5 * wider.fit(target, np.concatenate([fitted.at, own]), max_calls=5 if _is_hard(candidate.form) else 7).squares
         except NotConvergedError:
             continue
-        name = short_name(candidate.form)
         found[name] = min(nats, found.get(name, np.inf))
     close = {name: nats for name, nats in found.items() if nats < TELLING_NATS}
     return dict(sorted(close.items(), key=lambda item: item[1]))
@@ -120,10 +124,7 @@ def templates_of(scene: Scene, forms: Sequence[Form], fitted: Fitted, model: Mod
         for form in forms:
             if form.side == "reading":
                 numbers = as_numbers(settings[form])
-                out[form] = (
-                    read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)])
-                    - fitted.readings
-                )
+                out[form] = read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)]) - fitted.readings
         alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or scene.kind.law is None)]
         for form in alone:
             found = _simulated(scene, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))

@@ -77,9 +77,7 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
             return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
         first = 0.01 * spread
-        bank = [
-            [{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")
-        ]
+        bank = [[{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")]
         yield Form(
             f"periodic_error:{column}", "input", _on(column, wavy), lambda a, drawn: {"a": a, **drawn},
             lambda rng: {"period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)), "phase": float(rng.uniform(0, 2 * np.pi))},

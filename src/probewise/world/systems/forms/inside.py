@@ -65,21 +65,13 @@ def forms_of_rates(scene: Scene) -> Iterator[Form]:
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
         yield pushing(scene, f"damping:{state}", state, lambda s, now, v, r=state: -s[r], size, own, signed=False)
-        yield pushing(
-            scene, f"drag:{state}", state, lambda s, now, v, r=state: -np.abs(s[r]) * s[r], size**2, own, signed=False
-        )
-        yield pushing(
-            scene, f"forcing:{state}", state, lambda s, now, v, r=state: 1.0 + 0.0 * s[r], 1.0, ("time", *own)
-        )
+        yield pushing(scene, f"drag:{state}", state, lambda s, now, v, r=state: -np.abs(s[r]) * s[r], size**2, own, signed=False)
+        yield pushing(scene, f"forcing:{state}", state, lambda s, now, v, r=state: 1.0 + 0.0 * s[r], 1.0, ("time", *own))
         for other, there in scene.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
-            yield pushing(
-                scene, f"cubic:{state}:{other}", state, lambda s, now, v, r=other: -(s[r] ** 3), most**3, seen
-            )
-            yield pushing(
-                scene, f"quadratic:{state}:{other}", state, lambda s, now, v, r=other: -(s[r] ** 2), most**2, seen
-            )
+            yield pushing(scene, f"cubic:{state}:{other}", state, lambda s, now, v, r=other: -(s[r] ** 3), most**3, seen)
+            yield pushing(scene, f"quadratic:{state}:{other}", state, lambda s, now, v, r=other: -(s[r] ** 2), most**2, seen)
             if other != state:
                 yield pushing(scene, f"coupling:{state}:{other}", state, lambda s, now, v, r=other: -s[r], most, seen)
         yield _periodic(scene, state)

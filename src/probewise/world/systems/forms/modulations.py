@@ -12,18 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Bank, Now, Numbers
 from probewise.world.systems.forms.scene import Scene, log_uniform
 
-__all__ = [
-    "Modulation",
-    "along_time",
-    "by_run",
-    "one_by_one",
-    "settling",
-    "step",
-    "waves",
-    "with_column",
-    "wave_bank",
-    "wave_joined",
-]
+__all__ = ["Modulation", "along_time", "by_run", "one_by_one", "settling", "step", "waves", "with_column", "wave_bank", "wave_joined"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +41,9 @@ def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[s
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
-def _plain(
-    over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
-) -> Modulation:
+def _plain(over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()) -> Modulation:
     return Modulation(
-        over,
-        lambda a, drawn: {"a": a},
-        _nothing,
-        lambda a: [[{"a": a}]],
-        one_by_one,
-        lambda a: {"a": a},
-        covariates,
-        reach,
-        uses,
+        over, lambda a, drawn: {"a": a}, _nothing, lambda a: [[{"a": a}]], one_by_one, lambda a: {"a": a}, covariates, reach, uses
     )
 
 

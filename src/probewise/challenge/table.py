@@ -42,7 +42,7 @@ __all__ = [
     "merged_size",
     "names_physics",
     "score",
-    "singles",
+    "singles_of",
     "surely_wrong",
 ]
 
@@ -104,7 +104,7 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
 
 def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
     """Tell of each single effect of a size how often it was detected at alpha .01, and named first."""
-    singles = singles([r for r in results if "failed" not in r], size)
+    singles = singles_of([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
     return {name: (alarms(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
@@ -131,7 +131,7 @@ def _clean(done: list[Result]) -> list[Row]:
 def _detection(done: list[Result]) -> list[Row]:
     targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
     rows = [
-        Row(f"detection, alpha .01, lambda {size:g}", alarms(_seen_as_physics(singles(done, size)), 0.01), least)
+        Row(f"detection, alpha .01, lambda {size:g}", alarms(_seen_as_physics(singles_of(done, size)), 0.01), least)
         for size, least in targets.items()
     ]
     each = [detected for detected, _ in by_effect(_seen_as_physics(done)).values()]
@@ -141,12 +141,12 @@ def _detection(done: list[Result]) -> list[Row]:
 
 def _naming(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
-    found = {size: share([leading_name_right(r) for r in singles(done, size)]) for size in targets}
+    found = {size: share([leading_name_right(r) for r in singles_of(done, size)]) for size in targets}
     falls = [_fall(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
     for size, least in targets.items():
-        like = [name_by_likeness(r["hidden"][0]) for r in singles(done, size)]
+        like = [name_by_likeness(r["hidden"][0]) for r in singles_of(done, size)]
         rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
         rows.append(Row(f"  by likeness to the hardest rival, lambda {size:g}", mean(like)))
     return [
@@ -167,7 +167,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
     covered = [any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in done]
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
-        singles = singles(done, size)
+        singles = singles_of(done, size)
         like = [set_size_by_likeness(r["hidden"][0]) for r in singles]
         rows += [
             Row(
@@ -194,8 +194,8 @@ def merged_size(result: Result) -> float:
 
 def _places(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.8, 20.0: 0.9}
-    local = {size: [r["overlap"] for r in singles(done, size) if r["overlap"] is not None] for size in targets}
-    shown = [r for r in singles(done, 8.0) if on_mean(r)]
+    local = {size: [r["overlap"] for r in singles_of(done, size) if r["overlap"] is not None] for size in targets}
+    shown = [r for r in singles_of(done, 8.0) if on_mean(r)]
     first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
@@ -216,6 +216,7 @@ def _intervals(done: list[Result]) -> list[Row]:
 
 
 def covering(intervals: list[list[float]]) -> Estimate:
+    """Estimate how often intervals [truth, low, high] hold the truth."""
     return share([low <= truth <= high for truth, low, high in intervals])
 
 
@@ -315,7 +316,8 @@ def _time(done: list[Result]) -> list[Row]:
     ]
 
 
-def singles(done: Sequence[Result], size: float) -> list[Result]:
+def singles_of(done: Sequence[Result], size: float) -> list[Result]:
+    """List the cases with one effect of this size."""
     return [r for r in done if r["kind"] == "single" and r["size"] == size]
 
 
@@ -330,10 +332,12 @@ def _on_mean(results: Sequence[Result]) -> list[Result]:
 
 
 def alarms(results: Sequence[Result], alpha: float) -> Estimate:
+    """Estimate how often the mean is said to lack something at a level."""
     return share([r["p_value"] <= alpha for r in results])
 
 
 def names_physics(result: Result) -> bool:
+    """Tell whether an effect on the mean is named."""
     return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
@@ -342,6 +346,7 @@ def _mean_names(result: Result) -> list[str]:
 
 
 def surely_wrong(result: Result) -> bool:
+    """Tell whether something else than the truth is stated above .9, `clean` and `unknown` left out."""
     probability, right = stated(result)
     names = leading(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

@@ -61,12 +61,16 @@ def run(arguments: argparse.Namespace) -> int:
         )
     rows = score_systems(results) if arguments.systems else score(results)
     of = ["--systems"] if arguments.systems else []
-    command = shlex.join(["probewise", "challenge", *of, "--cases", str(arguments.cases), "--seed", str(arguments.seed)])
+    command = shlex.join(
+        ["probewise", "challenge", *of, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
+    )
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
-        write_text_atomically(stage / "report.html", report.write_page(results, command=command, systems=arguments.systems))
+        write_text_atomically(
+            stage / "report.html", report.write_page(results, command=command, systems=arguments.systems)
+        )
     say(report.answer(rows, len(results)), quiet=arguments.quiet)
     say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

@@ -1,4 +1,4 @@
-"""Does the diagnosis of a person's simulator keep its promises? Systems of a separate world, diagnosed blind and scored."""
+"""Does the diagnosis of a person's simulator keep its promises? Concealed systems tell."""
 
 from probewise.challenge.systems.case import run_system_case
 from probewise.challenge.systems.table import family_of, score_systems

@@ -1,4 +1,4 @@
-"""One case of a challenge on systems: drawn, written as its owner would bring it, diagnosed blind, held against the truth."""
+"""One case of a challenge on systems: drawn, written to files, diagnosed blind, held against the truth."""
 
 from __future__ import annotations
 
@@ -114,9 +114,9 @@ def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
 
 
 def _within(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
-    """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high]; a phase counts by its nearest turn.
+    """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
 
-    Values of runs are left out: what they have in common is the simulator's as well.
+    A phase counts by its nearest turn. Values of runs are left out: what they share is the simulator's too.
     """
     out = {}
     for stated in found.parameters:

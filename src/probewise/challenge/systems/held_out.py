@@ -30,8 +30,8 @@ def log_densities_of_runs(
 ) -> dict[str, dict[str, float]]:
     """Sum the log predictive densities of each run kept back, in nats.
 
-    "null" and "repaired" are the diagnosis's own models. "right", where something is concealed, is the model with just that,
-    fitted to the same readings by the world itself. "true" knows the noise-free reading.
+    "null" and "repaired" are the diagnosis's own models. "right", where something is concealed, is the model with just
+    that, fitted to the same readings by the world itself. "true" knows the noise-free reading.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.challenge.estimates import mean, resampled, share
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import answers, fits, is_outside, leading, leading_name_right, names_of
-from probewise.challenge.table import Row, alarms, covering, merged_size, names_physics, singles, surely_wrong
+from probewise.challenge.table import Row, alarms, covering, merged_size, names_physics, singles_of, surely_wrong
 
 __all__ = ["family_of", "gains_of", "score_systems"]
 
@@ -60,13 +60,13 @@ def _clean(done: list[Result]) -> list[Row]:
 
 def _naming(done: list[Result]) -> list[Row]:
     targets = {6.0: -math.inf, 8.0: 0.9, 12.0: 0.95, 20.0: 0.98}
-    shown = singles(done, 12.0)
+    shown = singles_of(done, 12.0)
     pairs = [r for r in done if r["kind"] == "pair"]
     return [
         *(
             Row(
                 f"right name and target first, lambda {size:g}",
-                share([leading_name_right(r) for r in singles(done, size)]),
+                share([leading_name_right(r) for r in singles_of(done, size)]),
                 least,
             )
             for size, least in targets.items()
@@ -81,7 +81,7 @@ def _naming(done: list[Result]) -> list[Row]:
 
 
 def _probabilities(done: list[Result]) -> list[Row]:
-    own = singles(done, 12.0)
+    own = singles_of(done, 12.0)
 
     def holds(r: Result) -> bool:
         return any(fits(names_of(label), answers(r, merged=True)) for label in r["credible_set"])
@@ -110,7 +110,7 @@ def _intervals(done: list[Result]) -> list[Row]:
 
 
 def gains_of(result: Result, best: str) -> tuple[float, float] | None:
-    """Return what the repaired and the best model gain over the null in the runs kept back, at most 100 nats each; None without one."""
+    """Return what the repaired and the best model gain in the runs kept back, each at most 100 nats."""
     own = [result["held_out"][run] for run in _RUNS]
     if any(model not in scores for scores in own for model in ("null", "repaired", best)):
         return None

@@ -16,10 +16,10 @@ from probewise.world.challenge.sizing import amplitude_of_size
 from probewise.world.challenge.strata import Stratum
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.fit import Beside, Fitted, Model, left_over, numbers_of
-from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.forms.form import Form, Placed
 from probewise.world.systems.forms.scene import Scene
 from probewise.world.systems.forms.strange import STRANGE, strangers
+from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.kind import Kind
 from probewise.world.systems.laws import LAWS
 from probewise.world.systems.laying import lay_out
@@ -89,19 +89,24 @@ class Drawn:
         """Where forms are bound."""
         parameters = self.nominal.parameters(self.at[None, :])
         trace = simulate(self.kind, self.seen, parameters)
-        return Scene(self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()})
+        return Scene(
+            self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
+        )
 
     def everywhere(self, effects: Sequence[Placed]) -> FloatArray:
         """Noise-free readings at all rows, (n_points,)."""
         whole = Model(self.kind, self.rows)
         with np.errstate(all="ignore"):
-            trace = simulate(self.kind, self.rows, whole.parameters(whole.coordinates(self.shared, self.by_run)[None, :]), effects)
-        return trace.readings[0]
+            at = whole.coordinates(self.shared, self.by_run)
+            trace = simulate(self.kind, self.rows, whole.parameters(at[None, :]), effects)
+        return np.asarray(trace.readings[0])
 
     def changed(self, effects: Sequence[Placed]) -> FloatArray:
         """Noise-free readings at the rows that are seen, (n_points,)."""
         with np.errstate(all="ignore"):
-            readings: FloatArray = simulate(self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects).readings[0]
+            readings: FloatArray = simulate(
+                self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects
+            ).readings[0]
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
@@ -197,7 +202,9 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         If nothing that was drawn for it can have the size wanted.
     """
     stratum, before = system_stratum_of(number)
-    drawing, noise = (np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2))
+    drawing, noise = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
+    )
     shuffled = np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES)
     failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
@@ -216,9 +223,16 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
 
 
 def _recorded(
-    seed: int, number: int, stratum: Stratum, before: int, drawn: Drawn, effects: tuple[SystemEffect, ...], cosine: float | None,
-    noise_free: FloatArray, rng: np.random.Generator,
-) -> SystemCase:  # fmt: skip
+    seed: int,
+    number: int,
+    stratum: Stratum,
+    before: int,
+    drawn: Drawn,
+    effects: tuple[SystemEffect, ...],
+    cosine: float | None,
+    noise_free: FloatArray,
+    rng: np.random.Generator,
+) -> SystemCase:
     """Add noise, round as printed, and choose what the owner knows of it."""
     kind = drawn.kind
     name = OTHER_NOISE[before % len(OTHER_NOISE)] if stratum.other_noise else "white"
@@ -231,11 +245,25 @@ def _recorded(
     said = {"sd": kind.sd} if knows != "nothing" else {}
     if step is not None:
         readings, said = np.round(readings / step) * step, {**said, "step": step}
-    text = f"noise = {{{', '.join(f'{key!r}: {value:g}' for key, value in said.items())}}}".replace("'", '"') if said else ""
+    text = (
+        f"noise = {{{', '.join(f'{key!r}: {value:g}' for key, value in said.items())}}}".replace("'", '"')
+        if said
+        else ""
+    )
     plain = bool(rng.random() < 0.5)
     labels = tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.rows.n_runs))
     return SystemCase(
-        seed, number, stratum, drawn, effects, noise, text, labels, noise_free, np.round(readings, kind.reading_decimals), cosine
+        seed,
+        number,
+        stratum,
+        drawn,
+        effects,
+        noise,
+        text,
+        labels,
+        noise_free,
+        np.round(readings, kind.reading_decimals),
+        cosine,
     )
 
 
@@ -284,7 +312,13 @@ def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) ->
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
     first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
     amplitude = amplitude_of_size(
-        lambda a: drawn.size(placed(a)), wanted, first=first, limit=form.limit, tolerance=_TOLERANCE, acceptable=0.01, max_calls=14
+        lambda a: drawn.size(placed(a)),
+        wanted,
+        first=first,
+        limit=form.limit,
+        tolerance=_TOLERANCE,
+        acceptable=0.01,
+        max_calls=14,
     )
     return SystemEffect(form, form.sized(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
 
@@ -294,7 +328,9 @@ def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 
-def _with_rivals(effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]) -> SystemEffect:
+def _with_rivals(
+    effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]
+) -> SystemEffect:
     """Look for what explains the same, with the others named beside it."""
     target = drawn.changed([e.placed for e in (effect, *others)])
     beside = [Beside(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]

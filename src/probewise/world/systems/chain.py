@@ -24,7 +24,9 @@ class Trace:
     states: Mapping[str, FloatArray]
 
 
-def simulate(kind: Kind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()) -> Trace:
+def simulate(
+    kind: Kind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()
+) -> Trace:
     """Simulate a system.
 
     Parameters
@@ -43,8 +45,12 @@ def simulate(kind: Kind, rows: SystemRows, parameters: Mapping[str, FloatArray],
     for form, numbers in placed:
         if form.side == "input" and not (form.late and kind.law is not None):
             columns = form.act(columns, rows, numbers)
-    inner = [(form, n) for form, n in placed if form.side in ("parameter", "rate") or (form.late and kind.law is not None)]
-    n_samples = max(len(v) for v in (*parameters.values(), *columns.values(), *(v for _, n in placed for v in n.values())))
+    inner = [
+        (form, n) for form, n in placed if form.side in ("parameter", "rate") or (form.late and kind.law is not None)
+    ]
+    n_samples = max(
+        len(v) for v in (*parameters.values(), *columns.values(), *(v for _, n in placed for v in n.values()))
+    )
     if kind.law is not None:
         states = travel(kind, rows, parameters, columns, inner)
         readings = np.asarray(kind.law.read(states, parameters, columns))

@@ -62,7 +62,12 @@ def truth_of(case: SystemCase) -> dict[str, Any]:
     effects = [_effect(effect) for effect in case.effects]
     if case.noise.name not in ("white", "quantised", "t4"):
         effects.append(
-            {"name": case.noise.name, "side": "noise", "parameters": dict(case.noise.parameters), "lambda": case.noise.size_lambda}
+            {
+                "name": case.noise.name,
+                "side": "noise",
+                "parameters": dict(case.noise.parameters),
+                "lambda": case.noise.size_lambda,
+            }
         )
     return {
         "effects": effects,
@@ -83,7 +88,9 @@ def truth_of(case: SystemCase) -> dict[str, Any]:
 
 def _effect(effect: SystemEffect) -> dict[str, Any]:
     own = {"name": effect.name, "side": effect.form.side, "parameters": effect.parameters, "lambda": effect.size_lambda}
-    return own if effect.in_vocabulary else {**own, "side": "strange", "on_the_list": False, "formula": effect.form.shape}
+    return (
+        own if effect.in_vocabulary else {**own, "side": "strange", "on_the_list": False, "formula": effect.form.shape}
+    )
 
 
 def _named(effect: SystemEffect) -> list[list[Any]]:

@@ -39,7 +39,7 @@ class Beside:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), sum of squares in sds."""
+    """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), squares in sds."""
 
     at: FloatArray
     readings: FloatArray
@@ -76,7 +76,7 @@ class Model:
         return np.concatenate([np.ravel(own), *each, numbers])
 
     def parameters(self, x: FloatArray) -> dict[str, FloatArray]:
-        """Parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points) of a run's own."""
+        """Give parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points)."""
         out, n = {}, len(self.kind.shared)
         for k, name in enumerate(self.kind.shared):
             out[name] = self.kind.priors[name].value(x[:, k : k + 1])
@@ -88,7 +88,8 @@ class Model:
 
     def effects(self, x: FloatArray) -> list[Placed]:
         """Forms with their numbers at coordinates."""
-        out, n = [], self.n_nominal
+        out: list[Placed] = []
+        n = self.n_nominal
         for b in self.beside:
             numbers: dict[str, FloatArray] = {name: np.full((len(x), 1), value) for name, value in b.start.items()}
             for name in b.free:
@@ -102,7 +103,10 @@ class Model:
         return simulate(self.kind, self.rows, self.parameters(x), self.effects(x)).readings
 
     def with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Readings (n_points,) and their slopes (n_points, n_coordinates); what is a run's own is changed in all at once."""
+        """Return readings (n_points,) and their slopes (n_points, n_coordinates).
+
+        What is a run's own is changed in all runs at once.
+        """
         n_shared, n_runs = len(self.kind.shared), len(self._runs)
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
         for j in range(len(self.kind.per_run)):
@@ -125,7 +129,7 @@ class Model:
         return found[0], out
 
     def _or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Readings with their slopes; where a law runs away, so far off that a fit turns back."""
+        """Return readings with their slopes; where a law runs away, so far off that a fit turns back."""
         try:
             readings, slopes = self.with_slopes(x)
         except NotConvergedError:
@@ -152,13 +156,25 @@ class Model:
                 last[key] = self._or_far(x)
             return last[key]
 
+        def off(x: FloatArray) -> FloatArray:
+            return np.asarray((both(x)[0] - readings) / sd)
+
+        def slopes_of(x: FloatArray) -> FloatArray:
+            return np.asarray(both(x)[1] / sd)
+
         try:
             with np.errstate(all="ignore"):
                 found = least_squares(
-                    lambda x: (both(x)[0] - readings) / sd, start, jac=lambda x: both(x)[1] / sd, x_scale="jac",
-                    xtol=1e-6, ftol=1e-7, gtol=1e-7, max_nfev=max_calls,
-                )  # fmt: skip
-                f, slopes = both(found.x)
+                    off,
+                    start,
+                    jac=slopes_of,
+                    x_scale="jac",
+                    xtol=1e-6,
+                    ftol=1e-7,
+                    gtol=1e-7,
+                    max_nfev=max_calls,
+                )
+                f, slopes = both(np.asarray(found.x))
         except (ValueError, np.linalg.LinAlgError) as error:
             raise NotConvergedError(f"a fit of the {self.kind.name} left the finite numbers") from error
         return Fitted(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))

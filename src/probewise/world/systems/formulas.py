@@ -48,7 +48,11 @@ def simulate(p, data):
         p["scale"] * u["bath_c"] * (1 - np.exp(-u["t_s"] / p["tau_s"])) + p["start_c"] * np.exp(-u["t_s"] / p["tau_s"])
     ),
     time_anew=True,
-    logged=(Logged("room_c", 21.5, 0.8, 0.03, 2, 4.0), Logged("stir_rpm", 300, 15, 3, 0), Logged("rh_pct", 45, 3, 0.3, 1)),
+    logged=(
+        Logged("room_c", 21.5, 0.8, 0.03, 2, 4.0),
+        Logged("stir_rpm", 300, 15, 3, 0),
+        Logged("rh_pct", 45, 3, 0.3, 1),
+    ),
     n_runs=5,
 )
 
@@ -118,14 +122,20 @@ def simulate(p, data):
 """,
     priors={"dark_mv": Prior("normal", 0, 5), "power": Prior("log", 1e4, 1e7), "behind_mm": Prior("uniform", 0, 30)},
     draw=lambda rng: {
-        "dark_mv": float(rng.normal(0, 2)), "power": float(rng.uniform(2e5, 5e5)), "behind_mm": float(rng.uniform(8, 20)),
+        "dark_mv": float(rng.normal(0, 2)),
+        "power": float(rng.uniform(2e5, 5e5)),
+        "behind_mm": float(rng.uniform(8, 20)),
     },
     lay=_lay_photodiode,
     decimals={"dist_mm": 2},
     drives=("dist_mm",),
     sd=0.4,
     formula=lambda p, u: p["dark_mv"] + p["power"] / (u["dist_mm"] + p["behind_mm"]) ** 2,
-    logged=(Logged("board_c", 27, 1.5, 0.05, 2, 6.0), Logged("rail_v", 5.0, 0.01, 0.002, 4), Logged("rh_pct", 42, 3, 0.3, 1)),
+    logged=(
+        Logged("board_c", 27, 1.5, 0.05, 2, 6.0),
+        Logged("rail_v", 5.0, 0.01, 0.002, 4),
+        Logged("rh_pct", 42, 3, 0.3, 1),
+    ),
     n_runs=5,
     reading_decimals=3,
 )
@@ -133,7 +143,9 @@ def simulate(p, data):
 
 def _lay_flow(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     most = 12.0 * regime
-    return irregular(rng, n, 6.0), {"flow_lpm": blocks(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)}
+    return irregular(rng, n, 6.0), {
+        "flow_lpm": blocks(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
+    }
 
 
 FLOW = Kind(
@@ -158,7 +170,11 @@ def simulate(p, data):
     drives=("flow_lpm",),
     sd=0.03,
     formula=lambda p, u: p["zero_kpa"] + p["k"] * u["flow_lpm"] ** 2,
-    logged=(Logged("water_c", 18, 1.5, 0.05, 2, 8.0), Logged("pump_v", 24, 0.1, 0.02, 3), Logged("baro_hpa", 1009, 2, 0.1, 1)),
+    logged=(
+        Logged("water_c", 18, 1.5, 0.05, 2, 8.0),
+        Logged("pump_v", 24, 0.1, 0.02, 3),
+        Logged("baro_hpa", 1009, 2, 0.1, 1),
+    ),
     n_runs=4,
 )
 
@@ -190,7 +206,11 @@ def simulate(p, data):
     drives=("nm",),
     sd=0.01,
     formula=lambda p, u: p["radius_mm"] / (2 * (1.504 + p["b_um2"] / (u["nm"] / 1000) ** 2 - 1)),
-    logged=(Logged("glass_c", 22, 1.2, 0.03, 2, 7.0), Logged("lamp_w", 40, 0.3, 0.05, 2), Logged("baro_hpa", 1015, 2, 0.1, 1)),
+    logged=(
+        Logged("glass_c", 22, 1.2, 0.03, 2, 7.0),
+        Logged("lamp_w", 40, 0.3, 0.05, 2),
+        Logged("baro_hpa", 1015, 2, 0.1, 1),
+    ),
     n_runs=3,
 )
 

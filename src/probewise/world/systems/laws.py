@@ -56,7 +56,11 @@ def simulate(p, data):
         lambda s, p, u: {"level": (p["cm_per_v"] * u["valve_v"] - s["level"]) / p["tau_s"]},
         lambda s, p, u: s["level"],
     ),
-    logged=(Logged("water_c", 16, 1.0, 0.04, 2, 6.0), Logged("hall_c", 20, 0.8, 0.04, 2), Logged("supply_v", 12, 0.05, 0.01, 3)),
+    logged=(
+        Logged("water_c", 16, 1.0, 0.04, 2, 6.0),
+        Logged("hall_c", 20, 0.8, 0.04, 2),
+        Logged("supply_v", 12, 0.05, 0.01, 3),
+    ),
     n_runs=4,
     tells_states=False,
 )
@@ -79,14 +83,21 @@ parameters = {"gain": ("normal", 1.0, 0.1), "tau1_s": ("log", 0.0005, 0.1), "tau
 states = {"first": 0.0, "second": 0.0}
 
 def rates(s, p, u):
-    return {"first": (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"], "second": (s["first"] - s["second"]) / p["tau2_s"]}
+    charging = (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"]
+    return {"first": charging, "second": (s["first"] - s["second"]) / p["tau2_s"]}
 
 def observe(s, p, u):
     return s["second"]
 """,
-    priors={"gain": Prior("normal", 1.0, 0.1), "tau1_s": Prior("log", 0.0005, 0.1), "tau2_s": Prior("log", 0.0005, 0.1)},
+    priors={
+        "gain": Prior("normal", 1.0, 0.1),
+        "tau1_s": Prior("log", 0.0005, 0.1),
+        "tau2_s": Prior("log", 0.0005, 0.1),
+    },
     draw=lambda rng: {
-        "gain": float(rng.normal(1.0, 0.03)), "tau1_s": float(rng.uniform(0.003, 0.006)), "tau2_s": float(rng.uniform(0.010, 0.018)),
+        "gain": float(rng.normal(1.0, 0.03)),
+        "tau1_s": float(rng.uniform(0.003, 0.006)),
+        "tau2_s": float(rng.uniform(0.010, 0.018)),
     },
     lay=_lay_filter,
     decimals={"t_s": 6, "in_v": 3},
@@ -95,7 +106,8 @@ def observe(s, p, u):
     law=Law(
         {"first": 0.0, "second": 0.0},
         lambda s, p, u: {
-            "first": (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"], "second": (s["first"] - s["second"]) / p["tau2_s"],
+            "first": (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"],
+            "second": (s["first"] - s["second"]) / p["tau2_s"],
         },
         lambda s, p, u: s["second"],
     ),
@@ -179,7 +191,11 @@ def rates(s, p, u):
         lambda s, p, u: {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]},
         lambda s, p, u: s["angle"],
     ),
-    logged=(Logged("case_c", 33, 2.5, 0.05, 2, 10.0), Logged("bus_v", 9.0, 0.05, 0.01, 3), Logged("load_g", 120, 6, 0.5, 1)),
+    logged=(
+        Logged("case_c", 33, 2.5, 0.05, 2, 10.0),
+        Logged("bus_v", 9.0, 0.05, 0.01, 3),
+        Logged("load_g", 120, 6, 0.5, 1),
+    ),
     n_runs=5,
     reading_decimals=3,
 )
@@ -209,7 +225,11 @@ def rates(s, p, u):
 def observe(s, p, u):
     return s["b"]
 """,
-    priors={"k1_per_s": Prior("log", 0.0005, 0.5), "k2_per_s": Prior("log", 0.0005, 0.5), "dose": Prior("uniform", 0, 3)},
+    priors={
+        "k1_per_s": Prior("log", 0.0005, 0.5),
+        "k2_per_s": Prior("log", 0.0005, 0.5),
+        "dose": Prior("uniform", 0, 3),
+    },
     per_run=("dose",),
     draw=lambda rng: {"k1_per_s": float(rng.uniform(0.018, 0.03)), "k2_per_s": float(rng.uniform(0.004, 0.008))},
     draw_run=lambda rng: {"dose": float(rng.uniform(0.7, 2.0))},
@@ -223,7 +243,11 @@ def observe(s, p, u):
         lambda s, p, u: s["b"],
     ),
     time_anew=True,
-    logged=(Logged("jacket_c", 30, 0.7, 0.04, 2, 4.0), Logged("stir_rpm", 500, 12, 4, 0), Logged("lamp_a", 0.8, 0.01, 0.001, 4)),
+    logged=(
+        Logged("jacket_c", 30, 0.7, 0.04, 2, 4.0),
+        Logged("stir_rpm", 500, 12, 4, 0),
+        Logged("lamp_a", 0.8, 0.01, 0.001, 4),
+    ),
     n_runs=5,
     reading_decimals=5,
 )
@@ -249,11 +273,14 @@ states = {"prey": 20.0, "hunters": 5.0}
 
 def rates(s, p, u):
     caught = p["eat"] * s["prey"] * s["hunters"]
-    return {"prey": p["grow_per_d"] * u["feed"] * s["prey"] - caught, "hunters": 0.3 * caught - p["die_per_d"] * s["hunters"]}
+    born = p["grow_per_d"] * u["feed"] * s["prey"]
+    return {"prey": born - caught, "hunters": 0.3 * caught - p["die_per_d"] * s["hunters"]}
 """,
     priors={"grow_per_d": Prior("log", 0.05, 5), "eat": Prior("log", 0.005, 0.5), "die_per_d": Prior("log", 0.05, 5)},
     draw=lambda rng: {
-        "grow_per_d": float(rng.uniform(0.5, 0.9)), "eat": float(rng.uniform(0.06, 0.1)), "die_per_d": float(rng.uniform(0.4, 0.7)),
+        "grow_per_d": float(rng.uniform(0.5, 0.9)),
+        "eat": float(rng.uniform(0.06, 0.1)),
+        "die_per_d": float(rng.uniform(0.4, 0.7)),
     },
     lay=_lay_predator,
     decimals={"t_d": 3, "feed": 2},
@@ -267,7 +294,11 @@ def rates(s, p, u):
         },
         lambda s, p, u: s["prey"],
     ),
-    logged=(Logged("room_c", 21, 0.8, 0.04, 2, 5.0), Logged("oxygen_mg_l", 7.5, 0.3, 0.05, 2), Logged("light_lx", 400, 15, 4, 0)),
+    logged=(
+        Logged("room_c", 21, 0.8, 0.04, 2, 5.0),
+        Logged("oxygen_mg_l", 7.5, 0.3, 0.05, 2),
+        Logged("light_lx", 400, 15, 4, 0),
+    ),
     n_runs=4,
     reading_decimals=3,
 )

@@ -1,4 +1,4 @@
-"""How runs are laid out: irregular sampling, sweeps, steps and swings of what drives a system, columns that do nothing."""
+"""How runs are laid out: irregular sampling, sweeps, steps and swings, columns that do nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PAUSE = 0.15  # between runs, of the first run's length
 
 
 def irregular(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
-    """Times from 0 whose gaps lie between 0.6 and 1.4 of `gap`, (n,)."""
+    """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `gap`, (n,)."""
     return np.concatenate([[0.0], np.cumsum(gap * rng.uniform(0.6, 1.4, n - 1))])
 
 
@@ -28,7 +28,7 @@ def blocks(rng: np.random.Generator, n: int, levels: FloatArray, length: int) ->
 
 
 def swings(rng: np.random.Generator, t: FloatArray, size: float, fastest: float) -> FloatArray:
-    """A sum of four sinusoids of random frequency up to `fastest`, rms `size`, (n,)."""
+    """Add up four sinusoids of random frequency up to `fastest`, rms `size`, (n,)."""
     hz = fastest * rng.uniform(0.1, 1.0, 4)
     waves = np.sin(2 * np.pi * hz[:, None] * t + rng.uniform(0, 2 * np.pi, 4)[:, None])
     return np.asarray(size * waves.sum(axis=0) / np.sqrt(2.0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,8 @@ class _Trip:
         here, there = self.places[k, runs], self.places[k + 1, runs]
         first = self.places[0, runs]
         law, time = self.kind.law, self.rows.time
-        assert law is not None and time is not None
+        assert law is not None
+        assert time is not None
         t, printed = self.columns[time], self.rows.t
         ends = {}
         for name in self.needed:
@@ -184,7 +186,7 @@ class _Trip:
         return self._at_rows(names, kept)
 
     def _through_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
-        """Go from place k of all runs to the next, (n_states, n_samples, n_runs); friction and bounds as they are at its start."""
+        """Go from place k of all runs to the next, (n_states, n_samples, n_runs), by the modes at its start."""
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
@@ -196,7 +198,7 @@ class _Trip:
 
         edges, begun = self.breaks(k), s
         again = np.zeros(s.shape[1:], dtype=bool)
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in pairwise(edges):
             # A hair inside: what jumps at an end belongs to the other side of it.
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
@@ -209,16 +211,26 @@ class _Trip:
                 nonlocal n_calls
                 n_calls += 1
                 if n_calls > _MOST_CALLS:
-                    raise NotConvergedError(f"the law of the {self.kind.name} runs away, or is too stiff, between two rows")
+                    raise NotConvergedError(
+                        f"the law of the {self.kind.name} runs away, or is too stiff, between two rows"
+                    )
                 found = free(share, flat.reshape(shape))
                 for (form, size), mode in zip(hard, modes, strict=True):
-                    found[form.target] = np.where(mode == 0, 0.0, found[form.target] - (size * mode if form.sticks else 0.0))
+                    found[form.target] = np.where(
+                        mode == 0, 0.0, found[form.target] - (size * mode if form.sticks else 0.0)
+                    )
                 return np.stack([np.broadcast_to(found[name] * gap, shape[1:]) for name in names]).ravel()
 
             solved = solve_ivp(
-                slope, (begin, end), s.ravel(), method="DOP853", rtol=_RTOL, atol=_ATOL, first_step=end - begin,
+                slope,
+                (begin, end),
+                s.ravel(),
+                method="DOP853",
+                rtol=_RTOL,
+                atol=_ATOL,
+                first_step=end - begin,
                 t_eval=np.minimum(begin + (end - begin) * _LOOKS, end) if hard else None,
-            )  # fmt: skip
+            )
             if not solved.success:
                 raise NotConvergedError(f"the law of the {self.kind.name} cannot be solved: {solved.message}")
             for x, y in zip(solved.t, solved.y.T, strict=True) if hard else ():
@@ -281,29 +293,38 @@ class _Trip:
             return {name: float(np.ravel(v)[0]) for name, v in found.items()}
 
         edges = self.breaks(k)
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
+        for low, high in pairwise(edges):
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):
                 rates = free(share, s)
                 modes = [
-                    forced.get(m, int(_mode(f, size, s[names.index(f.target)], rates[f.target]))) for m, (f, size) in enumerate(hard)
+                    forced.get(m, int(_mode(f, size, s[names.index(f.target)], rates[f.target])))
+                    for m, (f, size) in enumerate(hard)
                 ]
 
                 def slope(x: float, y: FloatArray, modes: Any = modes) -> FloatArray:
                     found = free(x, y)
                     for (form, size), mode in zip(hard, modes, strict=True):
-                        found[form.target] = 0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
+                        found[form.target] = (
+                            0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
+                        )
                     return gap * np.array([found[name] for name in names])
 
                 solved = solve_ivp(
-                    slope, (share, high), s, method="DOP853", rtol=_RTOL, atol=_ATOL, first_step=high - share,
+                    slope,
+                    (share, high),
+                    s,
+                    method="DOP853",
+                    rtol=_RTOL,
+                    atol=_ATOL,
+                    first_step=high - share,
                     events=[_event(f, size, mode, names, free) for (f, size), mode in zip(hard, modes, strict=True)],
-                )  # fmt: skip
+                )
                 s, share = solved.y[:, -1].copy(), float(solved.t[-1])
                 if solved.status != 1 or share >= high:
                     break
                 forced = {}
-                for m, ((f, size), found, mode) in enumerate(zip(hard, solved.t_events, modes, strict=True)):
+                for m, ((f, size), found, mode) in enumerate(zip(hard, solved.t_events or [], modes, strict=True)):
                     if found.size and mode != 0:  # at rest, or at the bound
                         s[names.index(f.target)] = 0.0 if f.sticks else size
                     elif found.size:  # breaks loose

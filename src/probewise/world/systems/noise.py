@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import brentq
@@ -14,8 +15,17 @@ from probewise.world.systems.rows import SystemRows
 
 __all__ = ["OTHER_NOISE", "SystemNoise", "noise_of"]
 
-OTHER_NOISE = ("correlated_noise", "outliers", "signal_dependent_noise", "t4", "random_walk", "quantised", "noise_per_run", "dropouts")
-"""Kinds of noise that a clean recording may have beside white noise; "t4" and "quantised" are no names of the vocabulary."""
+OTHER_NOISE = (
+    "correlated_noise",
+    "outliers",
+    "signal_dependent_noise",
+    "t4",
+    "random_walk",
+    "quantised",
+    "noise_per_run",
+    "dropouts",
+)
+"""Kinds of noise that a clean recording may have beside white noise; "t4" and "quantised" are no names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +53,9 @@ class SystemNoise:
     step: float | None = None
 
 
-def noise_of(name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator) -> SystemNoise:
+def noise_of(
+    name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator
+) -> SystemNoise:
     """Choose the strength of a noise such that it is as plain as an effect of size `wanted`."""
     whole = rows.n_runs
     match name:
@@ -56,43 +68,58 @@ def noise_of(name: str, wanted: float, readings: FloatArray, rows: SystemRows, s
         case "random_walk":
             q = _solved(lambda a: _of_covariance(np.eye(len(rows)) + a**2 * _walk(len(rows))), wanted, 1e-4, 1.0)
             return SystemNoise(
-                name, lambda y, rows, rng: y + sd * (rng.standard_normal(len(y)) + q * np.cumsum(rng.standard_normal(len(y)))),
-                {"sd_per_row": q * sd}, wanted,
-            )  # fmt: skip
+                name,
+                lambda y, rows, rng: (
+                    y + sd * (rng.standard_normal(len(y)) + q * np.cumsum(rng.standard_normal(len(y))))
+                ),
+                {"sd_per_row": q * sd},
+                wanted,
+            )
         case "signal_dependent_noise":
             share = (readings - readings.min()) / np.ptp(readings)
             low, span = float(readings.min()), float(np.ptp(readings))
             ratio = _solved(lambda a: _of_variances(1 + a * share), wanted, 1e-3, 1e4)
             return SystemNoise(
                 name,
-                lambda y, rows, rng: y + sd * np.sqrt(1 + ratio * np.clip((y - low) / span, 0, None)) * rng.standard_normal(len(y)),
-                {"ratio": ratio}, wanted,
-            )  # fmt: skip
+                lambda y, rows, rng: (
+                    y + sd * np.sqrt(1 + ratio * np.clip((y - low) / span, 0, None)) * rng.standard_normal(len(y))
+                ),
+                {"ratio": ratio},
+                wanted,
+            )
         case "noise_per_run":
             logs = rng.standard_normal(whole)
             power = _solved(lambda a: _of_variances(np.exp(2 * a * logs)[rows.run]), wanted, 1e-2, 3.0)
             own = np.exp(power * logs)
             return SystemNoise(
-                name, lambda y, rows, rng: y + sd * own[rows.run] * rng.standard_normal(len(y)), {"values": (sd * own).tolist()}, wanted
+                name,
+                lambda y, rows, rng: y + sd * own[rows.run] * rng.standard_normal(len(y)),
+                {"values": (sd * own).tolist()},
+                wanted,
             )
         case "outliers":
-            return SystemNoise(name, lambda y, rows, rng: y + sd * _outlying(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0})
+            return SystemNoise(
+                name, lambda y, rows, rng: y + sd * _outlying(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0}
+            )
         case "dropouts":
             return SystemNoise(
-                name, lambda y, rows, rng: np.where(rng.random(len(y)) < 0.02, 0.0, y + sd * rng.standard_normal(len(y))),
+                name,
+                lambda y, rows, rng: np.where(rng.random(len(y)) < 0.02, 0.0, y + sd * rng.standard_normal(len(y))),
                 {"share": 0.02, "value": 0.0},
-            )  # fmt: skip
+            )
         case "t4":  # its scale is the sd of the normal that its middle looks like
             return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_t(4.0, len(y)), {"freedom": 4.0})
         case _:
             step = _round_number(2.0 * sd)
-            return SystemNoise("quantised", lambda y, rows, rng: y + sd * rng.standard_normal(len(y)), {"step": step}, step=step)
+            return SystemNoise(
+                "quantised", lambda y, rows, rng: y + sd * rng.standard_normal(len(y)), {"step": step}, step=step
+            )
 
 
 def _ar1(rows: SystemRows, rho: float, rng: np.random.Generator) -> FloatArray:
     own = rng.standard_normal(len(rows))
     for run in rows.by_run:
-        for before, row in zip(run[:-1], run[1:], strict=True):
+        for before, row in pairwise(run):
             own[row] = rho * own[before] + math.sqrt(1 - rho**2) * own[row]
     return own
 
@@ -114,7 +141,9 @@ def _of_variances(variances: FloatArray) -> float:
 
 def _of_covariance(covariance: FloatArray) -> float:
     n = len(covariance)
-    keep = np.linalg.qr(np.concatenate([np.ones((n, 1)), np.eye(n)[:, :-1]], axis=1))[0][:, 1:]  # a constant is no noise
+    keep = np.linalg.qr(np.concatenate([np.ones((n, 1)), np.eye(n)[:, :-1]], axis=1))[0][
+        :, 1:
+    ]  # a constant is no noise
     own = keep.T @ covariance @ keep
     values = np.linalg.eigvalsh(own)
     return _of_variances(np.maximum(values, 1e-12))

@@ -15,7 +15,7 @@ __all__ = ["right_predictions"]
 def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
     """Predict the rows kept back by posterior samples of the right model, (n_samples, n_rows).
 
-    Samples are of the Gaussian about the least-squares fit; what is a run's own, in runs not seen, is drawn from its prior.
+    Samples are of the Gaussian about the least-squares fit; what is a run's own is drawn from its prior.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     beside = [Beside(e.form, e.values, free_numbers(e.form)) for e in case.effects]
     model = Model(kind, drawn.seen, beside)
     fitted = model.fit(case.readings[drawn.kept], model.coordinates(drawn.shared, drawn.by_run))
-    u, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
+    _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
     x = fitted.at + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
     later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
@@ -34,16 +34,17 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     n_shared = len(kind.shared)
     n_runs = len(later.by_run)
     own = [
-        np.stack([kind.priors[name].coordinate(kind.priors[name].spread(n_samples, rng=rng)) for _ in range(n_runs)], axis=1)
+        np.stack(
+            [kind.priors[name].coordinate(kind.priors[name].spread(n_samples, rng=rng)) for _ in range(n_runs)], axis=1
+        )
         for name in kind.per_run
     ]
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
     there = np.concatenate(parts, axis=1)
-    effects = ahead.effects(there)
-    for (form, numbers), b in zip(effects, beside, strict=True):
-        for name in numbers:
-            if name.startswith("values[") and name not in b.free:
-                numbers[name] = np.zeros((1, 1))  # a run that was not seen is taken as the others' middle
-        del form
+    # A run that was not seen is taken as the others' middle.
+    effects = [
+        (form, {k: np.zeros((1, 1)) if k.startswith("values[") and k not in b.free else v for k, v in numbers.items()})
+        for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
+    ]
     with np.errstate(all="ignore"):
         return simulate(kind, later, ahead.parameters(there), effects).readings

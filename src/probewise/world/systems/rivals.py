@@ -1,4 +1,4 @@
-"""What else would explain the same: forms that, refitted together with the system, come within a few nats of noise-free readings.
+"""What else would explain the same: forms that, fitted together with the system, come within a few nats of it.
 
 First on straight lines, for every form at once; then by a fit in full of those that come near.
 """
@@ -76,10 +76,19 @@ def rivals_of(
         if hard:  # fits beside dry friction or a bound take minutes: straight lines have to do
             found[name] = min(candidate.nats, found.get(name, np.inf))
             continue
-        wider = Model(scene.kind, scene.rows, [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))])
+        wider = Model(
+            scene.kind,
+            scene.rows,
+            [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))],
+        )
         own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
         try:
-            nats = 0.5 * wider.fit(target, np.concatenate([fitted.at, own]), max_calls=5 if _is_hard(candidate.form) else 7).squares
+            nats = (
+                0.5
+                * wider.fit(
+                    target, np.concatenate([fitted.at, own]), max_calls=5 if _is_hard(candidate.form) else 7
+                ).squares
+            )
         except NotConvergedError:
             continue
         found[name] = min(nats, found.get(name, np.inf))
@@ -106,7 +115,7 @@ def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fit
             rest = left - columns @ amounts
             nats = 0.5 * float(rest @ rest)
             if nats < _NEAR or 1 - 2 * nats / size > _COSINE**2:
-                own.append(_Candidate(form, form.join(group, amounts), nats))
+                own.append(_Candidate(form, form.join(group, np.asarray(amounts, dtype=np.float64)), nats))
         out += sorted(own, key=lambda c: c.nats)[:2]
     return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
 
@@ -124,7 +133,10 @@ def templates_of(scene: Scene, forms: Sequence[Form], fitted: Fitted, model: Mod
         for form in forms:
             if form.side == "reading":
                 numbers = as_numbers(settings[form])
-                out[form] = read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)]) - fitted.readings
+                out[form] = (
+                    read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)])
+                    - fitted.readings
+                )
         alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or scene.kind.law is None)]
         for form in alone:
             found = _simulated(scene, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))

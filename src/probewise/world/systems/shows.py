@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.world.systems.forms.form import Form
 from probewise.world.systems.forms.scene import Scene
 
@@ -16,7 +16,7 @@ _PLAIN = 0.25  # of all squares: below it nothing shows
 
 
 def covariates_of(form: Form, left: FloatArray, scene: Scene) -> tuple[str, ...]:
-    """Name the covariates that a right answer may put first: the form's own, and what shows the noise-free residual as well.
+    """Name the covariates that a right answer may put first: its form's own, and what shows it as well.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def _binned(values: FloatArray) -> FloatArray:
     return np.asarray(np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
 
 
-def _share(left: FloatArray, groups: FloatArray) -> float:
+def _share(left: FloatArray, groups: FloatArray | IntArray) -> float:
     """Share of the squares that means of groups explain, less what they would of noise."""
     total, explained, n_groups = float(left @ left), 0.0, 0
     for group in np.unique(groups):

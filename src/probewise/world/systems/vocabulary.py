@@ -11,11 +11,42 @@ from probewise.world.systems.forms.scene import Scene
 __all__ = ["FAMILIES", "forms_of"]
 
 FAMILIES = (
-    "offset_drift", "offset_step", "offset_per_run", "gain_drift", "gain_step", "gain_per_run", "nonlinearity", "saturation",
-    "hysteresis", "lag", "delay", "settling", "interference", "sensitivity", "input_offset", "input_gain", "input_delay",
-    "input_saturation", "dead_zone", "periodic_error", "backlash", "clock_drift", "drifts", "steps", "differs", "depends",
-    "damping", "drag", "friction", "forcing", "periodic_forcing", "cubic", "quadratic", "coupling", "limit",
-)  # fmt: skip
+    "offset_drift",
+    "offset_step",
+    "offset_per_run",
+    "gain_drift",
+    "gain_step",
+    "gain_per_run",
+    "nonlinearity",
+    "saturation",
+    "hysteresis",
+    "lag",
+    "delay",
+    "settling",
+    "interference",
+    "sensitivity",
+    "input_offset",
+    "input_gain",
+    "input_delay",
+    "input_saturation",
+    "dead_zone",
+    "periodic_error",
+    "backlash",
+    "clock_drift",
+    "drifts",
+    "steps",
+    "differs",
+    "depends",
+    "damping",
+    "drag",
+    "friction",
+    "forcing",
+    "periodic_forcing",
+    "cubic",
+    "quadratic",
+    "coupling",
+    "limit",
+)
 """Names before their targets."""
 
 

@@ -1,4 +1,4 @@
-"""What may be wrong with what drives a system: offset, gain, ceiling, dead zone, play, waves, dead time; and its clock."""
+"""What may be wrong with what drives a system: offset, gain, ceiling, dead zone, play, waves, delay; its clock."""
 
 from __future__ import annotations
 
@@ -35,20 +35,39 @@ def _on(column: str, change: Change) -> Callable[[Mapping[str, FloatArray], Syst
 
 def _linear(name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]) -> Form:
     return Form(
-        name, "input", _on(column, change), lambda a, drawn: {"a": a}, lambda rng: {}, [[{"a": first}]], one_by_one,
-        {"a": first}, first, limit, covariates, uses=(),
-    )  # fmt: skip
+        name,
+        "input",
+        _on(column, change),
+        lambda a, drawn: {"a": a},
+        lambda rng: {},
+        [[{"a": first}]],
+        one_by_one,
+        {"a": first},
+        first,
+        limit,
+        covariates,
+        uses=(),
+    )
 
 
 def _sized(
     name: str, number: str, change: Change, column: str, tried: FloatArray, covariates: tuple[str, ...], late: str = ""
 ) -> Form:
     return Form(
-        name, "input", _on(column, change), lambda a, drawn: {number: a}, lambda rng: {},
-        [[{number: float(size)}] for size in tried], lambda group, amounts: dict(group[0]),
-        {number: 0.02 * float(tried[len(tried) // 2])}, float(tried[len(tried) // 2]), float(tried[-1]), covariates,
-        signed=False, late=late,
-    )  # fmt: skip
+        name,
+        "input",
+        _on(column, change),
+        lambda a, drawn: {number: a},
+        lambda rng: {},
+        [[{number: float(size)}] for size in tried],
+        lambda group, amounts: dict(group[0]),
+        {number: 0.02 * float(tried[len(tried) // 2])},
+        float(tried[len(tried) // 2]),
+        float(tried[-1]),
+        covariates,
+        signed=False,
+        late=late,
+    )
 
 
 def _of_column(scene: Scene, column: str) -> Iterator[Form]:
@@ -59,14 +78,29 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
     yield _linear(f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own)
     levels = high - span * np.geomspace(0.004, 0.5, 12)
     yield Form(
-        f"input_saturation:{column}", "input", _on(column, lambda c, rows, v: np.minimum(c, v["level"])),
-        lambda a, drawn: {"level": high - a}, lambda rng: {}, [[{"level": float(level)}] for level in levels],
-        lambda group, amounts: dict(group[0]), {"level": 0.01 * span}, 0.05 * span, 0.6 * span, own, signed=False,
-    )  # fmt: skip
+        f"input_saturation:{column}",
+        "input",
+        _on(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        lambda a, drawn: {"level": high - a},
+        lambda rng: {},
+        [[{"level": float(level)}] for level in levels],
+        lambda group, amounts: dict(group[0]),
+        {"level": 0.01 * span},
+        0.05 * span,
+        0.6 * span,
+        own,
+        signed=False,
+    )
     sizes = span * np.geomspace(1e-4, 0.3, 10)
     if low <= 0.1 * span:
-        yield _sized(f"dead_zone:{column}", "width", lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
-                     column, sizes, own)  # fmt: skip
+        yield _sized(
+            f"dead_zone:{column}",
+            "width",
+            lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
+            column,
+            sizes,
+            own,
+        )
     moves = np.concatenate([np.diff(values[rows]) for rows in scene.rows.by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield _sized(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
@@ -77,20 +111,41 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
             return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
         first = 0.01 * spread
-        bank = [[{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")]
+        bank = [
+            [{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")
+        ]
         yield Form(
-            f"periodic_error:{column}", "input", _on(column, wavy), lambda a, drawn: {"a": a, **drawn},
-            lambda rng: {"period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)), "phase": float(rng.uniform(0, 2 * np.pi))},
-            bank, wave_joined, {"a": first, "period": 0.002 * span, "phase": 0.05}, first, 0.2 * span, own, signed=False,
-        )  # fmt: skip
+            f"periodic_error:{column}",
+            "input",
+            _on(column, wavy),
+            lambda a, drawn: {"a": a, **drawn},
+            lambda rng: {
+                "period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
+                "phase": float(rng.uniform(0, 2 * np.pi)),
+            },
+            bank,
+            wave_joined,
+            {"a": first, "period": 0.002 * span, "phase": 0.05},
+            first,
+            0.2 * span,
+            own,
+            signed=False,
+        )
     if scene.rows.time is not None:
         taus = scene.rows.gap * np.geomspace(0.05, 6, 12 if scene.kind.law is None else 5)
-        yield _sized(f"input_delay:{column}", "tau_s", lambda c, rows, v: earlier(c, rows, np.maximum(v["tau_s"], 0.0)), column, taus,
-                     ("previous", column), late=column)  # fmt: skip
+        yield _sized(
+            f"input_delay:{column}",
+            "tau_s",
+            lambda c, rows, v: earlier(c, rows, np.maximum(v["tau_s"], 0.0)),
+            column,
+            taus,
+            ("previous", column),
+            late=column,
+        )
 
 
 def play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-    """Follow a column with play: nothing moves until it is taken up; a run begins as if it had come the way it goes on."""
+    """Follow a column with play: nothing moves until it is taken up; a run came the way it goes on."""
     half = 0.5 * np.maximum(v["width"][:, 0], 0.0)
     out = np.empty((max(len(c), len(half)), c.shape[1]))
     for own in rows.by_run:

@@ -39,22 +39,54 @@ def varying(scene: Scene, name: str, target: str, how: Modulation) -> Form:
     """Bind a modulation to a parameter."""
     first = 0.003 * float(np.abs(scene.parameters[target]).mean()) / how.reach
     return Form(
-        name, "parameter", how.over, how.sized, how.draw, how.bank(0.1 * first), how.join, how.steps(first), first, 200 * first,
-        how.covariates, target=target, uses=how.uses, breaks=how.breaks,
-    )  # fmt: skip
+        name,
+        "parameter",
+        how.over,
+        how.sized,
+        how.draw,
+        how.bank(0.1 * first),
+        how.join,
+        how.steps(first),
+        first,
+        200 * first,
+        how.covariates,
+        target=target,
+        uses=how.uses,
+        breaks=how.breaks,
+    )
 
 
 def pushing(
-    scene: Scene, name: str, state: str, push: Callable[[Any, Any, Any], Any], size: float, covariates: tuple[str, ...],
-    uses: tuple[str, ...] = (), draw: Callable[[np.random.Generator], dict[str, float]] = lambda rng: {}, shape: str = "",
+    scene: Scene,
+    name: str,
+    state: str,
+    push: Callable[[Any, Any, Any], Any],
+    size: float,
+    covariates: tuple[str, ...],
+    uses: tuple[str, ...] = (),
+    draw: Callable[[np.random.Generator], dict[str, float]] = lambda rng: {},
+    shape: str = "",
     signed: bool = True,
-) -> Form:  # fmt: skip
+) -> Form:
     """Bind a term a push(states, now, numbers) to the rate of a state; `size` is how large the push is."""
     first = 0.01 * scene.speed(state) / size
     return Form(
-        name, "rate", lambda s, now, v: v["a"] * push(s, now, v), lambda a, drawn: {"a": a, **drawn}, draw, [[{"a": 0.1 * first}]], one_by_one,
-        {"a": first}, first, 300 * first, covariates, target=state, uses=uses, shape=shape, signed=signed,
-    )  # fmt: skip
+        name,
+        "rate",
+        lambda s, now, v: v["a"] * push(s, now, v),
+        lambda a, drawn: {"a": a, **drawn},
+        draw,
+        [[{"a": 0.1 * first}]],
+        one_by_one,
+        {"a": first},
+        first,
+        300 * first,
+        covariates,
+        target=state,
+        uses=uses,
+        shape=shape,
+        signed=signed,
+    )
 
 
 def forms_of_rates(scene: Scene) -> Iterator[Form]:
@@ -64,41 +96,80 @@ def forms_of_rates(scene: Scene) -> Iterator[Form]:
     for state, values in scene.states.items():
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
-        yield pushing(scene, f"damping:{state}", state, lambda s, now, v, r=state: -s[r], size, own, signed=False)
-        yield pushing(scene, f"drag:{state}", state, lambda s, now, v, r=state: -np.abs(s[r]) * s[r], size**2, own, signed=False)
-        yield pushing(scene, f"forcing:{state}", state, lambda s, now, v, r=state: 1.0 + 0.0 * s[r], 1.0, ("time", *own))
+        yield pushing(scene, f"damping:{state}", state, _of(state, lambda r: -r), size, own, signed=False)
+        drags = _of(state, lambda r: -np.abs(r) * r)
+        yield pushing(scene, f"drag:{state}", state, drags, size**2, own, signed=False)
+        yield pushing(scene, f"forcing:{state}", state, _of(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own))
         for other, there in scene.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
-            yield pushing(scene, f"cubic:{state}:{other}", state, lambda s, now, v, r=other: -(s[r] ** 3), most**3, seen)
-            yield pushing(scene, f"quadratic:{state}:{other}", state, lambda s, now, v, r=other: -(s[r] ** 2), most**2, seen)
+            yield pushing(scene, f"cubic:{state}:{other}", state, _of(other, lambda r: -(r**3)), most**3, seen)
+            yield pushing(scene, f"quadratic:{state}:{other}", state, _of(other, lambda r: -(r**2)), most**2, seen)
             if other != state:
-                yield pushing(scene, f"coupling:{state}:{other}", state, lambda s, now, v, r=other: -s[r], most, seen)
+                yield pushing(scene, f"coupling:{state}:{other}", state, _of(other, lambda r: -r), most, seen)
         yield _periodic(scene, state)
         yield from _hard(scene, state)
+
+
+def _of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
+    """Make a push of a term in one state."""
+    return lambda s, now, v: term(s[state])
 
 
 def _periodic(scene: Scene, state: str) -> Form:
     how = modulations.waves(scene, _N_WAVES)
     first = 0.02 * scene.speed(state)
     return Form(
-        f"periodic_forcing:{state}", "rate", lambda s, now, v: how.over(now, v), how.sized, how.draw, how.bank(0.1 * first), how.join,
-        how.steps(first), first, 100 * first, how.covariates, signed=False, target=state,
-    )  # fmt: skip
+        f"periodic_forcing:{state}",
+        "rate",
+        lambda s, now, v: how.over(now, v),
+        how.sized,
+        how.draw,
+        how.bank(0.1 * first),
+        how.join,
+        how.steps(first),
+        first,
+        100 * first,
+        how.covariates,
+        signed=False,
+        target=state,
+    )
 
 
 def _hard(scene: Scene, state: str) -> Iterator[Form]:
     speed, values = scene.speed(state), scene.states[state]
     sizes = speed * np.geomspace(1e-3, 0.3, 4)
     yield Form(
-        f"friction:{state}", "rate", lambda s, now, v: 0.0, lambda a, drawn: {"a": a}, lambda rng: {},
-        [[{"a": float(size)}] for size in sizes], lambda group, amounts: dict(group[0]), {"a": 0.01 * speed}, 0.02 * speed, 2 * speed,
-        (f"state:{state}", "level"), signed=False, target=state, sticks=True,
-    )  # fmt: skip
+        f"friction:{state}",
+        "rate",
+        lambda s, now, v: 0.0,
+        lambda a, drawn: {"a": a},
+        lambda rng: {},
+        [[{"a": float(size)}] for size in sizes],
+        lambda group, amounts: dict(group[0]),
+        {"a": 0.01 * speed},
+        0.02 * speed,
+        2 * speed,
+        (f"state:{state}", "level"),
+        signed=False,
+        target=state,
+        sticks=True,
+    )
     low, high = float(values.min()), float(values.max())
     levels = high - (high - low) * np.array([0.01, 0.04, 0.12, 0.3])
     yield Form(
-        f"limit:{state}", "rate", lambda s, now, v: 0.0, lambda a, drawn: {"level": high - a}, lambda rng: {},
-        [[{"level": float(level)}] for level in levels], lambda group, amounts: dict(group[0]), {"level": 0.01 * (high - low)},
-        0.05 * (high - low), 0.6 * (high - low), (f"state:{state}", "level"), signed=False, target=state, stops=True,
-    )  # fmt: skip
+        f"limit:{state}",
+        "rate",
+        lambda s, now, v: 0.0,
+        lambda a, drawn: {"level": high - a},
+        lambda rng: {},
+        [[{"level": float(level)}] for level in levels],
+        lambda group, amounts: dict(group[0]),
+        {"level": 0.01 * (high - low)},
+        0.05 * (high - low),
+        0.6 * (high - low),
+        (f"state:{state}", "level"),
+        signed=False,
+        target=state,
+        stops=True,
+    )

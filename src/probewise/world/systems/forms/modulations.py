@@ -12,7 +12,18 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Bank, Now, Numbers
 from probewise.world.systems.forms.scene import Scene, log_uniform
 
-__all__ = ["Modulation", "along_time", "by_run", "one_by_one", "settling", "step", "waves", "with_column", "wave_bank", "wave_joined"]
+__all__ = [
+    "Modulation",
+    "along_time",
+    "by_run",
+    "one_by_one",
+    "settling",
+    "step",
+    "wave_bank",
+    "wave_joined",
+    "waves",
+    "with_column",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +52,19 @@ def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[s
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
-def _plain(over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()) -> Modulation:
+def _plain(
+    over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
+) -> Modulation:
     return Modulation(
-        over, lambda a, drawn: {"a": a}, _nothing, lambda a: [[{"a": a}]], one_by_one, lambda a: {"a": a}, covariates, reach, uses
+        over,
+        lambda a, drawn: {"a": a},
+        _nothing,
+        lambda a: [[{"a": a}]],
+        one_by_one,
+        lambda a: {"a": a},
+        covariates,
+        reach,
+        uses,
     )
 
 
@@ -60,7 +81,7 @@ def with_column(scene: Scene, column: str) -> Modulation:
 
 
 def step(scene: Scene) -> Modulation:
-    """A step at a moment; at a row where there is no time."""
+    """Step at a moment; at a row where there is no time."""
     at, timed = ("at_s", True) if scene.rows.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(scene.rows.t), np.linspace(0.02, 0.98, 40))
 
@@ -134,7 +155,7 @@ def waves(scene: Scene, n: int) -> Modulation:
 
 
 def settling(scene: Scene) -> Modulation:
-    """What dies away after the start of each run."""
+    """Let something die away after the start of each run."""
     longest = float(scene.rows.since_start.max())
     taus = np.geomspace(scene.rows.gap, longest, 12)
     return Modulation(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,9 +38,20 @@ def added_to_readings(scene: Scene, name: str, how: Modulation, *, gain: bool = 
     typical = float(np.sqrt(np.mean(scene.readings**2))) if gain else 1.0
     first = scene.sd / typical / how.reach
     return Form(
-        name, "reading", act, how.sized, how.draw, how.bank(first), how.join, how.steps(first), first, 1e4 * first,
-        how.covariates, signed=how.signed, order=GAIN if gain else OFFSET,
-    )  # fmt: skip
+        name,
+        "reading",
+        act,
+        how.sized,
+        how.draw,
+        how.bank(first),
+        how.join,
+        how.steps(first),
+        first,
+        1e4 * first,
+        how.covariates,
+        signed=how.signed,
+        order=GAIN if gain else OFFSET,
+    )
 
 
 def _varying(scene: Scene) -> Iterator[Form]:
@@ -76,9 +88,19 @@ def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
 def _bent(scene: Scene) -> Iterator[Form]:
     low, high, sd = float(scene.readings.min()), float(scene.readings.max()), scene.sd
     yield Form(
-        "hysteresis", "reading", lambda y, rows, v: y + v["a"] * way_of(y, rows), lambda a, drawn: {"a": a}, lambda rng: {},
-        [[{"a": sd}]], modulations.one_by_one, {"a": sd}, sd, 1e3 * sd, ("previous",), order=OFFSET,
-    )  # fmt: skip
+        "hysteresis",
+        "reading",
+        lambda y, rows, v: y + v["a"] * way_of(y, rows),
+        lambda a, drawn: {"a": a},
+        lambda rng: {},
+        [[{"a": sd}]],
+        modulations.one_by_one,
+        {"a": sd},
+        sd,
+        1e3 * sd,
+        ("previous",),
+        order=OFFSET,
+    )
 
     def bend(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         z = (y - low) / (high - low)
@@ -86,21 +108,49 @@ def _bent(scene: Scene) -> Iterator[Form]:
 
     first = sd / (high - low)
     yield Form(
-        "nonlinearity", "reading", bend, lambda a, drawn: {"a": a, **drawn},
+        "nonlinearity",
+        "reading",
+        bend,
+        lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))},
-        [[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)], modulations.one_by_one,
-        {"a": first, "power": 0.05}, first, 0.5, ("level",), order=_BEND, beside={"lo": low, "hi": high},
-    )  # fmt: skip
+        [[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)],
+        modulations.one_by_one,
+        {"a": first, "power": 0.05},
+        first,
+        0.5,
+        ("level",),
+        order=_BEND,
+        beside={"lo": low, "hi": high},
+    )
     for upper in (True, False):
         end, sign = (high, -1.0) if upper else (low, 1.0)
         levels = end + sign * (high - low) * np.geomspace(0.004, 0.5, 14)
         yield Form(
-            "saturation" if upper else "saturation (floor)", "reading",
-            lambda y, rows, v, upper=upper: (np.minimum if upper else np.maximum)(y, v["level"]),
-            lambda a, drawn, end=end, sign=sign: {"level": end + sign * a}, lambda rng: {},
-            [[{"level": float(level)}] for level in levels], lambda group, amounts: dict(group[0]),
-            {"level": 0.01 * (high - low)}, 2 * sd, 0.5 * (high - low), ("level",), signed=False, order=_CEILING,
-        )  # fmt: skip
+            "saturation" if upper else "saturation (floor)",
+            "reading",
+            _ends(upper),
+            _level(end, sign),
+            lambda rng: {},
+            [[{"level": float(level)}] for level in levels],
+            lambda group, amounts: dict(group[0]),
+            {"level": 0.01 * (high - low)},
+            2 * sd,
+            0.5 * (high - low),
+            ("level",),
+            signed=False,
+            order=_CEILING,
+        )
+
+
+def _ends(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
+    """End at a level."""
+    bound = np.minimum if upper else np.maximum
+    return lambda y, rows, v: np.asarray(bound(y, v["level"]))
+
+
+def _level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
+    """Cut off so much."""
+    return lambda a, drawn: {"level": end + sign * a}
 
 
 def earlier(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
@@ -119,7 +169,7 @@ def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     tau = np.maximum(np.broadcast_to(v["tau_s"], (max(len(y), len(v["tau_s"])), 1)), 1e-12)
     out = np.array(np.broadcast_to(y, (len(tau), y.shape[1])))
     for own in rows.by_run:
-        for before, row in zip(own[:-1], own[1:], strict=True):
+        for before, row in pairwise(own):
             stays = np.exp(-(rows.t[row] - rows.t[before]) / tau[:, 0])
             out[:, row] = stays * out[:, before] + (1 - stays) * out[:, row]
     return out
@@ -132,7 +182,17 @@ def _behind(scene: Scene) -> Iterator[Form]:
     acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: earlier(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
     for name, (act, least) in acts.items():
         yield Form(
-            name, "reading", act, lambda a, drawn: {"tau_s": a}, lambda rng: {},
-            [[{"tau_s": float(tau)}] for tau in gap * np.geomspace(least, 12, 10)], lambda group, amounts: dict(group[0]),
-            {"tau_s": 0.02 * gap}, 0.45 * gap, 15 * gap, ("previous",), signed=False, order=_LAG,
-        )  # fmt: skip
+            name,
+            "reading",
+            act,
+            lambda a, drawn: {"tau_s": a},
+            lambda rng: {},
+            [[{"tau_s": float(tau)}] for tau in gap * np.geomspace(least, 12, 10)],
+            lambda group, amounts: dict(group[0]),
+            {"tau_s": 0.02 * gap},
+            0.45 * gap,
+            15 * gap,
+            ("previous",),
+            signed=False,
+            order=_LAG,
+        )

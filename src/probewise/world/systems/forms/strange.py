@@ -18,9 +18,17 @@ from probewise.world.systems.rows import SystemRows
 __all__ = ["STRANGE", "strangers"]
 
 STRANGE = (
-    "product", "square_wave", "switch", "one_sided_spring", "leak", "memory", "two_settlings", "column_times_state", "chirp",
+    "product",
+    "square_wave",
+    "switch",
+    "one_sided_spring",
+    "leak",
+    "memory",
+    "two_settlings",
+    "column_times_state",
+    "chirp",
     "fading_bend",
-)  # fmt: skip
+)
 """What strangers are called before their targets."""
 
 
@@ -44,36 +52,59 @@ def strangers(scene: Scene, rng: np.random.Generator) -> Iterator[Form]:
 
 
 def _added(
-    scene: Scene, name: str, shape: str, over: object, covariates: tuple[str, ...], drawn: dict[str, float] | None = None
+    scene: Scene,
+    name: str,
+    shape: str,
+    over: object,
+    covariates: tuple[str, ...],
+    drawn: dict[str, float] | None = None,
 ) -> Form:
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.asarray(y + v["a"] * over(y, rows, v))  # type: ignore[operator]
 
     sd = scene.sd
     return Form(
-        f"strange_{name}", "reading", act, lambda a, more: {"a": a, **more}, lambda rng: dict(drawn or {}), [[{"a": sd}]], one_by_one,
-        {"a": sd}, sd, 1e4 * sd, covariates, order=OFFSET, shape=shape,
-    )  # fmt: skip
+        f"strange_{name}",
+        "reading",
+        act,
+        lambda a, more: {"a": a, **more},
+        lambda rng: dict(drawn or {}),
+        [[{"a": sd}]],
+        one_by_one,
+        {"a": sd},
+        sd,
+        1e4 * sd,
+        covariates,
+        order=OFFSET,
+        shape=shape,
+    )
 
 
 def _product(scene: Scene, one: str, other: str) -> Form:
     a, b = scene.middle(one), scene.middle(other)
     scale = scene.spread(one) * scene.spread(other)
     return _added(
-        scene, f"product:{one}:{other}", "y + a (C - mean C)(D - mean D) / (sd C sd D)",
-        lambda y, rows, v: (rows.columns[one] - a) * (rows.columns[other] - b) / scale, (one, other, "time", "run"),
-    )  # fmt: skip
+        scene,
+        f"product:{one}:{other}",
+        "y + a (C - mean C)(D - mean D) / (sd C sd D)",
+        lambda y, rows, v: (rows.columns[one] - a) * (rows.columns[other] - b) / scale,
+        (one, other, "time", "run"),
+    )
 
 
 def _switch(scene: Scene, column: str, share: float) -> Form:
     at = float(np.quantile(scene.rows.columns[column], share))
     return _added(
-        scene, f"switch:{column}", "y + a 1(C > c)", lambda y, rows, v: 1.0 * (rows.columns[column] > at), (column, "time", "run")
+        scene,
+        f"switch:{column}",
+        "y + a 1(C > c)",
+        lambda y, rows, v: 1.0 * (rows.columns[column] > at),
+        (column, "time", "run"),
     )
 
 
 def _memory(scene: Scene, column: str) -> Form:
-    """What has been summed up since the start of the run, soft-limited."""
+    """Remember what has been summed up since the start of the run, soft-limited."""
     middle, spread = scene.middle(column), scene.spread(column)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
@@ -82,11 +113,22 @@ def _memory(scene: Scene, column: str) -> Form:
             out[own] = np.tanh(np.cumsum(np.abs(rows.columns[column][own] - middle)) / spread / 12)
         return out
 
-    return _added(scene, f"memory:{column}", "y + a tanh(sum of abs(C - mean C) since the start of the run)", over, ("time", "run", column))
+    return _added(
+        scene,
+        f"memory:{column}",
+        "y + a tanh(sum of abs(C - mean C) since the start of the run)",
+        over,
+        ("time", "run", column),
+    )
 
 
 def _fading(scene: Scene, column: str) -> Form:
-    middle, spread, low, high = scene.middle(column), scene.spread(column), float(scene.readings.min()), float(scene.readings.max())
+    middle, spread, low, high = (
+        scene.middle(column),
+        scene.spread(column),
+        float(scene.readings.min()),
+        float(scene.readings.max()),
+    )
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         z = np.clip((y - low) / (high - low), 0, 1)
@@ -101,7 +143,9 @@ def _square(scene: Scene, rng: np.random.Generator) -> Form:
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)
 
-    return _added(scene, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(scene.rows.time)), {"hz": hz})
+    return _added(
+        scene, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(scene.rows.time)), {"hz": hz}
+    )
 
 
 def _chirp(scene: Scene) -> Form:
@@ -111,7 +155,9 @@ def _chirp(scene: Scene) -> Form:
         z = (rows.t - begin) / (end - begin)
         return np.asarray(np.sin(2 * np.pi * (3 * z + 8 * z**2)))
 
-    return _added(scene, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(scene.rows.time)))
+    return _added(
+        scene, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(scene.rows.time))
+    )
 
 
 def _two_settlings(scene: Scene) -> Form:
@@ -121,16 +167,27 @@ def _two_settlings(scene: Scene) -> Form:
         since = now_at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
-    return _added(scene, "two_settlings", "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))", over, ("time", "run", str(scene.rows.time)))
+    return _added(
+        scene,
+        "two_settlings",
+        "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))",
+        over,
+        ("time", "run", str(scene.rows.time)),
+    )
 
 
 def _spring(scene: Scene, state: str) -> Form:
     at = float(np.quantile(scene.states[state], 0.6))
     size = float(np.ptp(scene.states[state]))
     return pushing(
-        scene, f"strange_one_sided_spring:{state}", state, lambda s, now, v: -np.maximum(s[state] - at, 0.0), size,
-        (f"state:{state}", "level", "time"), shape="-a max(S - s, 0) in the rate of S",
-    )  # fmt: skip
+        scene,
+        f"strange_one_sided_spring:{state}",
+        state,
+        lambda s, now, v: -np.maximum(s[state] - at, 0.0),
+        size,
+        (f"state:{state}", "level", "time"),
+        shape="-a max(S - s, 0) in the rate of S",
+    )
 
 
 def _leak(scene: Scene, state: str) -> Form:
@@ -139,13 +196,26 @@ def _leak(scene: Scene, state: str) -> Form:
     def push(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
         return np.asarray(-np.expm1(np.clip(s[state] / scale, -30, 12)))
 
-    return pushing(scene, f"strange_leak:{state}", state, push, 20.0, (f"state:{state}", "level", "time"), shape="-a (exp(S / s) - 1) in the rate of S")
+    return pushing(
+        scene,
+        f"strange_leak:{state}",
+        state,
+        push,
+        20.0,
+        (f"state:{state}", "level", "time"),
+        shape="-a (exp(S / s) - 1) in the rate of S",
+    )
 
 
 def _driven(scene: Scene, state: str, column: str) -> Form:
     middle, spread, most = scene.middle(column), scene.spread(column), float(np.abs(scene.states[state]).max())
     return pushing(
-        scene, f"strange_column_times_state:{state}:{column}", state,
-        lambda s, now, v: -(now.u[column] - middle) / spread * s[state] ** 2 / most**2, 1.0,
-        (column, f"state:{state}", "time", "run", "level"), uses=(column,), shape="-a (C - mean C) S^2 in the rate of S",
-    )  # fmt: skip
+        scene,
+        f"strange_column_times_state:{state}:{column}",
+        state,
+        lambda s, now, v: -(now.u[column] - middle) / spread * s[state] ** 2 / most**2,
+        1.0,
+        (column, f"state:{state}", "time", "run", "level"),
+        uses=(column,),
+        shape="-a (C - mean C) S^2 in the rate of S",
+    )

@@ -66,7 +66,8 @@ def noise_of(
             rho = math.sqrt(1 - math.exp(-(wanted**2) / pairs))
             return SystemNoise(name, lambda y, rows, rng: y + sd * _ar1(rows, rho, rng), {"rho": rho}, wanted)
         case "random_walk":
-            q = _solved(lambda a: _of_covariance(np.eye(len(rows)) + a**2 * _walk(len(rows))), wanted, 1e-4, 1.0)
+            spectrum = _spectrum_of_walk(len(rows))
+            q = _solved(lambda a: _of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
             return SystemNoise(
                 name,
                 lambda y, rows, rng: (
@@ -128,25 +129,18 @@ def _outlying(n: int, share: float, size: float, rng: np.random.Generator) -> Fl
     return rng.standard_normal(n) + np.where(rng.random(n) < share, size * rng.standard_normal(n), 0.0)
 
 
-def _walk(n: int) -> FloatArray:
+def _spectrum_of_walk(n: int) -> FloatArray:
+    """Variances of a walk of unit steps along its own axes, a constant left out, (n - 1,)."""
     count = np.arange(1.0, n + 1)
-    return np.asarray(np.minimum(count[:, None], count))
+    walk = np.minimum(count[:, None], count)
+    centered = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
+    return np.asarray(np.maximum(np.linalg.eigvalsh(centered)[1:], 0.0))
 
 
 def _of_variances(variances: FloatArray) -> float:
     """Lambda of unequal variances against their mean."""
     n = len(variances)
     return math.sqrt(max(n * math.log(variances.mean()) - float(np.log(variances).sum()), 0.0))
-
-
-def _of_covariance(covariance: FloatArray) -> float:
-    n = len(covariance)
-    keep = np.linalg.qr(np.concatenate([np.ones((n, 1)), np.eye(n)[:, :-1]], axis=1))[0][
-        :, 1:
-    ]  # a constant is no noise
-    own = keep.T @ covariance @ keep
-    values = np.linalg.eigvalsh(own)
-    return _of_variances(np.maximum(values, 1e-12))
 
 
 def _solved(size: Callable[[float], float], wanted: float, low: float, high: float) -> float:

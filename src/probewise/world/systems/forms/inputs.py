@@ -74,6 +74,8 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
     values, spread = scene.rows.columns[column], scene.spread(column)
     low, high = float(values.min()), float(values.max())
     span, own = high - low, (column, "level")
+    if not span > 0:
+        return
     yield _linear(f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own)
     yield _linear(f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own)
     levels = high - span * np.geomspace(0.004, 0.5, 12)

@@ -106,6 +106,8 @@ def _bent(scene: Scene) -> Iterator[Form]:
         z = (y - low) / (high - low)
         return np.asarray(y + v["a"] * (high - low) * (np.sign(z) * np.abs(z) ** v["power"] - z))
 
+    if not high > low:
+        return
     first = sd / (high - low)
     yield Form(
         "nonlinearity",

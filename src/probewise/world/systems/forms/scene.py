@@ -42,8 +42,8 @@ class Scene:
 
     @property
     def logged(self) -> tuple[str, ...]:
-        """Columns that something may depend on: all but the time."""
-        return tuple(name for name in self.rows.columns if name != self.rows.time)
+        """Columns that something may depend on: all that vary, but the time."""
+        return tuple(name for name, v in self.rows.columns.items() if name != self.rows.time and np.ptp(v) > 0)
 
     def middle(self, column: str) -> float:
         """Mean of a column."""

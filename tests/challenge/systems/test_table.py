@@ -1,0 +1,144 @@
+"""The table of a challenge on systems, from results made by hand."""
+
+import pytest
+
+from probewise.challenge.systems import family_of, score_systems
+from probewise.challenge.systems.table import gains_of
+from probewise.report.challenge import write_page
+
+
+def _hidden(name, size=12.0, *, rivals=None, on_the_list=True, shows_in=("time",)):
+    return {
+        "name": name,
+        "size_lambda": size,
+        "on_noise": False,
+        "in_vocabulary": on_the_list,
+        "shows_in": list(shows_in),
+        "cosines": rivals or {},
+        "parameters": {},
+    }
+
+
+def _case(kind="clean", size=0.0, *, truth=(), hides=(), said=None, p=0.97, gains=(40.0, 40.0), **others):
+    said = list(truth) if said is None else list(said)
+    own = {
+        "null": -100.0,
+        "repaired": -100.0 + gains[0] / 2,
+        "right": -100.0 + gains[1] / 2,
+        "true": -100.0 + gains[1] / 2,
+    }
+    return {
+        "kind": kind,
+        "size": size,
+        "other_noise": False,
+        "system": "tank",
+        "law": True,
+        "noise_model": "white",
+        "readings": 300,
+        "truth": list(truth),
+        "hidden": list(hides),
+        "alias": None,
+        "cosine": None,
+        "verdict": {(): "clean", ("unknown",): "unknown"}.get(tuple(said), "named"),
+        "p_value": 0.5 if not truth else 1e-5,
+        "combination": said,
+        "hypotheses": [[said, p], [["lag"], 1 - p]],
+        "credible_set": ["+".join(said) or "clean"],
+        "where": ["time"],
+        "parameters": {},
+        "formula": False,
+        "held_out": {"inside": dict(own), "beyond": dict(own)},
+        "cpu_s": 4.0,
+        **others,
+    }
+
+
+def _single(name="offset_drift", size=12.0, *, hide=None, **others):
+    return _case("single", size, truth=[name], hides=[hide or _hidden(name, size)], **others)
+
+
+def _row(results, name):
+    return next(row for row in score_systems(results) if row.name.strip() == name)
+
+
+def test_a_name_with_another_target_is_wrong():
+    right, wrong = _single("drifts:k"), _single("drifts:k", said=["drifts:tau_s"])
+    assert _row([right, wrong], "right name and target first, lambda 12").found.value == 0.5
+
+
+def test_what_explains_the_same_within_three_nats_is_right_too():
+    alias = _hidden("drifts:k", rivals={"differs:k": (1 - 2 * 2.0 / 144) ** 0.5})
+    apart = _hidden("drifts:k", rivals={"differs:k": (1 - 2 * 4.0 / 144) ** 0.5})
+    told = [_single("drifts:k", hide=hide, said=["differs:k"]) for hide in (alias, apart)]
+    assert [_row([r], "right name and target first, lambda 12").found.value for r in told] == [1.0, 0.0]
+    assert [_row([r], "wrong name stated above .9").found.value for r in told] == [0.0, 1.0]
+
+
+def test_noise_said_beside_an_effect_does_not_make_it_wrong():
+    said = _single(said=["offset_drift", "random_walk"])
+    assert _row([said], "right name and target first, lambda 12").found.value == 1.0
+
+
+def test_alarms_and_names_on_clean_recordings_are_counted():
+    quiet, loud = _case(), _case(p_value=0.01, said=["lag"])
+    assert _row([quiet, loud], "false alarms, clean, alpha .05").found.value == 0.5
+    assert _row([quiet, loud], "physics named, clean").found.value == 0.5
+
+
+def test_noise_of_another_kind_is_scored_by_its_name():
+    told = _case(truth=["outliers"], other_noise=True, noise_model="outliers", p_value=0.4)
+    missed = _case(truth=["outliers"], said=[], other_noise=True, noise_model="outliers", p_value=0.4)
+    assert _row([told, missed], "noise told as it is, other noise").found.value == 0.5
+    assert _row([told], "outliers").found.value == 0.0
+
+
+def test_a_pair_needs_both_names_or_their_aliases():
+    hides = [_hidden("lag"), _hidden("drag:v", rivals={"damping:v": 1.0})]
+    both = _case("pair", 12.0, truth=["drag:v", "lag"], hides=hides, said=["damping:v", "lag"])
+    one = _case("pair", 12.0, truth=["drag:v", "lag"], hides=hides, said=["lag"])
+    assert _row([both, one], "two effects, lambda 12 each: both named").found.value == 0.5
+
+
+def test_held_out_gain_is_the_median_share_and_capped():
+    """Shares 0.5, 1 (100 of 100 though 900 of 500 nats) and 0.25."""
+    cases = [_single(gains=(20.0, 40.0)), _single(gains=(900.0, 500.0)), _single(gains=(10.0, 40.0))]
+    assert gains_of(cases[1], "right") == (100.0, 100.0)
+    assert _row(cases, "held-out runs: median share of the right model's gain").found.value == 0.5
+
+
+def test_where_the_right_model_gains_nothing_there_is_no_share():
+    assert _row([_single(gains=(0.0, 1.0))], "held-out runs: median share of the right model's gain").found.n == 0
+
+
+@pytest.mark.parametrize(
+    ("said", "gains", "told", "named"),
+    [(["unknown"], (0.0, 50.0), 1.0, 0.0), (["lag"], (45.0, 50.0), 1.0, 1.0), (["lag"], (20.0, 50.0), 0.0, 0.0)],
+)
+def test_what_is_on_no_list_is_unknown_or_as_good_as_the_true_law(said, gains, told, named):
+    strange = _hidden("strange_switch:u", 20.0, on_the_list=False)
+    case = _case("outside", 20.0, truth=["unknown"], hides=[strange], said=said, gains=gains)
+    assert _row([case], "not on the list, lambda 20: unknown, or as good as the true law").found.value == told
+    assert _row([case], "by a formula or a name").found.value == named
+
+
+def test_intervals_are_counted_one_by_one():
+    case = _single(parameters={"offset_drift": {"a": [1.0, 0.9, 1.1], "b": [1.0, 1.05, 1.1]}})
+    assert _row([case], "95 % intervals of effect parameters cover").found.value == 0.5
+
+
+def test_a_case_that_failed_counts_in_the_last_row_alone():
+    failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
+    assert _row([_single(), failed], "cases that failed").found.value == 0.5
+    assert _row([_single(), failed], "right name and target first, lambda 12").found.n == 1
+
+
+def test_targets_are_left_out_of_what_is_taken_for_what():
+    assert family_of("depends:k:warm+lag") == "depends+lag"
+
+
+def test_the_page_tells_every_case():
+    failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
+    strange = _case("outside", 20.0, truth=["unknown"], hides=[_hidden("strange_switch:u", 20.0, on_the_list=False)])
+    text = write_page([_case(), _single("drifts:k"), strange, failed], command="probewise challenge", systems=True)
+    for expected in ("drifts:k", "strange_switch:u", "ParameterError: no", "right covariate first, lambda 12"):
+        assert expected in text

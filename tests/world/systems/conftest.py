@@ -1,0 +1,51 @@
+"""A system small enough to solve by hand: x' = u - k x (or with k = 0, x' = u), three runs of uneven rows."""
+
+import numpy as np
+import pytest
+
+from probewise.world.systems.chain import simulate
+from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.kind import Kind, Law, Prior
+from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.vocabulary import forms_of
+
+T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
+
+
+def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
+    kind = Kind(
+        name="by hand",
+        reading="x",
+        unit="m",
+        text="",
+        priors={"k": Prior("uniform", 0, 1)},
+        draw=lambda rng: {"k": k},
+        lay=lambda rng, n, regime: (T, {}),
+        decimals={},
+        drives=("u",),
+        sd=0.01,
+        law=Law({"x": x0}, lambda s, p, u: {"x": u["u"] - p["k"] * s["x"]}, lambda s, p, u: s["x"], linear=linear),
+    )
+    u = np.zeros(len(T)) if u is None else np.asarray(u, dtype=float)
+    warm = np.linspace(-1.0, 1.0, len(T) * n_runs)
+    rows = SystemRows(
+        {"t_s": np.concatenate([T + 10 * r for r in range(n_runs)]), "u": np.tile(u, n_runs), "warm": warm},
+        np.repeat(np.arange(n_runs), len(T)),
+        "t_s",
+        n_runs,
+    )
+    return kind, rows, {"k": np.array([[k]])}
+
+
+@pytest.fixture
+def solve():
+    """Readings of the small system with one form of the vocabulary and its numbers."""
+
+    def run(name, numbers, **options):
+        kind, rows, parameters = small(**options)
+        bare = simulate(kind, rows, parameters)
+        scene = Scene(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
+        form = next(f for f in forms_of(scene) if f.name == name)
+        return simulate(kind, rows, parameters, [(form, numbers)]).readings[0], rows, bare.readings[0]
+
+    return run

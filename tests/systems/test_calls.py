@@ -5,7 +5,7 @@ import pytest
 
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.priors import Uniform
-from probewise.systems import RunTable, Simulator, System
+from probewise.systems import CountedCalls, Law, RunTable, Simulator, System
 
 X = np.linspace(0, 1, 11)
 
@@ -91,3 +91,37 @@ def test_a_simulator_of_another_shape_is_refused():
 def test_a_simulator_that_gives_nan_everywhere_is_refused():
     with pytest.raises(ParameterError, match="NaN"):
         _system(lambda p, data: np.full(11, np.nan))
+
+
+def test_the_same_call_is_made_once():
+    """Effects on the reading leave the simulator as it was: their derivatives cost no further calls."""
+    system, table = _system(_with_a_loop)
+    theta = system.theta(system.starts)
+    first = system.chain(table, ()).predict(theta, table)
+    n_calls = system.caller.n_calls
+    np.testing.assert_array_equal(system.chain(table, ()).predict(theta, table), first)
+    assert system.caller.n_calls == n_calls
+
+
+def test_every_call_is_told():
+    system, table = _system(_with_a_loop)
+    told = []
+    CountedCalls(lambda stage, done=0, total=0, note="": told.append((stage, note)), system.caller)("fitting")
+    n_calls = system.caller.n_calls
+    system.chain(table, ()).predict(system.theta(system.starts[-1:]), table)
+    assert told[-1] == ("fitting", f"{n_calls + 1} calls of simulate")
+
+
+def test_a_law_that_raises_for_some_parameters_is_counted_and_the_others_are_integrated():
+    def rates(s, p, u):
+        if np.any(p["k"] > 1.0):
+            raise ZeroDivisionError
+        return {"y": -p["k"] * s["y"]}
+
+    table = RunTable({"t": X, "y": np.zeros(11)}, "t")
+    simulator = Simulator("y", "V", {"k": Uniform(0.5, 2.0)}, law=Law({"y": 1.0}, rates), time="t")
+    system = System.of(simulator, table)
+    found = system.chain(table, ()).predict(np.array([[0.8], [1.5]]), table)
+    np.testing.assert_allclose(found[0], np.exp(-0.8 * X), rtol=1e-5)
+    assert np.isnan(found[1]).all()
+    assert system.tally.n_failed == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from probewise.systems.simulator import Simulate
 __all__ = ["Caller", "CountedCalls", "Tally"]
 
 _N_NODES = 5  # values at which a parameter that cannot vary by row is held, to interpolate between
+_MOST_REMEMBERED = 2_000_000  # numbers of earlier calls that are kept
 _SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
 
 
@@ -49,6 +51,7 @@ class Caller:
     n_failed: int = 0
     interpolated: set[str] = field(default_factory=set)
     on_call: Callable[[], None] = lambda: None
+    _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
 
     @classmethod
     def probed(
@@ -126,6 +129,21 @@ class Caller:
                 raise first_error
         return out
 
+    def _remembered(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
+        """Call `simulate`, but not again where it was called so: effects on the readings alone leave it as it was."""
+        digest = hashlib.blake2b(digest_size=16)
+        for name, values in (*own.items(), *columns.items()):
+            digest.update(name.encode())
+            digest.update(np.ascontiguousarray(values).tobytes())
+        known = self._known.pop(key := digest.digest(), None)
+        if known is None:
+            self._counted()
+            known = _of_shape(np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64), (n_points,))
+        self._known[key] = known
+        while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
+            self._known.pop(next(iter(self._known)))
+        return known
+
     def _counted(self) -> None:
         self.n_calls += 1
         self.on_call()
@@ -133,8 +151,7 @@ class Caller:
     def _one(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
         vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
         if not vary:
-            self._counted()
-            return _of_shape(np.asarray(self.simulate(dict(own), dict(columns)), dtype=np.float64), (n_points,))
+            return self._remembered(own, columns, n_points)
         self.interpolated.update(vary)
         nodes = [_nodes(own[name]) for name in vary]
         out = np.zeros(n_points)

@@ -85,7 +85,8 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated):
     effect = dataclasses.replace(
         saturated.effects[0], probability=0.9, parameters=(bound,), scans=("edge_90_out", "edge_90_back")
     )
-    found = dataclasses.replace(saturated, effects=(effect,))
+    report = dataclasses.replace(saturated.report, effects=(effect,))
+    found = dataclasses.replace(saturated, report=report)
     html = page.write_page(found, page.figures(found), source="some.csv", seed=1)
     assert "edge_90_out, edge_90_back" in html
     assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]
@@ -171,6 +172,6 @@ def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
 @pytest.mark.slow
 def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
     worse = dataclasses.replace(saturated.improvement, heldout_log_density_per_reading=-1.0, heldout_sd=0.1)
-    found = dataclasses.replace(saturated, improvement=worse)
+    found = dataclasses.replace(saturated, repair=dataclasses.replace(saturated.repair, improvement=worse))
     drawn = {**page.figures(saturated), "gain.svg": b"<svg"}
     assert "Worse than before" in page.write_page(found, drawn, source="some.csv", seed=1)

@@ -102,7 +102,8 @@ class RunTable:
     def covariates(self) -> dict[str, FloatArray]:
         """Columns of numbers that were logged or set: neither the time nor the run."""
         kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run)}
-        return {name: values for name, values in kept.items() if values.dtype == np.float64}
+        numbers = {name: values for name, values in kept.items() if values.dtype == np.float64}
+        return {name: values for name, values in numbers.items() if np.isfinite(values).any()}
 
     @cached_property
     def time_begins_anew(self) -> bool:
@@ -163,8 +164,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
             columns[name] = table.numbers(name)
             continue
         try:
-            values = table.numbers(name, missing=name != run)
-            columns[name] = values if np.isfinite(values).any() else np.array(table.cells(name))
+            columns[name] = table.numbers(name, missing=name != run)
         except FileError:
             columns[name] = np.array(table.cells(name))
     return RunTable(columns, time, run)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, BLUE, stack_of_axes, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, legend_above, stack_of_axes, tidy
 
 __all__ = ["predicted_and_recorded"]
 
@@ -40,6 +40,6 @@ def predicted_and_recorded(
     )
     ends = [min(predicted[there].min(), readings[there].min()), max(predicted[there].max(), readings[there].max())]
     ax.plot(ends, ends, color=BLACK, lw=0.9, label="as predicted")
-    ax.legend(frameon=False, loc="upper left", fontsize=9)
     tidy(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
+    legend_above(ax)
     return ax

@@ -84,8 +84,8 @@ def _to_be_kept(arguments: argparse.Namespace, out: Path, reading: str) -> list[
     filled_in = out / "next.csv"
     if filled_in.is_file():
         try:
-            cells = read_table(filled_in).columns.get(reading, ())
-            read += [filled_in] if any(cells) else []
+            rows = read_table(filled_in)
+            read += [filled_in] if reading in rows.columns and any(rows.cells(reading)) else []
         except FileError:
             read.append(filled_in)
     return read

@@ -111,7 +111,7 @@ def diagnose_prepared(
         searched = searched.by_prior_alone()
     elif thorough is not None:
         searched, weighings = thorough(searched)
-    progress("testing what the sensor model leaves")
+    progress("testing what the model leaves")
     test = run_global_test(searched, rng=rng)
     progress("judging the repair on readings kept back")
     judged, best = best_repair(searched, test, judge(searched, test), rng=rng)

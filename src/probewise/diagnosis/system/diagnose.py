@@ -64,7 +64,8 @@ def diagnose_system(
     """
     table = table_for(simulator, table)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
-    return diagnose_prepared(prepared, thorough=thorough, rng=rng)
+    told = _counting(progress, cast(PersonsSystem, prepared.apparatus).system)
+    return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
 
 
 def prepare_system(
@@ -80,15 +81,19 @@ def prepare_system(
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
     recording = without_lost_rows(system, recording)
-    told = progress if system.caller is None else CountedCalls(progress, system.caller)
+    told = _counting(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
     apparatus = PersonsSystem(About(system, table, found.z, sd))
     begun = replace(system, first=found.z)
     told("binding effects")
     effects = apparatus.effects(recording, begun) if bound else {}
-    told("diagnosing")
     return Prepared(recording, effects, begun, apparatus, recording)
+
+
+def _counting(progress: Progress, system: System) -> Progress:
+    """Tell beside every stage how often `simulate` has been called, where there is one."""
+    return progress if system.caller is None else CountedCalls(progress, system.caller)
 
 
 def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:

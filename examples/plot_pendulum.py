@@ -3,7 +3,7 @@ My pendulum does not swing as it should
 =======================================
 
 Shows how a simulator of one's own is diagnosed. The pendulum here is slowed down by the air, by the square of its
-speed; the simulator in ``pendulum.py`` knows only friction in proportion to the speed. The recording is made by SciPy's
+speed; the simulator in ``simulators/pendulum.py`` knows only friction in proportion to the speed. The recording is made by SciPy's
 integrator, which shares no code with what explains it. With ``--out swings.csv`` it is written, for the command line.
 """
 
@@ -55,7 +55,7 @@ if out is not None:
     out.write_text(write_run_table(RunTable(swings, "t_s", "release")), encoding="utf-8")
 
 # %%
-# The simulator: a law of motion, here from Python; ``pendulum.py`` says the same in a file.
+# The simulator: a law of motion, here from Python; ``simulators/pendulum.py`` says the same in a file.
 
 
 def rates(s, p, u):

@@ -80,7 +80,7 @@ def test_an_audit_needs_no_readings(folder):
     document = strict_json((folder / "audit" / "audit.json").read_text())
     found = {effect["name"]: effect for effect in document["effects"]}
     assert found["sensitivity:room_c"]["sight"] == "invisible"
-    assert found["lag"]["rows"] > 64
+    assert found["offset_step"]["rows"] > 64
     assert any({"offset_step", "steps:start_c"} <= set(names) for names in document["alias_classes"])
 
 

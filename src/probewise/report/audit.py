@@ -15,6 +15,8 @@ from probewise.report.words import count, number, readable
 
 __all__ = ["answer", "figures", "picture", "write_page"]
 
+_CURED_BY = "The fewest readings that would cure it"
+
 
 def answer(audit: PlanAudit) -> str:
     """Say in twenty words at most what the plan can do, and what it takes to cure the rest."""
@@ -42,22 +44,23 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     """Write the whole page."""
     shown = figure(
         drawn["audit.png"],
-        "Left: of what each effect changes in the readings, the share that the sensor's own parameters cannot absorb. "
+        "Left: of what each effect changes in the readings, the share that "
+        f"{audit.words.null}'s own parameters cannot absorb. "
         "Right: its cosine with each other effect. Circles mark aliases: at size "
         f"λ = {LAMBDA:g} these readings tell the two apart by less than {LEAST_NATS:g} nats.",
     )
     sections = [
-        Section("The fewest readings that would cure it", _cures(audit)),
-        Section("Every effect", (audit_table(audit.effects),)),
+        Section("Not told apart", _classes(audit)) if audit.classes is not None else Section(_CURED_BY, _cures(audit)),
+        Section("Every effect", (audit_table(audit.effects, audit.words.null),)),
         Section(
             "What was assumed",
             (
                 definition_list(
                     (
                         ("plan", source),
-                        ("readings", f"{len(audit.plan)} in {count(len(audit.plan.scan_names), 'scan')}"),
-                        ("sensor", audit.assumed),
-                        ("the arm can also command", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
+                        ("readings", f"{len(audit.plan)} in {count(len(audit.plan.scan_names), audit.words.run)}"),
+                        (audit.words.null.removeprefix("the "), audit.assumed),
+                        ("can be set", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
                     )
                 ),
             ),
@@ -70,6 +73,14 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
         key_figure=fragment(shown, *terms_of(f"{answer(audit)} {shown}", known)),
         sections=explained(sections, known),
     )
+
+
+def _classes(audit: PlanAudit) -> tuple[Markup, ...]:
+    if not audit.classes:
+        return (paragraph("Every effect that these rows show changes the readings in a way of its own."),)
+    opening = "Effects that are taken for each other, directly or by way of others:"
+    rows = ((str(k), ", ".join(map(spoken_name, names))) for k, names in enumerate(audit.classes, start=1))
+    return (paragraph(opening), table(("class", "effects"), rows))
 
 
 def _cures(audit: PlanAudit) -> tuple[Markup, ...]:

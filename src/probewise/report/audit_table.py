@@ -12,11 +12,15 @@ from probewise.report.words import number, unit_name
 __all__ = ["audit_table"]
 
 
-def audit_table(effects: Sequence[EffectAudit]) -> Markup:
-    """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows."""
+def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
+    """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows.
+
+    `of` is what has parameters of its own. Rows that would show an effect have a column where they were counted.
+    """
+    counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")
     return table(
-        ("effect", "status", "detectable share", "aliased with (cosine)", "size at λ = 8"),
+        ("effect", "status", "detectable share", "aliased with (cosine)", "size at λ = 8", *["rows"] * counted),
         (
             (
                 spoken_name(effect.name),
@@ -24,11 +28,13 @@ def audit_table(effects: Sequence[EffectAudit]) -> Markup:
                 number(effect.share, 2),
                 effect.reason or ", ".join(f"{spoken_name(n)} {c:.3f}" for n, c in effect.alike[:4]) or "–",
                 "; ".join(_smallest(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
+                *["–" if effect.rows is None else str(effect.rows)] * counted,
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
         ),
         caption="Status: fine (can be identified), aliased, or invisible (cannot be detected). Detectable share: of "
-        "what it changes in the readings, the share that the sensor's own parameters do not absorb.",
+        f"what it changes in the readings, the share that {of}'s own parameters do not absorb."
+        + (" Rows: so many like these show it where it changes readings by one noise sd rms." if counted else ""),
     )
 
 

@@ -17,6 +17,7 @@ from probewise.systems import RunTable
 __all__ = ["answer", "figures", "write_page"]
 
 _MOST_COLUMNS = 6
+_LEAST_VALUES = 8  # of a column, for a running mean along it
 
 
 def answer(fit: SystemFit) -> str:
@@ -39,9 +40,8 @@ def _along(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]
     own = fit.fitted.simulator
     time = f"{plan.time} ({own.time_unit})" if plan.has_time else "row of the table"
     out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
-    varying = {
-        name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd) and np.nanstd(v) > 0
-    }
+    inputs = {name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd)}
+    varying = {name: v for name, v in inputs.items() if len(np.unique(v[np.isfinite(v)])) >= _LEAST_VALUES}
     return (*out, *list(varying.items())[: _MOST_COLUMNS - len(out)])
 
 

@@ -363,7 +363,7 @@ def _seen(
     effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...], unit: str
 ) -> EffectAudit:
     if share < LEAST_SHARE:
-        reason = "the sensor's own parameters absorb it" if share > 0 else "it leaves no trace here"
+        reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
         return EffectAudit(effect.name, "invisible", share, reason=reason)
     alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
     smallest = tuple(

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, judged
 from probewise.diagnosis.system.apparatus import ON_NOISE, PersonsSystem
-from probewise.effects import NamedEffect, first_of
+from probewise.effects import NUISANCES, NamedEffect, first_of
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
@@ -53,7 +53,8 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     system = system.standing_still(own, z[None, :], tolerance=_STANDS_STILL * sd)
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
-    on_noise = {kind.name: kind() for kind in ON_NOISE}
+    kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
+    on_noise = {kind.name: kind() for kind in kinds}
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
     reasons = _reasons(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
@@ -127,8 +128,8 @@ def _reasons(about: About) -> dict[str, str]:
 
 def _with_rows(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
     """Count rows like these at which lambda 8 is left of an effect that changes readings by one noise sd rms."""
-    if effect.share == 0:
-        return replace(effect, reason=reasons.get(effect.name, effect.reason))
+    if effect.detectability == "invisible":
+        return replace(effect, reason=effect.reason if effect.share > 0 else reasons.get(effect.name, effect.reason))
     return replace(effect, rows=math.ceil((LAMBDA / effect.share) ** 2))
 
 

@@ -25,6 +25,8 @@ __all__ = ["audit_matrix"]
 
 COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
 
+_MOST_NAMES = 36  # that stand side by side under the columns; of more their numbers do
+
 
 def audit_matrix(
     names: Sequence[str], sights: Sequence[str], cosines: FloatArray, *, alias: float, axes: AxesGrid | None = None
@@ -60,6 +62,10 @@ def audit_matrix(
         if sight in sights:
             bars.barh([np.nan], [0], color=colour, label=sight)
     tidy(bars, x="detectable share (no unit)", y="")
+    numbered = len(order) > _MOST_NAMES
+    if numbered:
+        bars.set_yticks(at, [f"{name}  {k + 1}" for k, name in enumerate(labels)])
+        labels = [str(k + 1) if k % 5 == 4 else "" for k in range(len(labels))]
     _matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
     if own:
         key_below(axes)
@@ -73,7 +79,7 @@ def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) 
     image = ax.imshow(shown, cmap=COPPER, vmin=0, vmax=1, aspect="auto")
     rows, columns = np.nonzero(np.nan_to_num(shown) >= alias)
     ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
-    ax.set_xticks(np.arange(len(labels)), labels, rotation=90, fontsize=SMALL_PT)
+    ax.set_xticks(np.arange(len(labels)), labels, rotation=0 if labels[0] == "" else 90, fontsize=SMALL_PT)
     ax.tick_params(left=False)
     ax.figure.colorbar(image, ax=ax, label="cosine of row and column (no unit)", shrink=0.7)
     tidy(ax, x="", y="", title="circles: aliased pairs")

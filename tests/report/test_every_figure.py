@@ -129,7 +129,6 @@ def test_every_plot_function_is_here():
         "lost_readings",
         "mean_residuals_along",
         "one_scan",
-        "predicted_and_recorded",
         "readings_in_order",
         "residual_clouds",
         "spread_by_level",

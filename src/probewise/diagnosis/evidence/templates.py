@@ -21,6 +21,7 @@ from probewise.sensor import Stage
 
 __all__ = ["EffectTemplates", "TemplateMemory", "effect_templates", "subsets"]
 
+_RUNS_AWAY = 1e9  # times the largest prediction: such a model has run away, and says nothing to first order
 _ROUNDING = 1e-9  # of the largest prediction; what changes by less is not changed
 _AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
 
@@ -121,6 +122,7 @@ def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: Int
         read = model.chain.predict(theta, there) if seen is None else model.chain.read(seen, theta, there)
         change[rows, inside] = read - before[inside]
     columns = change[:, usable].T
+    columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + np.abs(before).max()))] = 0.0  # NaN too
     columns[:, np.abs(columns).max(axis=0) < _ROUNDING * np.abs(before).max()] = 0.0
     return np.split(columns, len(bank), axis=1)
 

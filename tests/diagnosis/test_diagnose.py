@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import math
+import pickle
 
 import jsonschema
 import numpy as np
@@ -46,6 +47,11 @@ def recording(plan_name: str, *concealed: hidden.Concealed, seed: int = 1) -> Re
 @functools.cache
 def clean_diagnosis() -> Diagnosis:
     return diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
+
+
+def test_a_diagnosis_can_be_sent_to_another_process():
+    sent = pickle.loads(pickle.dumps(clean_diagnosis()))
+    assert json.dumps(diagnosis_json(sent)) == json.dumps(diagnosis_json(clean_diagnosis()))
 
 
 def strict(diagnosis) -> dict:

@@ -93,7 +93,7 @@ def diagnose(
         If the fit of the null did not arrive anywhere.
     """
     require_rng(rng)
-    prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(effects))
+    prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(dict(effects)))
     return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
 
 

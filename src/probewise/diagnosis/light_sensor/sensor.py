@@ -29,9 +29,12 @@ __all__ = ["LightSensor"]
 
 @dataclass(frozen=True)
 class LightSensor:
-    """A light sensor that an arm moves over patterns; `vocabulary` are the effects it may have, by name."""
+    """A light sensor that an arm moves over patterns; `vocabulary` are the effects it may have, by name.
 
-    vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: VOCABULARY)
+    The vocabulary is a plain dict, which can be sent to another process.
+    """
+
+    vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: dict(VOCABULARY))
     words: ClassVar[Words] = Words(
         null="the sensor",
         find_signal="scan across an edge",

@@ -29,13 +29,13 @@ from pathlib import Path
 import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
-from probewise.experiment import SHAPES, Experiment, Field, Step, explore
+from probewise.experiment import Experiment, Field, Step, explore
 from probewise.experiment.asking import inquire
 from probewise.experiment.loop import from_scratch
 from probewise.experiment.particles import update
 from probewise.inquiry import Grid
+from probewise.scene import SHAPES, HypothesisScene
 from probewise.scene import Field as PlayingField
-from probewise.scene import HypothesisScene
 from probewise.study import REFERENCE, Trial, arm_of, experiment_of
 
 FIRST_CIRCLE = 2000  # the study looks for the first thousand at most

@@ -15,6 +15,7 @@ __all__ = [
     "ProbewiseError",
     "ReachError",
     "ShapeError",
+    "SlowWarning",
     "shortened",
     "shown",
 ]
@@ -97,6 +98,10 @@ class NotConvergedError(ProbewiseError, RuntimeError):
 
 class DoubtfulResultWarning(UserWarning):
     """Warn of a result that can be used but not trusted blindly; the result holds the reason too."""
+
+
+class SlowWarning(UserWarning):
+    """Warn of a computation that takes a slow way where a quick one could be given."""
 
 
 class NotSavedWarning(UserWarning):

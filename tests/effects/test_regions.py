@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.effects import edge_distance
 from probewise.effects.albedo import GradedRegion, PatchedRegion
+from probewise.scene import edge_distance
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,

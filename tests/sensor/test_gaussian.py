@@ -10,7 +10,7 @@ from scipy.integrate import dblquad
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, SlowWarning
 from probewise.recordings import patterns as kinds
 from probewise.scene import (
     EllipseRegion,
@@ -358,7 +358,8 @@ def test_a_region_without_a_closed_form_is_summed_over_pixels():
         return np.sum((-1.0) ** np.arange(len(edges) - 1) * np.diff(ndtr((edges - place) / sd)))
 
     wanted = 0.5 + 0.5 * wave(3.0, 4.0) * wave(-2.0, 6.0)
-    found = see(Checkers(), 3.0, -2.0, np.diag([16.0, 36.0]))
+    with pytest.warns(SlowWarning, match="Checkers has no closed form"):
+        found = see(Checkers(), 3.0, -2.0, np.diag([16.0, 36.0]))
     assert found == pytest.approx(wanted, abs=0.02)
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise.errors import ParameterError
-from probewise.experiment import SHAPES, Hidden
-from probewise.scene import Field
+from probewise.experiment import Hidden
+from probewise.scene import SHAPES, Field
 
 __all__ = ["parse_field", "parse_truth"]
 

@@ -57,8 +57,8 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
 
 def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
     """Build the shape that the first line names, by trying those of the command line."""
-    from probewise.experiment import SHAPES, shape_named
-    from probewise.scene import Field
+    from probewise.experiment import shape_named
+    from probewise.scene import SHAPES, Field
 
     allowed = f"shapes as explore has them: {', '.join(SHAPES)}"
     try:

@@ -10,7 +10,6 @@ from typing import Any
 
 from probewise.effects.albedo import AlbedoGradient, AlbedoPatch
 from probewise.effects.angles import OrientationError, ScanAngleError
-from probewise.effects.edge_distance import edge_distance
 from probewise.effects.edges import EdgeBlur, EdgeShadow, Halo
 from probewise.effects.extent import Extent
 from probewise.effects.faults import Dropouts, Outliers
@@ -177,7 +176,6 @@ __all__ = [
     "SlowTurn",
     "StickSlip",
     "draw_readings",
-    "edge_distance",
     "first_of",
     "in_scans",
     "is_out_of_vocabulary",

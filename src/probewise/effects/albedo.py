@@ -22,6 +22,7 @@ from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
+from probewise.scene.regions import edge_distance
 from probewise.sensor.gaussian import Spot, seen_by_one
 from probewise.sensor.stages import SceneView, Stage
 
@@ -201,3 +202,9 @@ def _(region: PatchedRegion, spot: Spot, n_nodes: int) -> FloatArray:
 def _under(view: SceneView, plan: Plan) -> Mapping[str, Region]:
     """Name the regions that lie under some reading."""
     return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
+
+
+@edge_distance.register(GradedRegion)
+@edge_distance.register(PatchedRegion)
+def _(region: GradedRegion | PatchedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    return edge_distance(region.region, x_mm, y_mm)

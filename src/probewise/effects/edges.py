@@ -10,7 +10,6 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.edge_distance import edge_distance
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.spots import bell
@@ -18,6 +17,7 @@ from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan
+from probewise.scene.regions import edge_distance
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Footprint, Stage, View
 

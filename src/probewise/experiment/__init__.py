@@ -20,7 +20,6 @@ from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
 from probewise.experiment.setting import Experiment, OneScan
 from probewise.experiment.simulation import (
-    SHAPES,
     Model,
     Streams,
     arm_over,
@@ -36,7 +35,6 @@ from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 __all__ = [
     "OFF_MM",
     "PAPER_BITS",
-    "SHAPES",
     "AdjustedMixture",
     "Belief",
     "Change",

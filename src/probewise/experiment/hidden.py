@@ -10,9 +10,9 @@ import numpy as np
 from probewise._arrays import FloatArray, floats, frozen
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError
-from probewise.experiment.simulation import SHAPES, surface_under
+from probewise.experiment.simulation import surface_under
 from probewise.priors import Prior
-from probewise.scene import AnyOf, Field, Shape, outlines
+from probewise.scene import SHAPES, AnyOf, Field, Shape, outlines
 from probewise.world import Surface
 
 __all__ = ["Hidden", "Truth", "members_of"]

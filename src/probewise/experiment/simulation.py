@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
@@ -22,16 +22,12 @@ from probewise.inference import Naive, Rounded
 from probewise.inquiry import Finishing, Grid, Utility
 from probewise.recordings import Disc, Polygon
 from probewise.scene import (
+    SHAPES,
     AnyOf,
-    Circle,
-    Ellipse,
     EllipseRegion,
     Field,
     HypothesisScene,
-    PolygonRegion,
-    Rectangle,
     Region,
-    RegularPolygon,
     Shape,
     outlines,
 )
@@ -40,7 +36,6 @@ from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSe
 from probewise.world import Oval, Spot, Surface, World
 
 __all__ = [
-    "SHAPES",
     "Model",
     "Streams",
     "arm_over",
@@ -55,14 +50,7 @@ __all__ = [
 Model: TypeAlias = Literal["ssf", "naive"]
 
 _USUAL_HEIGHT_MM = 14.0  # of the paper's sensor above the surface
-
-SHAPES: Mapping[str, Callable[[Field], Shape]] = {
-    "circle": lambda field: Circle(field),
-    "ellipse": lambda field: Ellipse(field),
-    "rectangle": lambda field: Rectangle(field),
-    "triangle": lambda field: RegularPolygon(3, field),
-    "hexagon": lambda field: RegularPolygon(6, field),
-}
+_PAINTED_VERTICES = 512  # of a curved outline that is no ellipse: within 0.01 mm of a circle of 150 mm
 
 
 class Streams(NamedTuple):
@@ -233,17 +221,17 @@ def surface_under(region: Region, name: str) -> Surface:
     Raises
     ------
     ParameterError
-        If its outline is neither an ellipse nor a polygon.
+        If it has no closed outline, or one of several pieces.
     """
     if isinstance(region, EllipseRegion):
         center, axes = region.center_mm[0].tolist(), region.semi_axes_mm[0].tolist()
         if axes[0] == axes[1]:
             return Disc((center[0], center[1]), axes[0])
         return Oval((center[0], center[1]), (axes[0], axes[1]), float(region.angle_rad[0]))
-    if isinstance(region, PolygonRegion):
-        corners = outlines(region)[0][:-1]
-        return Polygon(tuple((float(x), float(y)) for x, y in corners))
-    raise ParameterError("shape", name, "one whose outline is an ellipse or a polygon")
+    (outline,) = outlines(region, n_vertices=_PAINTED_VERTICES)
+    if np.isnan(outline).any():
+        raise ParameterError("shape", name, "one whose outline is one closed line")
+    return Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
 
 
 def arm_over(

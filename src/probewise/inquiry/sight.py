@@ -9,8 +9,9 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.scene import EllipseRegion, HypothesisScene, MixtureOfRegions, PolygonRegion, outlines
+from probewise.scene import HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.commanded import is_commanded
 from probewise.sensor.stages import SensorModel
@@ -43,11 +44,12 @@ class Sight:
         if not isinstance(model.scene, HypothesisScene):
             return None
         region = model.scene.shape.region(theta)
-        if not isinstance(region, (EllipseRegion, PolygonRegion, MixtureOfRegions)):
+        try:
+            edges = outlines(region)
+        except ParameterError:  # no closed edge: it may be seen anywhere
             return None
         sds = np.sqrt(np.linalg.eigvalsh(model.ssf.covs_mm2)[:, -1])
         reach = float((np.linalg.norm(model.ssf.means_mm, axis=1) + _REACH * sds).max())
-        edges = outlines(region)
         low, high = (np.array([f(edge, axis=0) for edge in edges]) for f in (np.nanmin, np.nanmax))
         one = plan.take(np.array([0]))
         beside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]

@@ -17,12 +17,14 @@ from probewise.scene.regions import (
     StripesRegion,
     UniformRegion,
     disc_region,
+    edge_distance,
     outlines,
 )
 from probewise.scene.scenes import HypothesisScene, KnownScene
-from probewise.scene.shapes import AnyOf, Circle, Ellipse, Field, Placed, Rectangle, RegularPolygon
+from probewise.scene.shapes import SHAPES, AnyOf, Circle, Ellipse, Field, Placed, Rectangle, RegularPolygon
 
 __all__ = [
+    "SHAPES",
     "AnyOf",
     "Circle",
     "Ellipse",
@@ -45,6 +47,7 @@ __all__ = [
     "StripesRegion",
     "UniformRegion",
     "disc_region",
+    "edge_distance",
     "outlines",
     "region_of",
 ]

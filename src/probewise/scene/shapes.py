@@ -19,7 +19,7 @@ from probewise.priors import Prior, Product, Uniform
 from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.regions import EllipseRegion, MixtureOfRegions, PolygonRegion, UniformRegion, disc_region
 
-__all__ = ["AnyOf", "Circle", "Ellipse", "Field", "Placed", "Rectangle", "RegularPolygon"]
+__all__ = ["SHAPES", "AnyOf", "Circle", "Ellipse", "Field", "Placed", "Rectangle", "RegularPolygon"]
 
 Bounds = tuple[float, float]
 
@@ -267,6 +267,16 @@ def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: Fl
     x = center_mm[:, :1] + cosine * corners_mm[..., 0] - sine * corners_mm[..., 1]
     y = center_mm[:, 1:] + sine * corners_mm[..., 0] + cosine * corners_mm[..., 1]
     return PolygonRegion.simple(np.stack([x, y], axis=-1))
+
+
+SHAPES: Mapping[str, Callable[[Field], Shape]] = {
+    "circle": lambda field: Circle(field),
+    "ellipse": lambda field: Ellipse(field),
+    "rectangle": lambda field: Rectangle(field),
+    "triangle": lambda field: RegularPolygon(3, field),
+    "hexagon": lambda field: RegularPolygon(6, field),
+}
+"""What may be asked for by name, on any field."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ is `probewise.sensor.discrete`. A new kind of region may register its own closed
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cache, singledispatch
 
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.special import ndtr, owens_t
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, SlowWarning
 from probewise.scene.albedo import Region
 from probewise.scene.regions import (
     EllipseRegion,
@@ -127,8 +128,15 @@ def seen_by_one(region: Region, spot: Spot, n_nodes: int) -> FloatArray:
     """Mean albedo that one Gaussian footprint sees: broadcasts to (n_samples, n_points).
 
     A region of a kind without a closed form is summed over square pixels of a quarter of the
-    smaller standard deviation, each with its coverage; the error is about 1e-3.
+    smaller standard deviation, each with its coverage; the error is about 1e-3, and a `SlowWarning` says so.
     """
+    kind = type(region).__name__
+    warnings.warn(
+        f"{kind} has no closed form: each footprint over it is summed over pixels, in milliseconds; register one with "
+        f"probewise.sensor.gaussian.seen_by_one.register({kind})",
+        SlowWarning,
+        stacklevel=2,
+    )
     shape = np.broadcast_shapes(spot.shape, (region.n_regions, 1))
     out = np.empty(shape)
     x, y = np.broadcast_to(spot.x_mm + spot.dx_mm, shape), np.broadcast_to(spot.y_mm + spot.dy_mm, shape)

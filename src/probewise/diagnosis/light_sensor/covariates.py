@@ -10,9 +10,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.effects import NamedEffect, edge_distance, sign_of_move
+from probewise.effects import NamedEffect, sign_of_move
 from probewise.recordings.plan import Plan
-from probewise.scene import region_of
+from probewise.scene import edge_distance, region_of
 
 __all__ = ["covariate_of", "covariates_of", "slope_along_the_move"]
 

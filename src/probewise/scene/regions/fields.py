@@ -1,0 +1,36 @@
+"""The fields of a batch of regions: checked, frozen, one length for all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen, require_finite
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["batch", "require_positive"]
+
+
+def batch(region: object, **shapes: tuple[int, ...]) -> None:
+    """Freeze the named fields to (n_regions, *shape), one n_regions for all."""
+    arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
+    lengths = set()
+    for name, shape in shapes.items():
+        array = arrays[name] = arrays[name][None] if arrays[name].ndim == len(shape) else arrays[name]
+        if array.ndim != len(shape) + 1 or any(
+            want not in (-1, got) for want, got in zip(shape, array.shape[1:], strict=True)
+        ):
+            raise ShapeError(f"{name} has shape {array.shape}; allowed: (n_regions, {', '.join(map(str, shape))})")
+        lengths.add(len(array))
+    n_regions = max(lengths, default=1)
+    for name, array in arrays.items():
+        if len(array) not in (1, n_regions):
+            raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other fields, or 1")
+        require_finite(name, array)
+        object.__setattr__(region, name, frozen(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
+
+
+def require_positive(name: str, values: FloatArray) -> None:
+    """Raise ParameterError unless all values are greater than 0."""
+    bad = values <= 0
+    if bad.any():
+        raise ParameterError(name, float(values[bad][0]), "greater than 0")

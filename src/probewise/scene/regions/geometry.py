@@ -1,0 +1,56 @@
+"""What is asked of any region's geometry beside its albedo; a kind registers its answers in its own file."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+from probewise.scene.albedo import Region
+
+__all__ = ["edge_distance", "outlines"]
+
+
+@singledispatch
+def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
+    """Trace the closed edge of each hypothesis, for drawing, painting, and to know where it can be seen.
+
+    Parameters
+    ----------
+    region
+        Ellipses, polygons, a set of these, or any kind that registers its trace (`outlines.register`).
+    n_vertices
+        Vertices of the trace of a curved edge.
+
+    Returns
+    -------
+    One array (n, 2) a hypothesis, mm, the first vertex repeated at the end; pieces of a
+    polygon that crosses itself are separated by NaN.
+
+    Raises
+    ------
+    ParameterError
+        If the region has no closed edge.
+    """
+    raise ParameterError("region", type(region).__name__, "EllipseRegion, PolygonRegion or a mixture of them")
+
+
+@singledispatch
+def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Distance of places from the nearest edge of a region, mm.
+
+    Parameters
+    ----------
+    region
+        Of n_regions hypotheses; infinitely far where its kind has no edge (uniform, a ramp, an image).
+    x_mm, y_mm
+        Places, (n_samples or 1, n_points).
+
+    Returns
+    -------
+    Distances, (n_samples or n_regions or 1, n_points). Of an ellipse to first order in the distance; of
+    a disc exactly.
+    """
+    return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)

@@ -1,0 +1,51 @@
+"""Two halves with a straight edge between them (paper, S_BW)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.scene._pixels import share_behind_edge
+from probewise.scene.regions.fields import batch
+from probewise.scene.regions.geometry import edge_distance
+
+__all__ = ["HalfPlaneRegion"]
+
+
+@dataclass(frozen=True, eq=False)
+class HalfPlaneRegion:
+    """Inside where x cos(normal) + y sin(normal) > offset (paper, S_BW); fields (n_regions,)."""
+
+    normal_rad: FloatArray
+    offset_mm: FloatArray
+    inside: float = 1.0
+    outside: float = 0.0
+
+    def __post_init__(self) -> None:
+        batch(self, normal_rad=(), offset_mm=())
+
+    @property
+    def n_regions(self) -> int:
+        """How many hypotheses it holds, or 1."""
+        return len(self.offset_mm)
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        return np.where(self._distance(points_mm) > 0, self.inside, self.outside)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        share = share_behind_edge(self._distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm)
+        return self.outside + (self.inside - self.outside) * share
+
+    def _distance(self, points_mm: FloatArray) -> FloatArray:
+        normal = self.normal_rad[:, None]
+        return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.offset_mm[:, None]
+
+
+@edge_distance.register
+def _(region: HalfPlaneRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    normal = region.normal_rad[:, None]
+    return np.abs(np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.offset_mm[:, None])

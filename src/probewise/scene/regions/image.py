@@ -1,0 +1,92 @@
+"""An image of albedos."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray, frozen, require_finite
+from probewise.errors import ParameterError, ShapeError
+
+__all__ = ["ImageRegion"]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRegion:
+    """One image of albedos: `values` (n_rows, n_columns), first row on top, 0 outside it.
+
+    `origin_mm` is the lower left corner; hypotheses share it (n_regions is 1).
+    """
+
+    values: FloatArray
+    pixel_mm: float
+    origin_mm: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        values = frozen(self.values)
+        if values.ndim != 2 or values.size == 0:
+            raise ShapeError(f"image has shape {values.shape}; allowed: (n_rows, n_columns), not empty")
+        require_finite("image", values)
+        if not (0 < self.pixel_mm < math.inf):
+            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
+        object.__setattr__(self, "values", values)
+
+    @property
+    def n_regions(self) -> int:
+        """One image for all hypotheses."""
+        return 1
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) -> (1, n_points)."""
+        return self._at(points_mm[:, 0], points_mm[:, 1])[None]
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over turned square pixels, in strips along x: exact where they are not turned."""
+        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+        steep, flat = np.maximum(np.abs(cosine), 1e-9), np.maximum(np.abs(sine), 1e-9)
+        half = 0.5 * pixel_mm
+        height = half * (np.abs(cosine) + np.abs(sine))
+        total, area = np.zeros(len(centers_mm)), np.zeros(len(centers_mm))
+        n_strips = 8
+        for k in range(n_strips):
+            low, high = (2 * k / n_strips - 1) * height, (2 * (k + 1) / n_strips - 1) * height
+            y = 0.5 * (low + high)
+            # The square is where |c x + s y| and |c y - s x| are at most half a side.
+            middle_1, middle_2 = -sine * y * cosine / steep**2, cosine * y * sine / flat**2
+            left = np.maximum(middle_1 - half / steep, middle_2 - half / flat)
+            right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
+            bottom, top = centers_mm[:, 1] + low, centers_mm[:, 1] + high
+            near, far = centers_mm[:, 0] + left, centers_mm[:, 0] + right
+            total += self._summed(far, top) - self._summed(near, top)
+            total -= self._summed(far, bottom) - self._summed(near, bottom)
+            area += (right - left) * (high - low)
+        return (total / area)[None]
+
+    @cached_property
+    def _cumulative(self) -> FloatArray:
+        """Sums of all pixels to the lower left of each corner, (n_rows + 1, n_columns + 1), from below."""
+        padded = np.zeros((self.values.shape[0] + 1, self.values.shape[1] + 1))
+        padded[1:, 1:] = self.values[::-1].cumsum(axis=0).cumsum(axis=1)
+        return padded
+
+    def _summed(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Integral of the albedo over all that lies to the lower left, mm^2."""
+        n_rows, n_columns = self.values.shape
+        u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
+        v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)
+        i, j = np.minimum(v.astype(np.int64), n_rows - 1), np.minimum(u.astype(np.int64), n_columns - 1)
+        u, v, table = u - j, v - i, self._cumulative
+        lower = (1 - u) * table[i, j] + u * table[i, j + 1]
+        upper = (1 - u) * table[i + 1, j] + u * table[i + 1, j + 1]
+        return np.asarray(((1 - v) * lower + v * upper) * self.pixel_mm**2)
+
+    def _at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        n_rows, n_columns = self.values.shape
+        column = np.floor((x_mm - self.origin_mm[0]) / self.pixel_mm).astype(np.int64)
+        row = n_rows - 1 - np.floor((y_mm - self.origin_mm[1]) / self.pixel_mm).astype(np.int64)
+        within = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
+        found = self.values[np.where(within, row, 0), np.where(within, column, 0)]
+        return np.where(within, found, 0.0)

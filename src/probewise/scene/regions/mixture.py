@@ -1,0 +1,79 @@
+"""A region of another kind for each hypothesis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, frozen_int
+from probewise.errors import ParameterError, ShapeError
+from probewise.scene.albedo import Region
+from probewise.scene.regions.geometry import edge_distance, outlines
+
+__all__ = ["MixtureOfRegions"]
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureOfRegions:
+    """A region of another kind for each hypothesis: a set of shapes.
+
+    `which`, shape (n_regions,), names the part that each hypothesis takes; part k holds, in
+    order, the regions of the hypotheses with which == k (its own n_regions of them).
+    """
+
+    which: IntArray
+    parts: tuple[Region, ...]
+
+    def __post_init__(self) -> None:
+        which = frozen_int(self.which)
+        object.__setattr__(self, "which", which)
+        for k, part in enumerate(self.parts):
+            wanted = int(np.sum(which == k))
+            if wanted and part.n_regions != wanted:
+                raise ShapeError(f"part {k} holds {part.n_regions} regions; allowed: {wanted}, as which == {k}")
+        if which.ndim != 1 or (which.size and (which.min() < 0 or which.max() >= len(self.parts))):
+            raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one a hypothesis")
+
+    @property
+    def n_regions(self) -> int:
+        """How many hypotheses it holds."""
+        return len(self.which)
+
+    def rows(self) -> list[tuple[IntArray, Region]]:
+        """Rows of the hypotheses of each kind that occurs, with their regions."""
+        pairs = [(np.flatnonzero(self.which == k), part) for k, part in enumerate(self.parts)]
+        return [(rows, part) for rows, part in pairs if rows.size]
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        out = np.empty((self.n_regions, len(points_mm)))
+        for rows, part in self.rows():
+            out[rows] = part.albedo(points_mm)
+        return out
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over turned square pixels, (n_regions, n_points)."""
+        out = np.empty((self.n_regions, len(centers_mm)))
+        for rows, part in self.rows():
+            out[rows] = part.coverage(centers_mm, pixel_mm, turn_rad)
+        return out
+
+
+@outlines.register
+def _(region: MixtureOfRegions, *, n_vertices: int = 96) -> list[FloatArray]:
+    traces: list[FloatArray] = [np.empty((0, 2))] * region.n_regions
+    for rows, part in region.rows():
+        for row, trace in zip(rows, outlines(part, n_vertices=n_vertices), strict=True):
+            traces[int(row)] = trace
+    return traces
+
+
+@edge_distance.register
+def _(region: MixtureOfRegions, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    shape = (region.n_regions, max(x_mm.shape[1], y_mm.shape[1]))
+    x_mm, y_mm = np.broadcast_to(x_mm, shape), np.broadcast_to(y_mm, shape)
+    out = np.empty(shape)
+    for rows, part in region.rows():
+        out[rows] = edge_distance(part, x_mm[rows], y_mm[rows])
+    return out

@@ -100,6 +100,12 @@ FIGURES = {
     "widths_of_runs": lambda s: plots.widths_of_runs(RUNS),
     "widths_of_runs, one": lambda s: plots.widths_of_runs({"inside, SSF": RUNS["inside, SSF"]}),
     "hypothesis_probabilities": lambda s: plots.hypothesis_probabilities(EFFECTS[:3], [0.5, 0.3, 0.2]),
+    "beliefs_by_round": lambda s: plots.beliefs_by_round(
+        {
+            "round 1: 408 readings": dict(zip(EFFECTS[:8], (0.3, 0.2, 0.2, 0.1, 0.1, 0.05, 0.03, 0.02), strict=True)),
+            "round 2: 78 more": {EFFECTS[1]: 0.97, EFFECTS[0]: 0.03},
+        }
+    ),
     "audit_matrix": lambda s: plots.audit_matrix(
         EFFECTS, ["fine", "aliased", "invisible"] * 8, np.full((24, 24), 0.995), alias=0.99
     ),

@@ -4,10 +4,11 @@ The paper judges a sensor model by the inferences made with it (section "Efficac
 judged here the same way, on recordings of another simulator whose truth it never sees.
 """
 
-from probewise.challenge.case import Task, run_case
+from probewise.challenge.case import Investigated, Task, run_case
 from probewise.challenge.confusion import confusion
 from probewise.challenge.estimates import Estimate
 from probewise.challenge.reliability import Bin, calibration_error, reliability
+from probewise.challenge.rounds import score_rounds
 from probewise.challenge.run import run_challenge
 from probewise.challenge.surviving import NullRefit
 from probewise.challenge.table import Decision, Row, by_effect, score
@@ -16,6 +17,7 @@ __all__ = [
     "Bin",
     "Decision",
     "Estimate",
+    "Investigated",
     "NullRefit",
     "Row",
     "Task",
@@ -26,4 +28,5 @@ __all__ = [
     "run_case",
     "run_challenge",
     "score",
+    "score_rounds",
 ]

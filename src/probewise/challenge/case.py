@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,13 @@ from probewise.challenge.likeness import cosines, left_beside
 from probewise.challenge.surviving import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
+from probewise.investigation import investigate
+from probewise.recordings.plan import Plan, Recording
 from probewise.world.challenge import Case, Hidden, Ruler, draw_case, stratum_of
 from probewise.world.challenge.candidates import Setting
 from probewise.world.concealed import Disturbs, Quantisation
 
-__all__ = ["Task", "run_case", "said"]
+__all__ = ["Investigated", "Task", "run_case", "said"]
 
 _OWN = 1_000  # child of the case's seed sequence that the drawing has no use for
 _LEAST_PROBABILITY = 1e-3
@@ -40,6 +43,20 @@ class Task:
         return f"{self.seed} / {self.number}"
 
 
+@dataclass(frozen=True)
+class Investigated:
+    """Does a case in rounds: recording, diagnosis, the readings that it asks for, until settled.
+
+    A value instead of a closure, so that it can be sent to another process.
+    """
+
+    rounds: int
+
+    def __call__(self, task: Task) -> dict[str, Any]:
+        """Return what `run_case` does, and for "rounds" what was said after each, with its number of readings."""
+        return _run(task, partial(_investigated, rounds=self.rounds))
+
+
 def run_case(task: Task) -> dict[str, Any]:
     """Draw a case, diagnose it from its recording alone, and say what was stated and what is true.
 
@@ -48,6 +65,10 @@ def run_case(task: Task) -> dict[str, Any]:
     A JSON object. A case that could not be drawn or whose diagnosis failed has "failed", the reason, and "at",
     "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
     """
+    return _run(task, _diagnosed)
+
+
+def _run(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[str, Any]:
     stratum, _ = stratum_of(task.number)
     result: dict[str, Any] = asdict(stratum)
     refit = NullRefit()
@@ -58,7 +79,7 @@ def run_case(task: Task) -> dict[str, Any]:
             case = draw_case(task.seed, task.number, surviving=refit)
             result |= _truth(case, refit)
             at = "diagnosis"
-            result |= _diagnosed(case, task)
+            result |= diagnosed(case, task)
         # A campaign of thousands outlives the case that breaks the diagnosis, and tells of it.
         except (ProbewiseError, ArithmeticError, LookupError, ValueError) as error:
             result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
@@ -129,6 +150,23 @@ def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
         "settled": _settled(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }
+
+
+def _investigated(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
+    thinking, reading = (
+        np.random.default_rng(child)
+        for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(2)
+    )
+
+    def record(number: int, plan: Plan, _: str) -> Recording:
+        return case.recording if number == 1 else case.world.simulate(plan, rng=reading)
+
+    begun_s = time.process_time()
+    told = [
+        {**said(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
+        for each in investigate(record, case.recording.plan, rounds=rounds, rng=thinking)
+    ]
+    return {**told[-1], "readings": len(case.recording), "rounds": told, "cpu_s": time.process_time() - begun_s}
 
 
 def said(diagnosis: Diagnosis) -> dict[str, Any]:

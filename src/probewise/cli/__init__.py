@@ -27,6 +27,7 @@ from probewise.cli import (
     emulate_nxt,
     explore,
     fit,
+    investigate,
     predict,
     study,
 )
@@ -44,6 +45,7 @@ VERBS: tuple[Verb, ...] = (
     study.VERB,
     audit.VERB,
     diagnose.VERB,
+    investigate.VERB,
     fit.VERB,
     challenge.VERB,
     arm.VERB,

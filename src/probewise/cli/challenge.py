@@ -6,7 +6,7 @@ import argparse
 import shlex
 from functools import partial
 
-from probewise.cli._common import Verb, add_common, add_out_directory, positive_int, say
+from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, positive_int, say
 from probewise.cli._executor import add_executor, campaign_keeps, executor_of
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
@@ -29,6 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="recordings of twelve kinds of system, each with its owner's file, instead of a light sensor's",
     )
+    parser.add_argument(
+        "--rounds",
+        type=positive_int,
+        default=1,
+        metavar="N",
+        help="take the readings that the diagnosis asks for, until it is settled, N rounds at most (default 1: none)",
+    )
     add_executor(parser)
     add_common(parser)
 
@@ -36,13 +43,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the challenge and write its table."""
     from probewise._progress import progress_shown
-    from probewise.challenge import run_case, run_challenge, score
+    from probewise.challenge import Investigated, run_case, run_challenge, score, score_rounds
     from probewise.challenge.systems import run_system_case, score_systems
     from probewise.recordings import write_text_atomically
     from probewise.report import challenge as report
 
+    if arguments.systems and arguments.rounds > 1:
+        raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")
     out = check_out_directory(arguments.out)
     out.mkdir(parents=True, exist_ok=True)
+    work, scored, of = run_case, score, ""
+    if arguments.systems:
+        work, scored, of = run_system_case, score_systems, "systems"
+    elif arguments.rounds > 1:
+        work, scored, of = Investigated(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
     kept = partial(campaign_keeps, cases, "case", arguments)
     with (
@@ -53,23 +67,24 @@ def run(arguments: argparse.Namespace) -> int:
         results = run_challenge(
             arguments.cases,
             seed=arguments.seed,
-            work=run_system_case if arguments.systems else run_case,
-            of="systems" if arguments.systems else "",
+            work=work,
+            of=of,
             path=cases,
             executor=executor,
             progress=progress,
         )
-    rows = score_systems(results) if arguments.systems else score(results)
-    of = ["--systems"] if arguments.systems else []
+    rows = scored(results)
+    options = ["--systems"] if arguments.systems else []
+    options += ["--rounds", str(arguments.rounds)] if arguments.rounds > 1 else []
     command = shlex.join(
-        ["probewise", "challenge", *of, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
+        ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
     )
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
         write_text_atomically(
-            stage / "report.html", report.write_page(results, command=command, systems=arguments.systems)
+            stage / "report.html", report.write_page(results, rows, command=command, systems=arguments.systems)
         )
     say(report.answer(rows, len(results)), quiet=arguments.quiet)
     say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)

@@ -54,6 +54,7 @@ def diagnose(
     null: Null | None = None,
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
     thorough: Thorough | None = None,
+    hands: bool = True,
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Diagnosis:
@@ -74,6 +75,8 @@ def diagnose(
         formula (`UNNAMED`).
     thorough
         Weighs what leads a second time: `weigh_thoroughly`, by nested sampling.
+    hands
+        Whether somebody can lay or turn a sheet for the next readings; without, they are taken over what lies there.
     rng
         Source of randomness, for the null laws of the tests and the posterior samples.
     progress
@@ -93,7 +96,7 @@ def diagnose(
         If the fit of the null did not arrive anywhere.
     """
     require_rng(rng)
-    prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(dict(effects)))
+    prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(dict(effects), hands))
     return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
 
 

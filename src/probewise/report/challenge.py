@@ -8,9 +8,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probewise.challenge import Estimate, Row, by_effect, confusion, reliability, score
+from probewise.challenge import Estimate, Row, by_effect, confusion, reliability
 from probewise.challenge.scoring import answers, fits, leading, leading_name_right
-from probewise.challenge.systems import family_of, score_systems
+from probewise.challenge.systems import family_of
 from probewise.challenge.systems.table import gains_of
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
@@ -72,9 +72,8 @@ def table_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-def write_page(results: Results, *, command: str, systems: bool = False) -> str:
-    """Write the whole page; `command` is what made it, and `systems` says that the cases are of systems."""
-    rows = score_systems(results) if systems else score(results)
+def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: bool = False) -> str:
+    """Write the whole page; `rows` are its table, `command` made it, and `systems` says that cases are of systems."""
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (table_of_rows(rows), _legend()))]
     if done:

@@ -139,6 +139,7 @@ def test_targets_are_left_out_of_what_is_taken_for_what():
 def test_the_page_tells_every_case():
     failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
     strange = _case("outside", 20.0, truth=["unknown"], hides=[_hidden("strange_switch:u", 20.0, on_the_list=False)])
-    text = write_page([_case(), _single("drifts:k"), strange, failed], command="probewise challenge", systems=True)
+    results = [_case(), _single("drifts:k"), strange, failed]
+    text = write_page(results, score_systems(results), command="probewise challenge", systems=True)
     for expected in ("drifts:k", "strange_switch:u", "ParameterError: no", "right covariate first, lambda 12"):
         assert expected in text

@@ -17,7 +17,7 @@ from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
-__all__ = ["Excerpt", "commands", "distinct_scans", "excerpts", "reading_s", "rescheduled"]
+__all__ = ["Excerpt", "commands", "distinct_scans", "excerpts", "reading_s", "rescheduled", "rows_that_need_no_hand"]
 
 _LEAST_ROWS = 8
 _MOST_SCANS = 6
@@ -112,6 +112,15 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
                 words = f"take scan {name} with the sensor at {_RAISE * height_mm:.4g} mm{every}"
                 out.append(Scan("raise", words, _named(high, "raised")))
     return out
+
+
+def rows_that_need_no_hand(plan: Plan) -> IntArray:
+    """Find the rows that can be taken again with the sheet as it lies, and the sensor as it is mounted."""
+    last = int(np.argmax(plan.time_s))
+    same_sheet = plan.pattern == plan.pattern[last]
+    turned_rad = np.abs(np.angle(np.exp(1j * (plan.orientation_rad - plan.orientation_rad[last]))))
+    as_mounted = turned_rad < math.radians(_TURN_DEG) / 2
+    return np.flatnonzero(same_sheet & (as_mounted | ("orientation_deg" in plan.instrumentation.controls)))
 
 
 def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:

@@ -13,7 +13,7 @@ from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.ssf_forms import SsfForms
-from probewise.diagnosis.light_sensor.commands import commands
+from probewise.diagnosis.light_sensor.commands import commands, rows_that_need_no_hand
 from probewise.diagnosis.light_sensor.covariates import covariate_of, covariates_of, slope_along_the_move
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
@@ -31,10 +31,12 @@ __all__ = ["LightSensor"]
 class LightSensor:
     """A light sensor that an arm moves over patterns; `vocabulary` are the effects it may have, by name.
 
-    The vocabulary is a plain dict, which can be sent to another process.
+    The vocabulary is a plain dict, which can be sent to another process. `hands` says whether somebody can lay or
+    turn a sheet; without, the next scans are taken over the pattern of the last reading.
     """
 
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: dict(VOCABULARY))
+    hands: bool = True
     words: ClassVar[Words] = Words(
         null="the sensor",
         find_signal="scan across an edge",
@@ -85,4 +87,7 @@ class LightSensor:
 
     def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
         """List what the arm can do, and what a hand can: swap the target, or turn it."""
-        return [*commands(plan, strides=strides, level=level), *target_swaps(plan)]
+        if self.hands:
+            return [*commands(plan, strides=strides, level=level), *target_swaps(plan)]
+        rows = rows_that_need_no_hand(plan)
+        return commands(plan.take(rows), strides=strides, level=None if level is None else level[rows])

@@ -39,7 +39,7 @@ from probewise.report.plots.scans import before_and_after, residuals_by_scan
 from probewise.report.plots.scene import explain_field, playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
 from probewise.report.plots.study import readings_needed, widths_of_runs
-from probewise.report.plots.verdict import hypothesis_probabilities
+from probewise.report.plots.verdict import beliefs_by_round, hypothesis_probabilities
 
 __all__ = [
     "PAGE_IN",
@@ -48,6 +48,7 @@ __all__ = [
     "arm_and_sensor",
     "audit_matrix",
     "before_and_after",
+    "beliefs_by_round",
     "calibration_check",
     "confusion_matrix",
     "corner_plot",

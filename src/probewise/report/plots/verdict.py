@@ -1,16 +1,19 @@
-"""What the diagnosis believes, as bars."""
+"""What a diagnosis believes, and how that moves from round to round, as bars."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise.report.plots.canvas import BLUE, GREY, SMALL_PT, axes_or_new, tidy
+from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_new, legend_above, tidy
 
-__all__ = ["hypothesis_probabilities"]
+__all__ = ["beliefs_by_round", "hypothesis_probabilities"]
+
+_SHOWN = 6  # hypotheses with a colour of their own
+_VISIBLE = 0.02  # probability from which a hypothesis has one
 
 
 def hypothesis_probabilities(
@@ -45,4 +48,36 @@ def hypothesis_probabilities(
     ax.set_xticks(np.linspace(0.0, 1.0, 6))
     # Room for three bars at least, so that one alone is no wall.
     ax.set_ylim(min(at[-1], -2.0) - 0.5, 0.5)
+    return tidy(ax, x="probability", y="")
+
+
+def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
+    """Draw the probabilities of the hypotheses after each round, as one bar a round.
+
+    Parameters
+    ----------
+    beliefs
+        By name of the round, the first on top: the probability of each hypothesis by its name. The six with the
+        highest probability in any round have colours of their own, the others share a grey.
+    ax
+        Axes to draw on; a new figure without.
+    """
+    ax = axes_or_new(ax, size_in=(6.6, 1.3 + 0.5 * len(beliefs)))
+    highest: dict[str, float] = {}
+    for believed in beliefs.values():
+        for name, p in believed.items():
+            highest[name] = max(p, highest.get(name, 0.0))
+    likely = [name for name in sorted(highest, key=lambda name: -highest[name]) if highest[name] >= _VISIBLE]
+    shown = likely[:_SHOWN]
+    at = -np.arange(len(beliefs), dtype=np.float64)
+    left = np.zeros(len(beliefs))
+    for name, colour in zip(shown, CYCLE, strict=False):
+        width = np.array([believed.get(name, 0.0) for believed in beliefs.values()])
+        ax.barh(at, width, left=left, height=0.6, color=colour, edgecolor="white", linewidth=0.5, label=name)
+        left += width
+    if (left < 1.0 - 1e-3).any():
+        ax.barh(at, 1.0 - left, left=left, height=0.6, color=GREY, edgecolor="white", linewidth=0.5, label="all others")
+    ax.set_yticks(at, list(beliefs))
+    ax.set_xlim(0.0, 1.0)
+    legend_above(ax)
     return tidy(ax, x="probability", y="")

@@ -1,0 +1,98 @@
+"""The table of a challenge in rounds: what the readings that a diagnosis asks for are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from probewise.challenge.estimates import Estimate, mean, share
+from probewise.challenge.scoring import NOISE, answers, extras, fits, leading, leading_name_right, names_of, on_mean
+from probewise.challenge.table import Row, alarms, singles_of
+
+__all__ = ["score_rounds"]
+
+Result = Mapping[str, Any]
+
+_BOOTSTRAPS = 2000
+
+
+def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
+    """Score the results of `Investigated`: each target after the last round, below it the same after the first."""
+    last = [r for r in results if "failed" not in r]
+    first = [r | r["rounds"][0] for r in last]
+    return (
+        *_both(last, first, "right name first, lambda 8", lambda rs: _named(rs, 8.0), least=0.985),
+        *_both(last, first, "right name first, lambda 12", lambda rs: _named(rs, 12.0), least=0.995),
+        *_both(last, first, "size of the credible set, lambda 8", lambda rs: _set_size(rs, 8.0), most=1.15),
+        *_both(last, first, "size of the credible set, lambda 12", lambda rs: _set_size(rs, 12.0), most=1.05),
+        *_both(last, first, "95 % credible set holds the truth", _covered, least=0.95),
+        *_both(last, first, "detection, alpha .01, lambda 8", _detected, least=0.995),
+        *_both(last, first, "two effects: both named", _pairs_named, least=0.96),
+        *_both(last, first, "two effects: a false extra", _pairs_extra, most=0.03),
+        *_both(last, first, "physics named, clean", _physics_on_clean, most=0.005),
+        Row("extra readings, median of those not settled at once", _extra(last), most=80.0),
+        Row("settled at last", share([r["rounds"][-1]["settled"] for r in last])),
+        Row("processor time of an investigation (s)", mean([r["cpu_s"] for r in last])),
+        Row("cases that failed", share(["failed" in r for r in results])),
+    )
+
+
+def _both(
+    last: list[Result],
+    first: list[Result],
+    name: str,
+    scored: Any,
+    *,
+    least: float = -np.inf,
+    most: float = np.inf,
+) -> tuple[Row, Row]:
+    return Row(name, scored(last), least, most), Row(f"  after one round: {name}", scored(first))
+
+
+def _named(results: list[Result], size: float) -> Estimate:
+    return share([leading_name_right(r) for r in singles_of(results, size)])
+
+
+def _set_size(results: list[Result], size: float) -> Estimate:
+    return mean([float(len(r["credible_set"])) for r in singles_of(results, size)])
+
+
+def _covered(results: list[Result]) -> Estimate:
+    return share([any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in results])
+
+
+def _detected(results: list[Result]) -> Estimate:
+    return alarms([r for r in singles_of(results, 8.0) if on_mean(r)], 0.01)
+
+
+def _pairs(results: list[Result]) -> list[Result]:
+    return [r for r in results if r["kind"] == "pair"]
+
+
+def _pairs_named(results: list[Result]) -> Estimate:
+    return share([leading_name_right(r) for r in _pairs(results)])
+
+
+def _pairs_extra(results: list[Result]) -> Estimate:
+    def named(r: Result) -> list[str]:
+        return [name for name in leading(r, clean=True)[0] if name not in NOISE]
+
+    return share([bool(extras(named(r), answers(r, merged=True, noise=False))) for r in _pairs(results)])
+
+
+def _physics_on_clean(results: list[Result]) -> Estimate:
+    clean = [r for r in results if r["kind"] == "clean"]
+    return share([bool(set(r["combination"]) - NOISE - {"unknown"}) for r in clean])
+
+
+def _extra(results: list[Result]) -> Estimate:
+    """Estimate the median number of readings after the first round, of the cases that took any, with its interval."""
+    extra = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in results], dtype=np.float64)
+    extra = extra[extra > 0]
+    if not extra.size:
+        return mean([])
+    drawn = np.random.default_rng(0).choice(extra, (_BOOTSTRAPS, extra.size))
+    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    return Estimate(float(np.median(extra)), float(low), float(high), int(extra.size))

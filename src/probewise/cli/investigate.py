@@ -1,0 +1,182 @@
+"""`probewise investigate`: record, diagnose, take the readings that settle it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
+from probewise.cli._output import check_out_directory, staged
+from probewise.cli._stopping import saying_what_is_kept
+from probewise.errors import ParameterError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from probewise.recordings import Plan
+    from probewise.world import World
+
+__all__ = ["VERB"]
+
+PLANS = ("paper", "two_way")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument(
+        "--arm",
+        default="simulated",
+        metavar="ARM",
+        help="where the readings come from: simulated (the default)",
+    )
+    parser.add_argument(
+        "--plan",
+        required=True,
+        metavar="PLAN.csv",
+        help=f"what is recorded first: a plan or recording, its JSON beside it; or {' or '.join(PLANS)}, which ship",
+    )
+    add_out_directory(parser)
+    parser.add_argument(
+        "--sensor", type=a_path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="NAME:V,V",
+        help="what the simulated world conceals, such as backlash:0.5 or nothing; several joined by + (default: one "
+        "effect drawn from the seed, told at the end)",
+    )
+    parser.add_argument(
+        "--readings",
+        type=positive_int,
+        default=400,
+        metavar="N",
+        help="at most so many readings more than the first plan has (default 400)",
+    )
+    parser.add_argument(
+        "--minutes",
+        type=_minutes,
+        default=math.inf,
+        metavar="M",
+        help="at most so many minutes more (default: no limit)",
+    )
+    parser.add_argument(
+        "--rounds",
+        type=positive_int,
+        default=6,
+        metavar="N",
+        help="at most so many rounds, the first included (default 6)",
+    )
+    parser.add_argument(
+        "--no-hands",
+        action="store_true",
+        help="nobody is there to turn or lay a sheet: take only readings over what lies there",
+    )
+    parser.add_argument("--resume", action="store_true", help="go on from the rounds in DIR")
+    add_common(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Go round after round; keep every reading; write the report of all."""
+    import hashlib
+
+    import numpy as np
+
+    from probewise._progress import progress_shown
+    from probewise.calibration import read_sensor
+    from probewise.cli.diagnose import write_results
+    from probewise.diagnosis import join
+    from probewise.investigation import Budget, Investigation, RoundsFolder, SimulatedRecorder, investigate
+    from probewise.recordings import Recording, fingerprint, write_recording, write_text_atomically
+    from probewise.report import diagnosis as of_a_diagnosis
+    from probewise.report import investigation as report
+
+    out = check_out_directory(arguments.out)
+    if arguments.arm != "simulated":
+        raise ParameterError("--arm", arguments.arm, "simulated")
+    plan = _plan(arguments.plan)
+    sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+    truth_seed, noise_seed, rounds_seed, files_seed = np.random.SeedSequence(arguments.seed).spawn(4)
+    world = _world(arguments.truth, np.random.default_rng(truth_seed))
+    settings = {
+        "arm": arguments.arm,
+        "plan": fingerprint(Recording(plan, np.zeros(len(plan)))),
+        "sensor": None if arguments.sensor is None else hashlib.sha256(arguments.sensor.read_bytes()).hexdigest(),
+        "truth": arguments.truth,
+        "hands": not arguments.no_hands,
+        "seed": str(arguments.seed),
+    }
+    folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
+    take = SimulatedRecorder(world, int(noise_seed.generate_state(1)[0]))
+
+    def kept() -> str:
+        return keeps(folder.path, folder.n_readings, "reading", arguments, "--resume")
+
+    say(f"seed {arguments.seed}", quiet=arguments.quiet)
+    rounds = []
+    with saying_what_is_kept(kept), progress_shown(quiet=arguments.quiet) as progress:
+        for each in investigate(
+            partial(folder.record, take=take, progress=progress),
+            plan,
+            sensor=sensor,
+            budget=Budget(arguments.readings, arguments.minutes),
+            rounds=arguments.rounds,
+            hands=not arguments.no_hands,
+            rng=np.random.default_rng(rounds_seed),
+            progress=progress,
+        ):
+            rounds.append(each)
+    found = Investigation(tuple(rounds))
+    diagnosis = found.last.diagnosis
+    drawing = progress_shown(quiet=arguments.quiet)
+    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+        progress("drawing the report")
+        drawn = of_a_diagnosis.figures(diagnosis)
+        write_results(diagnosis, drawn, stage.folder, rng=np.random.default_rng(files_seed))
+        write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
+        concealed = tuple(effect.name for effect in world.concealed)
+        page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
+        write_text_atomically(stage / "report.html", page)
+    say(found.summary(), quiet=arguments.quiet)
+    say(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
+    say(f"written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _minutes(text: str) -> float:
+    """Read a number of minutes, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of minutes above 0")
+    return value
+
+
+def _plan(text: str) -> Plan:
+    from probewise.recordings import paper_plan, read_plan, two_way_plan
+
+    shipped = {"paper": paper_plan, "two_way": two_way_plan}
+    return shipped[text]() if text in shipped else read_plan(text)
+
+
+def _world(truth: str | None, rng: np.random.Generator) -> World:
+    """Build the world behind the shipped recordings, with what it is to conceal."""
+    from dataclasses import replace
+
+    from probewise.investigation import parse_concealed
+    from probewise.world.shipped import CANDIDATES
+    from probewise.world.shipped import truth as world_behind
+
+    concealed = (CANDIDATES[int(rng.integers(len(CANDIDATES)))],) if truth is None else parse_concealed(truth)
+    return replace(world_behind("paper"), concealed=concealed)
+
+
+VERB = Verb(
+    "investigate",
+    "Record, diagnose, take the readings that the diagnosis asks for, until it is settled.",
+    add_arguments,
+    run,
+)

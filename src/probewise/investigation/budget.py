@@ -1,0 +1,49 @@
+"""How much may be measured beyond the first plan."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.errors import ParameterError
+from probewise.recordings.plan import Plan
+
+__all__ = ["Budget"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Readings and minutes that may be spent after the first plan; infinite: as many as it takes.
+
+    Minutes are those of the plans: from the first reading of a round to its last, breaks between rounds included.
+    """
+
+    readings: float = 400
+    minutes: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("readings", "minutes"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(name, getattr(self, name), "0 or more")
+
+    def less(self, plan: Plan, after_s: float) -> Budget:
+        """Take off what a plan costs that begins after a time; never below nothing."""
+        return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes(plan, after_s), 0.0))
+
+    def affordable(self, plan: Plan, after_s: float) -> Plan | None:
+        """Keep the leading scans of a plan that can be afforded; None where not even the first can."""
+        kept = np.zeros(0, dtype=np.int64)
+        for rows in plan.rows_by_scan():
+            more = np.concatenate([kept, rows])
+            if len(more) > self.readings or _minutes(plan.take(more), after_s) > self.minutes:
+                break
+            kept = more
+        if len(kept) == len(plan):
+            return plan
+        return plan.take(kept) if kept.size else None
+
+
+def _minutes(plan: Plan, after_s: float) -> float:
+    return (float(plan.time_s.max()) - after_s) / 60.0

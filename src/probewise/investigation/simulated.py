@@ -1,0 +1,73 @@
+"""A simulated arm for investigations: a world that conceals something carries out the plans."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from probewise.arm import Pose, Reading
+from probewise.errors import ParameterError
+from probewise.recordings.plan import Plan
+from probewise.world import World, concealed
+from probewise.world.concealed import Concealed
+
+__all__ = ["SimulatedRecorder", "parse_concealed"]
+
+NOTHING = "nothing"
+
+
+@dataclass(frozen=True)
+class SimulatedRecorder:
+    """Carry out plans in a world; each round's noise follows from the seed and the round's number."""
+
+    world: World
+    seed: int
+
+    def __call__(self, number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
+        """Yield the readings of a round's plan that follow those taken already."""
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
+        recording = self.world.simulate(plan, rng=rng)
+        for row in range(len(taken), len(plan)):
+            pose = Pose(float(plan.x_mm[row]), float(plan.y_mm[row]), float(plan.orientation_rad[row]))
+            known = {name: float(values[row]) for name, values in plan.covariates.items()}
+            yield Reading(float(recording.readings[row]), pose, float(plan.time_s[row]), known)
+
+
+def parse_concealed(text: str) -> tuple[Concealed, ...]:
+    """Read what a world conceals: NAME:VALUE,VALUE, several joined by +, or "nothing".
+
+    Raises
+    ------
+    ParameterError
+        If there is no such effect, or it takes other values.
+    """
+    return () if text == NOTHING else tuple(_one(part) for part in text.split("+"))
+
+
+def _one(text: str) -> Concealed:
+    name, _, numbers = text.partition(":")
+    kinds = _kinds()
+    if name not in kinds:
+        near = difflib.get_close_matches(name, list(kinds), n=1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise ParameterError(
+            "--truth", name, f"{NOTHING}, or an effect of probewise.world.concealed with its values{meant}"
+        )
+    kind = kinds[name]
+    wanted = ",".join(field.name for field in fields(kind))
+    try:
+        return kind(*map(float, numbers.split(",")))  # type: ignore[no-any-return]
+    except (TypeError, ValueError) as error:
+        raise ParameterError("--truth", text, f"{name}:{wanted}, all of them numbers") from error
+
+
+def _kinds() -> dict[str, Any]:
+    """Give the effects that are described by numbers alone, by name."""
+    every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
+    named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]
+    of_numbers = [kind for kind in named if all(field.type == "float" for field in fields(kind))]
+    return {kind.name: kind for kind in of_numbers}

@@ -1,0 +1,120 @@
+"""The page of an investigation: what was thought after each round, why the next readings were taken, what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from probewise.diagnosis import p_in_words
+from probewise.effects import spoken_name
+from probewise.investigation import Investigation, Round
+from probewise.report import diagnosis as of_a_diagnosis
+from probewise.report.effect_words import hypothesis_in_words
+from probewise.report.headline import headline
+from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
+from probewise.report.plots import beliefs_by_round, png
+from probewise.report.terms import explained, terms_of
+from probewise.report.words import count, probability, readable
+
+__all__ = ["answer", "write_page"]
+
+_MOST_TOLD = 4
+_LEAST_TOLD = 0.005
+
+
+def answer(found: Investigation) -> str:
+    """Say what came out, and after how many readings."""
+    extra = found.extra_readings
+    taken = f"{count(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
+    came = "settled it" if found.last.settled else "did not settle it"
+    return f"{headline(found.last.diagnosis)} {taken} {came}."
+
+
+def write_page(
+    found: Investigation,
+    drawn: Mapping[str, bytes],
+    *,
+    source: str,
+    seed: int,
+    concealed: Sequence[str] | None = None,
+) -> str:
+    """Write the whole page.
+
+    Parameters
+    ----------
+    found
+        All rounds.
+    drawn
+        The figures of the last diagnosis, by file name.
+    source
+        Where the readings came from, in words.
+    seed
+        Of the run.
+    concealed
+        What a simulated world concealed, told at the end; None for a real arm.
+    """
+    last = found.last
+    beliefs = {_title(each): _beliefs(each) for each in found.rounds}
+    bars = figure(
+        png(beliefs_by_round(beliefs)),
+        "What was believed after each round: the probability of each explanation, given all readings so far.",
+    )
+    run = definition_list(
+        (
+            ("arm", source),
+            ("readings", f"{sum(len(each.recording) for each in found.rounds)} in {count(len(found.rounds), 'round')}"),
+            ("seed", str(seed)),
+            *(
+                (("the world concealed", ", ".join(map(spoken_name, concealed)) or "nothing"),)
+                if concealed is not None
+                else ()
+            ),
+        )
+    )
+    known: set[str] = set()
+    story = Section("How it came to that", (), tuple(_told(each) for each in found.rounds))
+    details = Section("The diagnosis of all readings", (), tuple(of_a_diagnosis.sections(last.diagnosis, drawn)))
+    return page(
+        f"Investigation: {last.diagnosis.verdict.replace('_', ' ')} after {count(len(found.rounds), 'round')}",
+        answer=answer(found),
+        key_figure=fragment(bars, *terms_of(bars, known)),
+        sections=explained([story, details, Section("This run", (run,))], known),
+    )
+
+
+def _title(each: Round) -> str:
+    n = count(len(each.recording), "reading")
+    return f"round {each.number}: {n}" if each.number == 1 else f"round {each.number}: {len(each.recording)} more"
+
+
+def _beliefs(each: Round) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for hypothesis in each.diagnosis.hypotheses:
+        name = hypothesis_in_words(hypothesis.effects)
+        out[name] = out.get(name, 0.0) + hypothesis.probability
+    return out
+
+
+def _told(each: Round) -> Section:
+    """Tell one round: what was read and why, what was believed then, what follows."""
+    diagnosis = each.diagnosis
+    why = "as the first plan has them" if each.number == 1 else f"as was asked for: {each.asked}"
+    likely = [(name, p) for name, p in _beliefs(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
+    asked = diagnosis.next_measurement
+    between = (
+        "" if asked is None or len(asked.between) < 2 else f", which tell {asked.between[0]} from {asked.between[1]}"
+    )
+    if each.stop_reason is not None:
+        then = f"Here it ends: {each.stop_reason}."
+    elif asked is None:
+        then = ""
+    else:
+        then = f"So the next readings are: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
+    said: tuple[Markup, ...] = (
+        paragraph(readable(f"{count(len(each.recording), 'reading').capitalize()} were taken, {why}.")),
+        paragraph(
+            readable(f"All readings so far: {p_in_words(diagnosis.p_value)} that nothing is missing from the mean.")
+        ),
+        table(("explanation", "probability"), ((name, probability(p)) for name, p in likely)),
+        paragraph(readable(then)),
+    )
+    return Section(_title(each)[:1].upper() + _title(each)[1:], said)

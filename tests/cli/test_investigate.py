@@ -1,0 +1,87 @@
+"""`probewise investigate` on the simulated arm: the rounds it keeps, the files it leaves, what it refuses."""
+
+import json
+
+import pytest
+
+from probewise.cli import main
+from probewise.recordings import paper_plan, read_recording, write_plan
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+@pytest.fixture
+def few(tmp_path):
+    """Two scans across the edge: a diagnosis of them is quick."""
+    plan = paper_plan()
+    path = tmp_path / "few.csv"
+    write_plan(plan.take(plan.scan < 2), path)
+    return path
+
+
+def test_one_round_leaves_a_diagnosis_and_all_it_was_made_of(few, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--seed", 1)
+    assert run("investigate", *options, "--out", out) == 0
+    names = {path.name for path in out.iterdir()}
+    assert {"diagnosis.json", "sensor.json", "calibrated.json", "recording.csv", "report.html", "rounds"} <= names
+    assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
+    assert json.loads((out / "diagnosis.json").read_text())["verdict"]
+    said = capsys.readouterr().out
+    assert "round 1:" in said
+    assert "concealed    nothing" in said
+    page = (out / "report.html").read_text()
+    assert "How it came to that" in page
+    assert "http://" not in page
+
+
+def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--quiet", "--out", out)
+    assert run("investigate", *options, "--seed", 1) == 0
+    before = (out / "rounds" / "1.csv").read_bytes()
+    assert run("investigate", *options, "--seed", 1) == 2
+    assert "--resume to go on with it" in capsys.readouterr().err
+    assert run("investigate", *options, "--seed", 2, "--resume") == 2
+    assert "seed '1'" in capsys.readouterr().err
+    assert (out / "rounds" / "1.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "way_out"),
+    [
+        (("--truth", "bcklash:1"), "did you mean backlash"),
+        (("--minutes", "-1"), "above 0"),
+        (("--readings", "0"), "above 0"),
+        (("--plan", "nowhere.csv"), "nowhere.csv"),
+    ],
+)
+def test_bad_input_is_told_in_one_line_and_nothing_is_written(few, tmp_path, capsys, options, way_out):
+    out = tmp_path / "out"
+    try:
+        status = run("investigate", "--plan", few, "--out", out, *options)
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    said = capsys.readouterr().err
+    assert way_out in said
+    assert len(said.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_an_aliased_effect_is_settled_by_the_readings_that_are_asked_for(tmp_path):
+    """And a resumed investigation ends as the one that was never cut, byte for byte."""
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    options = ("--plan", "paper", "--truth", "backlash:0.5", "--seed", 4, "--quiet")
+    assert run("investigate", *options, "--out", whole) == 0
+    found = json.loads((whole / "diagnosis.json").read_text())
+    assert found["hypotheses"][0]["effects"] == ["backlash"]
+    assert found["hypotheses"][0]["probability"] > 0.95
+    assert (whole / "rounds" / "2.csv").exists()
+    assert run("investigate", *options, "--out", cut, "--rounds", 1) == 0
+    assert run("investigate", *options, "--out", cut, "--resume") == 0
+    for name in ("diagnosis.json", "recording.csv", "sensor.json", "rounds/2.csv"):
+        assert (cut / name).read_bytes() == (whole / name).read_bytes(), name

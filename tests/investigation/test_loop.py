@@ -1,0 +1,105 @@
+"""The loop of an investigation: when it goes on, what it asks, and why it ends."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import Hypothesis
+from probewise.errors import ParameterError
+from probewise.investigation import Budget, investigate, settled_by
+from probewise.recordings import Recording, paper_plan
+
+
+def scans(*numbers):
+    plan = paper_plan()
+    return plan.take(np.isin(plan.scan, numbers))
+
+
+def diagnosis(p, *, verdict="named", ask=True):
+    rows = scans(1)
+    asked = SimpleNamespace(plan=rows, description="take it again", minutes=1.0) if ask else None
+    hypotheses = (Hypothesis(("lag",), p), Hypothesis((), 1 - p))
+    return SimpleNamespace(hypotheses=hypotheses, verdict=verdict, next_measurement=asked, reason="")
+
+
+@pytest.fixture
+def diagnosed(monkeypatch):
+    """Let `diagnose` return what is put in, one after another, and tell what it was asked."""
+
+    def with_results(*results):
+        calls, waiting = [], iter(results)
+
+        def diagnose(recordings, **options):
+            calls.append((list(recordings), options))
+            return next(waiting)
+
+        monkeypatch.setattr("probewise.investigation.loop.diagnose", diagnose)
+        return calls
+
+    return with_results
+
+
+def record(number, plan, asked):
+    return Recording(plan, np.full(len(plan), float(number)))
+
+
+def rounds_of(**options):
+    return list(investigate(record, scans(0), rng=np.random.default_rng(0), **options))
+
+
+def test_it_ends_as_soon_as_one_hypothesis_is_settled(diagnosed):
+    calls = diagnosed(diagnosis(0.6), diagnosis(0.97))
+    rounds = rounds_of()
+    assert [each.settled for each in rounds] == [False, True]
+    assert rounds[-1].stop_reason == "lag has probability 0.970"
+    assert [len(recordings) for recordings, _ in calls] == [1, 2]
+    assert rounds[1].asked == "take it again"
+
+
+def test_what_the_verdict_does_not_state_is_not_settled():
+    assert settled_by(diagnosis(0.99, verdict="cannot_tell")) is None
+    assert settled_by(diagnosis(0.949)) is None
+    assert settled_by(diagnosis(0.95)) is not None
+
+
+def test_it_ends_where_nothing_would_tell_more(diagnosed):
+    diagnosed(diagnosis(0.6, ask=False))
+    assert rounds_of()[-1].stop_reason == "no further reading would tell more"
+
+
+def test_it_ends_when_the_budget_is_spent(diagnosed):
+    n = len(scans(1))
+    diagnosed(*[diagnosis(0.6)] * 3)
+    rounds = rounds_of(budget=Budget(readings=2 * n))
+    assert len(rounds) == 3
+    assert rounds[-1].stop_reason == "what may be spent on readings is spent"
+    assert sum(len(each.recording) for each in rounds[1:]) == 2 * n
+
+
+def test_it_ends_after_the_rounds_that_were_allowed(diagnosed):
+    diagnosed(*[diagnosis(0.6)] * 2)
+    assert rounds_of(rounds=2)[-1].stop_reason == "2 rounds are over"
+
+
+def test_a_round_thinks_alike_however_often_the_others_were_run(diagnosed):
+    calls = diagnosed(*[diagnosis(0.6)] * 2, *[diagnosis(0.6)] * 3)
+    rounds_of(rounds=2)
+    rounds_of(rounds=3)
+    drawn = [options["rng"].random() for _, options in calls]
+    assert drawn[:2] == drawn[2:4]
+
+
+def test_it_is_known_whether_hands_are_there(diagnosed):
+    calls = diagnosed(diagnosis(0.97))
+    rounds_of(hands=False)
+    assert calls[0][1]["hands"] is False
+
+
+def test_wrong_kinds_are_refused_before_anything_is_read():
+    with pytest.raises(ParameterError, match="record"):
+        investigate(None, scans(0), rng=np.random.default_rng(0))
+    with pytest.raises(ParameterError, match="rounds"):
+        investigate(record, scans(0), rng=np.random.default_rng(0), rounds=0)
+    with pytest.raises(ParameterError, match="rng"):
+        investigate(record, scans(0), rng=3)

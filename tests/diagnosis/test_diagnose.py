@@ -115,6 +115,7 @@ def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
     assert found.judged.unknown_probability < 0.03
 
 
+@pytest.mark.slow
 def test_backlash_is_named_measured_located_and_repaired():
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     document = strict(found)

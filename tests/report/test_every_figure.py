@@ -143,6 +143,7 @@ def test_every_plot_function_is_here():
     assert {name.partition(",")[0] for name in FIGURES} == set(plots.__all__) - others - of_a_diagnosis
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_is_pyplots_can_be_read_and_its_key_hides_nothing(name, result, recording):
     drawn = FIGURES[name](SimpleNamespace(result=result, recording=recording))

@@ -88,7 +88,7 @@ def test_what_cannot_be_reached_is_nan_in_its_row_only():
 def test_the_shipped_arm_holds_nearly_the_whole_field_and_nothing_off_it():
     assert 0.95 < SHIPPED.holds(GRID).mean() < 1.0
     assert not SHIPPED.holds(np.array([[524.0, 521.0], [-1.0, 300.0], [1049.0, 300.0]])).any()
-    assert "109 to 755 mm from the arm's axis at (524, 580) mm" in SHIPPED.sentence()
+    assert "126 to 755 mm from the arm's axis at (524, 580) mm" in SHIPPED.sentence()
 
 
 def test_the_sensor_turns_with_the_base():

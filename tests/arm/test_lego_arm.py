@@ -341,7 +341,7 @@ def test_a_simulated_arm_takes_the_geometry_of_a_real_one():
     np.testing.assert_array_equal(arm.reachable(places), SHIPPED.holds(places))
     np.testing.assert_array_equal(arm.orientation_rad(places), SHIPPED.orientation_rad(places))
     assert arm.measure(Pose(*PLACES[0])).value == 50
-    with pytest.raises(ReachError, match="109 to 755 mm"):
+    with pytest.raises(ReachError, match="126 to 755 mm"):
         arm.measure(Pose(2.0, 2.0))
     plain = SimulatedArm(lambda pose, time_s, height_mm: 50.0)
     np.testing.assert_array_equal(plain.orientation_rad(places), 0.0)

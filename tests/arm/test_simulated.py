@@ -5,7 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import Instrument, LegoScale, Pose, Reach, Reading, SimulatedArm, Speed
+from probewise.arm import (
+    Instrument,
+    LegoScale,
+    Pose,
+    Reach,
+    Reading,
+    SimulatedArm,
+    Speed,
+    read_geometry,
+    shipped_geometry,
+)
 from probewise.errors import ParameterError, ReachError, ShapeError
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 131), np.linspace(0, 520, 65)), axis=-1).reshape(-1, 2)
@@ -16,14 +26,24 @@ def flat(value):
     return lambda pose, time_s, height_mm: value
 
 
-def test_the_arm_reaches_all_but_the_two_far_corners():
+def test_the_arm_reaches_all_but_the_two_far_corners_and_what_is_too_near():
     """Paper, Fig. entropy-map: dark jagged edges at the bottom, where the arm does not reach."""
     held = Reach().holds(GRID)
     assert 0.95 < held.mean() < 0.99
     missed = GRID[~held]
-    assert missed[:, 1].max() < 120
-    assert set(np.sign(missed[:, 0] - 524)) == {-1, 1}
-    assert held[(abs(GRID[:, 0] - 524) < 380)].all()
+    far, near = missed[missed[:, 1] < 260], missed[missed[:, 1] >= 260]
+    assert far[:, 1].max() < 120
+    assert set(np.sign(far[:, 0] - 524)) == {-1, 1}
+    assert np.hypot(near[:, 0] - 524, near[:, 1] - 580).max() < 126
+
+
+def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
+    """Two routes to one reach, a ring to the mm, and the joints of the shipped geometry with room for their motors."""
+    shipped, ring = read_geometry(shipped_geometry()), Reach()
+    away = np.hypot(*(GRID - ring.axis_mm).T)
+    apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
+    np.testing.assert_array_equal(ring.holds(GRID[apart]), shipped.holds(GRID[apart]))
+    assert shipped.sentence().startswith(Reach().sentence())
 
 
 def test_a_longer_arm_reaches_everywhere():
@@ -66,7 +86,7 @@ def test_a_reach_without_sense_is_refused(changes):
 def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(pose):
     arm = SimulatedArm(flat(50.0))
     before = arm.pose, arm.time_s
-    with pytest.raises(ReachError, match=r"40 to 700 mm from the arm's axis at \(524, 580\)"):
+    with pytest.raises(ReachError, match=r"126 to 755 mm from the arm's axis at \(524, 580\)"):
         arm.measure(pose)
     assert (arm.pose, arm.time_s) == before
 

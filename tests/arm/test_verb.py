@@ -16,7 +16,7 @@ def said(capsys, *arguments, status=0):
 
 def test_check_says_and_draws_how_far_the_arm_reaches(tmp_path, capsys):
     out = said(capsys, "arm", "check", "--out", tmp_path / "reach.png").out
-    assert "109 to 755 mm from the arm's axis" in out
+    assert "126 to 755 mm from the arm's axis" in out
     assert "% of it within reach" in out
     assert (tmp_path / "reach.png").read_bytes().startswith(b"\x89PNG")
 

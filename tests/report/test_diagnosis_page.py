@@ -71,8 +71,10 @@ def test_every_figure_is_svg_that_a_browser_can_read(saturated):
 @pytest.mark.slow
 def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     """Its mean says nothing where the residual changes its sign within the scan."""
-    scan = saturated.recording.plan.scan_names[0]
-    place = dataclasses.replace(saturated.where[0], covariate="scan", scan=scan, start=None, end=None, level=None)
+    plan, usable = saturated.recording.plan, saturated.recording.usable
+    scan, by_row = plan.scan_names[0], plan.scan[usable].astype(float)
+    changed = {"covariate": "scan", "scan": scan, "start": None, "end": None, "values": by_row}
+    place = dataclasses.replace(saturated.where[0], **changed, without_effect=False)
     drawn = page.figures(dataclasses.replace(saturated, where=(place,)))
     shown = drawn[place.witness].decode()
     assert shown.count("<!-- one reading -->") == 2

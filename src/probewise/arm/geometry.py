@@ -195,12 +195,12 @@ class Geometry:
 
     @property
     def nearest_mm(self) -> float:
-        """How near to the axis the sensor can come, at the height at which it reads."""
+        """How near to the axis the sensor can read."""
         return float(self._ring_mm()[0])
 
     @property
     def farthest_mm(self) -> float:
-        """How far from the axis the sensor can come, at the height at which it reads."""
+        """How far from the axis the sensor can read."""
         return float(self._ring_mm()[1])
 
     @property
@@ -262,11 +262,8 @@ class Geometry:
     def holds(self, places_mm: FloatArray) -> BoolArray:
         """Tell which places, shape (n, 2), are on the field and leave the motors room to arrive: shape (n,)."""
         places = _columns(places_mm, 2)
-        room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
-        read, travel = (self.angles_rad(places, height) for height in (self.read_height_mm, self.travel_height_mm))
-        roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
-        return np.asarray(on_field & np.all(roomy, axis=0))
+        return np.asarray(on_field & self._leaves_room(places))
 
     def allows(self, angles_rad: FloatArray) -> BoolArray:
         """Tell which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
@@ -293,12 +290,19 @@ class Geometry:
             f"{self.farthest_mm:.0f} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm, within its joints' limits"
         )
 
+    def _leaves_room(self, places_mm: FloatArray) -> BoolArray:
+        """Tell over which places, shape (n, 2), the motors have room to arrive, reading and travelling: shape (n,)."""
+        room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
+        read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
+        roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
+        return np.asarray(np.all(roomy, axis=0))
+
     def _ring_mm(self) -> tuple[float, float]:
-        """Least and greatest distance from the axis at the height of reading; NaN where there is none."""
+        """Least and greatest distance from the axis, in whole mm, at which the motors have room; NaN where none is."""
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
-        within = away[np.isfinite(self.angles_rad(places, self.read_height_mm)).all(axis=-1)]
+        within = away[self._leaves_room(places)]
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
 
 

@@ -42,8 +42,9 @@ class Workspace(Protocol):
 class Reach:
     """A ring about the arm's axis, cut by the field.
 
-    The axis stands beyond the middle of the field's upper long side. The default leaves out the two
-    corners farthest from it, 3 % of the field, at the bottom of the paper's entropy map.
+    The axis stands beyond the middle of the field's upper long side. The default is the reach of the LEGO arm whose
+    geometry ships with the package. It leaves out 2 % of the field: the two corners farthest from the axis, at the
+    bottom of the paper's entropy map, and the places nearest to it, where the arm cannot fold.
 
     Parameters
     ----------
@@ -64,8 +65,8 @@ class Reach:
 
     field_mm: tuple[float, float] = FIELD_MM
     axis_beyond_mm: float = 60.0
-    nearest_mm: float = 40.0
-    farthest_mm: float = 700.0
+    nearest_mm: float = 126.0
+    farthest_mm: float = 755.0
 
     def __post_init__(self) -> None:
         width, height = self.field_mm

@@ -29,13 +29,13 @@ __all__ = [
 WAIT_S = 0.5  # where a wait for a person hears no signal, it lasts so long; the brick is then kept awake
 
 
-def add_geometry(parser: argparse.ArgumentParser) -> None:
-    """Add --geometry."""
+def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that ships") -> None:
+    """Add --geometry, and say what stands for it where it is not given."""
     parser.add_argument(
         "--geometry",
         type=a_path,
         metavar="ARM.toml",
-        help="the arm as built: lengths, gears, ports, limits (default: the file that ships)",
+        help=f"the arm as built: lengths, gears, ports, limits (default: {default})",
     )
 
 

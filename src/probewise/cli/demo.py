@@ -98,7 +98,7 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
         for name, png in drawn.items():
             write_bytes_atomically(stage / name, png)
         (stage / "diagnosis").mkdir()
-        rng = np.random.default_rng([seed, 3])
+        *_, rng = diagnose_verb.generators(seed)
         diagnose_verb.write_results(diagnosis, witnesses, stage / "diagnosis", rng=rng)
         write_text_atomically(stage / "diagnosis" / "report.html", diagnosis_page)
         page = report.write_page(
@@ -230,12 +230,13 @@ def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], se
 
 
 def _diagnose(seed: int) -> Diagnosis:
-    import numpy as np
-
+    """Diagnose the second recording as `probewise diagnose` does, to the same numbers."""
+    from probewise.cli.diagnose import generators
     from probewise.diagnosis import diagnose
     from probewise.recordings import read_recording, shipped
 
-    return diagnose(read_recording(shipped("concealed")), rng=np.random.default_rng([seed, 4]))
+    rng, *_ = generators(seed)
+    return diagnose(read_recording(shipped("concealed")), rng=rng)
 
 
 VERB = Verb("demo", "Do all of it: calibrate, find a hidden circle with two models, diagnose.", add_arguments, run)

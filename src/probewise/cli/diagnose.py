@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from probewise.diagnosis import Diagnosis
 
-__all__ = ["VERB", "write_results"]
+__all__ = ["VERB", "generators", "write_results"]
 
 _OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 
@@ -55,8 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
         return diagnose_simulator(arguments)
     from functools import partial
 
-    import numpy as np
-
     from probewise._progress import of_nested, progress_shown
     from probewise.calibration import read_sensor
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
@@ -80,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
             shapes.append(shape)
         if len(shapes) > 1:
             raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
-        diagnosis_rng, nested_rng, files_rng = np.random.default_rng(arguments.seed).spawn(3)
+        diagnosis_rng, nested_rng, files_rng = generators(arguments.seed)
         joined = join(recordings)
         null = None
         if sensor is not None and shapes:
@@ -110,6 +109,13 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def generators(seed: int) -> Sequence[np.random.Generator]:
+    """Give the randomness of a diagnosis, of its nested sampling, and of the samples in its files."""
+    import numpy as np
+
+    return np.random.default_rng(seed).spawn(3)
 
 
 def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:

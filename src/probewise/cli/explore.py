@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ARM",
         help="where the readings come from: simulated (the default), or nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5",
     )
-    add_geometry(parser)
+    add_geometry(parser, "the file that ships; the simulated arm has its reach, and a sensor that does not turn")
     parser.add_argument(
         "--max-readings",
         type=positive_int,

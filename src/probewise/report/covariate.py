@@ -6,7 +6,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.light_sensor.covariates import covariates_of, slope_along_the_move
 from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.report.words import unit_name
 
@@ -88,26 +87,14 @@ def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     """Give each row's value of the covariate of each place, (n_points,), by the place's witness.
 
-    NaN for rows that a place does not speak of.
+    NaN for rows that a place does not speak of. They are the values in which the place was found: a window of three
+    readings holds others where a slope is worked out from another estimate of the same sensor.
     """
-    if not diagnosis.where:
-        return {}
-    if isinstance(diagnosis.apparatus, PersonsSystem):
-        found = diagnosis.apparatus.covariates_by_row(diagnosis.repair.before.readings)
-        return {place.witness: found[place.covariate] for place in diagnosis.where}
-    plan = diagnosis.recording.plan
-    usable = np.flatnonzero(diagnosis.recording.usable)
-    covariates = covariates_of(plan, usable, diagnosis.repair.before.readings[usable], _slope(diagnosis)[usable])
-    out = {}
+    usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:
-        values = np.full(len(plan), np.nan)
-        for covariate in covariates:
-            # Of the covariate `scan` a place names the scan that stands out; all others are shown beside it.
-            if covariate.name == place.covariate and (covariate.scan == place.scan or place.covariate == "scan"):
-                values[usable[covariate.rows]] = covariate.values
-        if place.level is not None and len(place.level) == len(usable):
-            values[usable] = place.level
-        out[place.witness] = values
+        out[place.witness] = np.full(len(diagnosis.recording), np.nan)
+        if place.values is not None:
+            out[place.witness][usable] = place.values
     return out
 
 
@@ -123,9 +110,3 @@ def category_names(diagnosis: Diagnosis, place: Place) -> dict[float, str] | Non
             return {float(angle): f"{angle:g}°" for angle in angles} if len(angles) <= 24 else None
         case _:
             return None
-
-
-def _slope(diagnosis: Diagnosis) -> FloatArray:
-    """Differentiate the calibrated model's prediction along each row's move, per mm."""
-    known, theta = diagnosis.null.chain, diagnosis.null.theta.mean(axis=0, keepdims=True)
-    return slope_along_the_move(lambda moved: known.predict(theta, moved)[0], diagnosis.recording.plan)

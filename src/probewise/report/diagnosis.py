@@ -29,6 +29,7 @@ from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hyp
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.terms import explained, terms_of
+from probewise.report.witness import Chance, seen_first
 from probewise.report.words import count, number, probability, readable, unit_name
 
 __all__ = ["answer", "figures", "sections", "write_page"]
@@ -304,13 +305,16 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    """Show the strongest places, the others folded away."""
+    """Show what the headline names and what is seen first, the rest folded away."""
     if not diagnosis.where:
         return (paragraph("Nothing stands out more than noise explains."),)
-    shown = [figure(drawn[place.witness], _where(diagnosis, place)) for place in diagnosis.where]
+    shown = [
+        figure(drawn[place.witness], _where(diagnosis, place, seen=seen))
+        for place, seen in seen_first(diagnosis, Chance.of(diagnosis))
+    ]
     opening = paragraph(
-        "Residuals of the calibrated model against each covariate in which they stand out, the strongest first. Each "
-        "dot is a reading; 95 % of the means lie in the grey band by chance alone."
+        "Residuals of the calibrated model against each covariate in which they stand out. First comes what the headline "
+        "names, then what is seen best. Each dot is a reading; 95 % of the means lie in the grey band by chance alone."
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
     more = (element("details", element("summary", f"{len(rest)} more"), *rest),) if rest else ()
@@ -320,7 +324,7 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
 def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     run = diagnosis.apparatus.words.run
     which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
-    colours = "solid orange as calibrated, dashed blue repaired" if diagnosis.repair.changes_predictions else "orange"
+    colours = "orange as calibrated, blue repaired" if diagnosis.repair.changes_predictions else "orange"
     return (
         figure(
             drawn["before_after.svg"],
@@ -489,8 +493,8 @@ def _sentence(text: str) -> str:
     return readable(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
 
 
-def _where(diagnosis: Diagnosis, place: Place) -> str:
-    """Say where the residuals stand out."""
+def _where(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
+    """Say where the residuals stand out, and whether it is seen in their means."""
     run = diagnosis.apparatus.words.run
     covariate, unit = words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:
@@ -504,4 +508,5 @@ def _where(diagnosis: Diagnosis, place: Place) -> str:
     if place.scan and place.covariate != run:
         what += f", {run} {place.scan}"
     chance = "" if place.p_value < ALARM else ", which may be chance"
-    return readable(f"What stands out: {what} ({p_in_words(place.p_value)}{chance}).")
+    hidden = "" if seen else " No mean leaves the band: what changes its sign, or scatters, leaves none."
+    return readable(f"What stands out: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")

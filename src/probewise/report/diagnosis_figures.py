@@ -27,7 +27,7 @@ from probewise.report.plots import (
     tails,
 )
 from probewise.report.plots.residuals import AFTER, BEFORE
-from probewise.report.witness import Chance, Witness, along_scan, of_place, telling
+from probewise.report.witness import Chance, Witness, along_scan, is_line, of_place, telling
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
@@ -135,18 +135,19 @@ def _side_by_side(at: FloatArray) -> FloatArray:
 
 
 def _before_and_after(diagnosis: Diagnosis) -> bytes:
-    """Draw the scan that the repair changes most, or the longest: readings, models, and the residuals of each."""
+    """Draw the scan along a line that the repair changes most, or the longest: readings, models, residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    change = np.abs(diagnosis.repair.after.readings - diagnosis.repair.before.readings)
+    change = diagnosis.repair.after.readings - diagnosis.repair.before.readings
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
-    rows = max(scans, key=lambda r: (float(np.sqrt(np.mean(change[r] ** 2))), r.size))
+    lines = [rows for rows in scans if is_line(plan, rows)]
+    rows = max(lines or scans, key=lambda r: (float(change[r] @ change[r]), r.size))
     shown = along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = unit_name(plan.instrumentation.unit)
     models = models if diagnosis.repair.changes_predictions else models[:1]
-    return svg(one_scan(shown.at[rows], readings, models, label=shown.label, unit=unit))
+    return svg(one_scan(shown.at[rows], readings, models, joined=bool(lines), label=shown.label, unit=unit))
 
 
 def _residuals(diagnosis: Diagnosis) -> bytes:

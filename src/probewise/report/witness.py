@@ -7,19 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import ALARM, Diagnosis, Place
 from probewise.effects import UNNAMED, public_name
+from probewise.recordings import Plan
 from probewise.report.covariate import category_names, covariate_values, label_of, words_and_unit
 from probewise.report.residual_means import Means, mean_residuals
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
-__all__ = ["Chance", "Witness", "along_scan", "of_place", "telling"]
+__all__ = ["Chance", "Witness", "along_scan", "is_line", "of_place", "seen_first", "telling"]
 
 _SEEN = 2.3  # sds of chance from which a mean is seen to stand out
 _N_SAMPLES = 200  # of the posterior, for what the fit absorbs
 _ASTRAY = 0.01  # of its length, by which a scan may leave its line
+_LEAST_PLACES = 3  # that make a line
 _LEAST_PERIODS = 3.0  # within a recording, for folding it
 
 
@@ -90,9 +92,7 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
     places = sorted(alarming, key=lambda place: -_likeness(diagnosis, place))
     found = _folded(diagnosis)
     for place in places:
-        if place.covariate == diagnosis.apparatus.words.run and place.scan is not None:
-            found.append(along_scan(diagnosis, place.scan, place))
-        found.append(of_place(diagnosis, place, values[place.witness]))
+        found += _views(diagnosis, place, values[place.witness])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_by_change(diagnosis))
     if not found:
@@ -101,11 +101,43 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
 
+def seen_first(diagnosis: Diagnosis, chance: Chance) -> list[tuple[Place, bool]]:
+    """Order the places as a reader looks for them, each with whether a mean is seen to leave the band of chance.
+
+    First comes what the unknown varies with, of which the headline speaks; then what is seen; then what is not.
+    """
+    values, seen = covariate_values(diagnosis), {}
+    for place in diagnosis.where:
+        views = _views(diagnosis, place, values[place.witness])
+        seen[place.witness] = any(chance.means(diagnosis, w, after=False).stands_out >= _SEEN for w in views)
+    ordered = sorted(diagnosis.where, key=lambda p: (-_likeness(diagnosis, p), not seen[p.witness]))
+    shown: list[Place] = []
+    for place in ordered:  # where there is one scan, a place in all scans and one in that scan are the same
+        if not any(_is_same(values, place, other) for other in shown):
+            shown.append(place)
+    return [(place, seen[place.witness]) for place in shown]
+
+
+def _is_same(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
+    """Tell whether two places are one window of one covariate."""
+    ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
+    own, others = values[place.witness], values[other.witness]
+    return ends and place.start is not None and np.array_equal(own, others, equal_nan=True)
+
+
+def _views(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[Witness]:
+    """Show a place by its covariate, (n_points,); a scan along its way first."""
+    by_covariate = of_place(diagnosis, place, at)
+    if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
+        return [by_covariate]
+    return [along_scan(diagnosis, place.scan, place), by_covariate]
+
+
 def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> Witness:
     """Show a place along its covariate, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
     label = label_of(diagnosis, place.covariate, place.scan)
-    if place.level is not None:
+    if place.without_effect:
         label = f"reading to be expected without it ({unit_name(unit)})"
     names = category_names(diagnosis, place)
     return Witness(at, label, names, _window(place, at, names), place)
@@ -122,17 +154,21 @@ def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> W
         return Witness(at, label_of(diagnosis, "time" if plan.has_time else "row", whole), place=place)
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
-    if np.ptp(along) == 0 or not _on_a_line(x_mm, y_mm):
+    if not is_line(plan, rows):
         along, label = plan.time_s[rows], "time (s)"
     at = np.full(len(plan), np.nan)
     at[rows] = along
     return Witness(at, f"{label}, scan {scan}", place=place)
 
 
-def _on_a_line(x_mm: FloatArray, y_mm: FloatArray) -> bool:
-    places = np.stack([x_mm - x_mm.mean(), y_mm - y_mm.mean()])
-    widest, across = np.linalg.svd(places, compute_uv=False)
-    return bool(across <= _ASTRAY * widest)
+def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
+    """Tell whether rows of one scan were taken along a line, at three places or more; those of a table, in time."""
+    if isinstance(plan, RunTable):
+        return True
+    places = np.stack([plan.x_mm[rows], plan.y_mm[rows]])
+    widest, across = np.linalg.svd(places - places.mean(axis=1, keepdims=True), compute_uv=False)
+    several = np.unique(places.round(6), axis=1).shape[1] >= _LEAST_PLACES
+    return bool(several and across <= _ASTRAY * widest)
 
 
 def _likeness(diagnosis: Diagnosis, place: Place) -> float:

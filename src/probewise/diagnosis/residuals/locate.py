@@ -37,8 +37,9 @@ class Place:
     """A window of a covariate where the residual stands out, with its witness curve.
 
     `start`, `end` in the covariate's unit, None for a scan; the curve is the residual's mean in bins of
-    the covariate, with the noise sd of that mean. `level` (n_points,) is what would be read without the effect
-    that is there, where that is the covariate: the calibrated model does not know of it.
+    the covariate, with the noise sd of that mean. `values` (n_usable,) are the covariate's at each usable reading, NaN
+    where it has none, as the window was found in them; `without_effect` says that they are what would be read without
+    the effect that is there, of which the calibrated model does not know.
     """
 
     covariate: str
@@ -50,11 +51,12 @@ class Place:
     curve_at: FloatArray
     curve_mean: FloatArray
     curve_sd: FloatArray
-    level: FloatArray | None = None
+    values: FloatArray | None = None
+    without_effect: bool = False
 
     def __post_init__(self) -> None:
-        if self.level is not None:
-            object.__setattr__(self, "level", frozen(self.level))
+        if self.values is not None:
+            object.__setattr__(self, "values", frozen(self.values))
         for name in ("curve_at", "curve_mean", "curve_sd"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
@@ -248,9 +250,9 @@ def places_of_effect(
     # What sets in at a level is there from where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]
-    level = covariate.values if name == "level" else None
     curve = _curve(covariate, residuals, sd)
-    return [Place(name, None, float(values.min()), float(values.max()), p_value, size, **curve, level=level)]
+    start, end = float(values.min()), float(values.max())
+    return [Place(name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
 
 
 def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
@@ -262,12 +264,16 @@ def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> 
 
 
 def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, FloatArray]:
+    """Give the covariate at each reading, and the witness curve."""
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:
         parts = [np.flatnonzero(values == value) for value in np.unique(values)]
     else:
         parts = np.array_split(np.argsort(values, kind="stable"), min(30, max(len(values) // 4, 1)))
+    by_row = np.full(len(residuals), np.nan)
+    by_row[covariate.rows] = values
     return {
+        "values": by_row,
         "curve_at": np.array([values[p].mean() for p in parts]),
         "curve_mean": np.array([mine[p].mean() for p in parts]),
         "curve_sd": np.array([sd / math.sqrt(len(p)) for p in parts]),

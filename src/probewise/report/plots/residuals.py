@@ -108,6 +108,7 @@ def one_scan(
     readings: FloatArray,
     models: Sequence[tuple[str, FloatArray]],
     *,
+    joined: bool = True,
     label: str,
     unit: str,
 ) -> AxesGrid:
@@ -119,6 +120,8 @@ def one_scan(
         Place or time, and reading, (n_rows,); NaN where there is no usable reading.
     models
         Name and predicted readings, (n_rows,), the calibrated model first.
+    joined
+        Whether the rows are places along a line, which a curve may join.
     label, unit
         Of the x axis with its unit; of the readings.
 
@@ -131,9 +134,12 @@ def one_scan(
     above.plot(along, readings, "o", color=BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
     below.axhline(0, color=BLACK, linewidth=0.7)
     for (name, predicted), (colour, marker, line) in zip(models, _STYLES, strict=False):
-        above.plot(along, predicted, color=colour, linewidth=1.6, linestyle=line, label=f"predicted, {name}")
         style = {"color": colour, "marker": marker, "markersize": 3.2, "alpha": 0.8, "linestyle": "none"}
-        below.plot(along, readings - predicted, label=f"residual, {name}", **style)
+        curve = {"color": colour, "linewidth": 1.6, "linestyle": line} if joined else {**style, "markersize": 6.0}
+        above.plot(along, predicted, label=f"predicted, {name}", **curve)
+        below.plot(along, readings - predicted, label=f"residual, {name}", **{**style, "alpha": 0.5})
+        if joined:
+            below.plot(*_running_mean(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
     below.sharex(above)
     tidy(above, x="", y=f"reading ({unit})")
     tidy(below, x=label, y=f"residual ({unit})")

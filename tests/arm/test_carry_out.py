@@ -76,7 +76,9 @@ def test_it_goes_on_behind_the_rows_that_were_taken(told):
 
 def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):
     plan = paper_plan()
-    with pytest.raises(ReachError, match=r"row 1 of the plan, and \d+ more, is \(-26.0, 20.0\);.*move the plan"):
+    with pytest.raises(
+        ReachError, match=r"row 1 of the plan \(mm\) is \(-26.0, 20.0\);.*\d+ are in reach; move the plan"
+    ):
         list(carry_out(told.arm, plan, origin_mm=(24.0, 20.0), ask=told.asked.append))
     assert not told.asked
 

@@ -86,7 +86,7 @@ def test_a_reach_without_sense_is_refused(changes):
 def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(pose):
     arm = SimulatedArm(flat(50.0))
     before = arm.pose, arm.time_s
-    with pytest.raises(ReachError, match=r"126 to 755 mm from the arm's axis at \(524, 580\)"):
+    with pytest.raises(ReachError, match=r"126 to 755 mm from the arm's axis at \(524, 580\)|a finite orientation"):
         arm.measure(pose)
     assert (arm.pose, arm.time_s) == before
 

@@ -117,6 +117,18 @@ def test_what_cannot_be_done_is_refused_in_one_line(arguments, says, tmp_path, m
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("dry", [["--dry-run"], ["--arm", "nxt:x"]], ids=["rehearsed", "on a brick"])
+def test_a_scan_that_leaves_the_reach_moves_nothing_and_prints_nothing(dry, monkeypatch, capsys):
+    """The whole scan is checked first: the line to a brick is not even opened."""
+    monkeypatch.setattr("probewise.cli._arm.open_brick", lambda port: pytest.fail("the line was opened"))
+    told = said(capsys, "arm", "scan", "300,200", "5,5", "--readings", "6", *dry, status=2)
+    assert told.out == ""
+    assert "the place of reading 6 of the scan (mm) is (5.0, 5.0); allowed: a place on the field" in told.err
+    assert "126 to 755 mm from the arm's axis" in told.err
+    assert "of these 6 places 5 are in reach" in told.err
+    assert "Pose(" not in told.err
+
+
 def test_without_an_arm_there_is_nothing_to_move(capsys):
     assert "--arm is missing: name the brick" in said(capsys, "arm", "read", status=2).err
     assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "simulated", status=2).err

@@ -323,6 +323,7 @@ def test_a_bump_is_found_where_it_is():
     assert found[0].end == pytest.approx(75, abs=8)
     assert found[0].p_value < 0.01
     assert found[0].witness == "witness_time.svg"
+    np.testing.assert_array_equal(found[0].values, time)
     assert found[0].curve_mean.max() > 1.0
 
 
@@ -351,6 +352,8 @@ def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
     plan = line(101, scans=1).plan
     (found,) = placed(effect, change, without, plan, [level])
     assert found.covariate == "level"
+    assert found.without_effect
+    np.testing.assert_array_equal(found.values, without)
     assert found.start == pytest.approx(50.5, abs=0.6)
     assert found.end == pytest.approx(60.0, abs=1e-9)
 

@@ -1,17 +1,21 @@
 """The page of a diagnosis: its first screen says the verdict, the chance, the gain and what to do."""
 
 import dataclasses
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from probewise.diagnosis import ParameterFound, audit_recorded, diagnose
-from probewise.recordings import Recording, paper_plan
+from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
+from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import diagnosis as page
+from probewise.report import witness
 from probewise.report.covariate import category_names, covariate_label, covariate_values
-from probewise.report.plots import gain_by_scan
+from probewise.report.diagnosis_figures import changed_most
+from probewise.report.plots import gain_by_scan, one_scan
 from probewise.report.residual_means import mean_residuals
+from probewise.report.witness import is_line
 from probewise.report.words import readable
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -177,3 +181,44 @@ def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
     found = dataclasses.replace(saturated, repair=dataclasses.replace(saturated.repair, improvement=worse))
     drawn = {**page.figures(saturated), "gain.svg": b"<svg"}
     assert "Worse than before" in page.write_page(found, drawn, source="some.csv", seed=1)
+
+
+def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
+    plan = read_plan(shipped("concealed"))
+    assert {name for rows, name in scans_of(plan) if not is_line(plan, rows)} == {"quadrants"}
+    change = np.zeros(len(plan))
+    for rows, name in scans_of(plan):
+        change[rows] = {"quadrants": 9.0, "edge_90_out": 0.5}.get(name, 0.1)
+    chosen = changed_most(plan, change)
+    assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
+    alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
+    assert len(changed_most(alone, np.ones(4))) == 4
+
+
+def scans_of(plan):
+    return [(rows, plan.scan_names[plan.scan[rows[0]]]) for rows in plan.rows_by_scan()]
+
+
+def test_readings_on_no_line_are_not_joined():
+    x, y = np.arange(4.0), np.array([10.0, 50.0, 20.0, 30.0])
+    for joined in (True, False):
+        axes = one_scan(x, y, [("as calibrated", y + 1)], joined=joined, label="time (s)", unit="V")
+        curve = next(line for line in axes[0].lines if line.get_label().startswith("predicted"))
+        assert (curve.get_linestyle() != "None") is joined
+
+
+def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatch):
+    """The knife edge: the smallest p-value is seen in no mean, and the place is what the headline names."""
+    sizes = {"slope": 1.0, "time": 5.0, "place": 3.0}
+    where = [place_of(name, start) for name, start in (("slope", 0.0), ("time", 1.0), ("place", 2.0))]
+    judged = SimpleNamespace(unknown_shares={"place, smooth": 0.9})
+    found = SimpleNamespace(verdict="unknown", judged=judged, where=(*where, dataclasses.replace(where[2], scan="s")))
+    monkeypatch.setattr(witness, "covariate_values", lambda d: {place.witness: np.arange(3.0) for place in d.where})
+    monkeypatch.setattr(witness, "_views", lambda d, place, at: [place])
+    chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(stands_out=sizes[view.covariate]))
+    ordered = witness.seen_first(found, chance)
+    assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
+
+
+def place_of(covariate, start):
+    return Place(covariate, None, start, start + 1.0, 0.004, 4.0, *[np.zeros(0)] * 3, values=np.arange(3.0))

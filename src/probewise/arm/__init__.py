@@ -7,7 +7,7 @@ from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm, in_lego_units
 from probewise.arm.limits import SoftLimits
 from probewise.arm.machine import Machine, Rehearsal
-from probewise.arm.reach import FIELD_MM, Reach, Workspace
+from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_reach
 from probewise.arm.scale import LegoScale
 from probewise.arm.simulated import Light, SimulatedArm, Speed
 
@@ -32,5 +32,6 @@ __all__ = [
     "in_lego_units",
     "read_geometry",
     "recorded",
+    "require_reach",
     "shipped_geometry",
 ]

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from probewise._arrays import FloatArray
 from probewise.arm.instrument import Pose, Reading
 from probewise.arm.lego import LegoArm
-from probewise.errors import ParameterError, ReachError
+from probewise.arm.reach import require_reach
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 
 __all__ = ["carry_out", "recorded"]
@@ -52,7 +52,7 @@ def carry_out(
         If the plan commands what this arm has not: another height, the LED off.
     """
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    _require_reach(arm, places)
+    require_reach(arm.geometry, places, "row of the plan", way_out="; move the plan's origin")
     _require_settings(arm, plan)
     arm.turned_rad = 0.0
     turns = np.rint((plan.orientation_rad - arm.orientation_rad(places)) / QUARTER_RAD) % 4
@@ -97,19 +97,6 @@ def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
         covariates={**rows.covariates, **covariates},
     )
     return Recording(taken, np.array([reading.value for reading in readings]))
-
-
-def _require_reach(arm: LegoArm, places_mm: FloatArray) -> None:
-    out = np.flatnonzero(~arm.reachable(places_mm))
-    if out.size:
-        x_mm, y_mm = places_mm[out[0]]
-        raise ReachError(
-            f"row {out[0] + 1} of the plan, and {out.size - 1} more,"
-            if out.size > 1
-            else f"row {out[0] + 1} of the plan",
-            (round(float(x_mm), 3), round(float(y_mm), 3)),
-            f"{arm.geometry.sentence()}; move the plan's origin",
-        )
 
 
 def _require_settings(arm: LegoArm, plan: Plan) -> None:

@@ -17,6 +17,7 @@ from probewise.arm.basics import Clock, Side
 from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped
 from probewise.arm.instrument import Pose, Reading
 from probewise.arm.machine import Machine
+from probewise.arm.reach import require_reach
 from probewise.arm.scale import LegoScale
 from probewise.errors import LinkError, ReachError
 
@@ -133,8 +134,7 @@ class LegoArm:
             If the brick does not answer, or a motor does not move.
         """
         place = np.array([[pose.x_mm, pose.y_mm]])
-        if not self.geometry.holds(place)[0]:
-            raise ReachError("pose", pose, self.geometry.sentence())
+        require_reach(self.geometry, place, "pose")
         if pose.height_mm not in (None, self.geometry.read_height_mm):
             raise ReachError(
                 "height_mm", pose.height_mm, f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
@@ -142,9 +142,9 @@ class LegoArm:
         stands = float(self.orientation_rad(place)[0])
         if not abs(float(wrapped(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
             raise ReachError(
-                "pose",
-                pose,
-                f"orientation_rad {stands:.4f} there: this arm has no wrist, its sensor turns with the base",
+                "orientation_rad",
+                pose.orientation_rad,
+                f"{stands:.4f} at this place: this arm has no wrist, its sensor turns with the base",
             )
         self.go_down(pose.x_mm, pose.y_mm)
         battery_mv = self._machine.battery_mv()  # before the light: from then on nothing is asked that could lose it
@@ -266,7 +266,7 @@ class LegoArm:
     def _goals(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
         angles = self.geometry.angles_rad(np.array([[x_mm, y_mm]]), height_mm)[0]
         if not np.isfinite(angles).all():
-            raise ReachError("place", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())
+            raise ReachError("the place (mm)", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())
         return self._goals_at(angles)
 
     def _goals_at(self, angles_rad: FloatArray) -> list[Goal]:

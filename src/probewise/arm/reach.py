@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError, ReachError
 
-__all__ = ["FIELD_MM", "Reach", "Workspace"]
+__all__ = ["FIELD_MM", "Reach", "Workspace", "require_reach"]
 
 FIELD_MM = (1048.0, 520.0)
 """Width and height of the paper's playing field, 131 x 65 LEGO units of 8 mm."""
@@ -36,6 +36,39 @@ class Workspace(Protocol):
     def sentence(self) -> str:
         """Say where a place may be."""
         ...
+
+
+def require_reach(workspace: Workspace, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
+    """Refuse places of which one is out of reach, before anything moves.
+
+    Parameters
+    ----------
+    workspace
+        The arm's.
+    places_mm
+        Shape (n_places, 2).
+    of
+        What a place belongs to, such as "reading", and what the places are together, such as "of the plan".
+    way_out
+        What to do, where there is more to do than to choose other places.
+
+    Raises
+    ------
+    ReachError
+        If a place is out of reach: it names the first, counts the others, and says what is in reach.
+    """
+    held = workspace.holds(places_mm)
+    if held.all():
+        return
+    first, n = int(np.argmin(held)), len(places_mm)
+    within = f"; of these {n} places {int(held.sum())} are in reach" if n > 1 else ""
+    noun, _, whole = of.partition(" ")
+    x_mm, y_mm = places_mm[first].tolist()
+    raise ReachError(
+        f"the place of {noun} {first + 1}{' ' * bool(whole)}{whole} (mm)" if n > 1 else "the place (mm)",
+        (round(x_mm, 1), round(y_mm, 1)),
+        f"{workspace.sentence()}{within}{way_out}",
+    )
 
 
 @dataclass(frozen=True)

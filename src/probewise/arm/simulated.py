@@ -13,7 +13,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import require_callable, require_like, require_number
 from probewise.arm.instrument import Pose, Reading, require_pose
-from probewise.arm.reach import Reach, Workspace
+from probewise.arm.reach import Reach, Workspace, require_reach
 from probewise.arm.scale import LegoScale
 from probewise.errors import ParameterError, ReachError, ShapeError
 
@@ -142,8 +142,9 @@ class SimulatedArm:
         """
         require_pose(pose)
         place = np.array([[pose.x_mm, pose.y_mm]])
-        if not (math.isfinite(pose.orientation_rad) and self.reach.holds(place)[0]):
-            raise ReachError("pose", pose, f"{self.reach.sentence()}, at a finite orientation")
+        require_reach(self.reach, place, "pose")
+        if not math.isfinite(pose.orientation_rad):
+            raise ReachError("orientation_rad", pose.orientation_rad, "a finite orientation")
         height_mm = self._height_mm if pose.height_mm is None else pose.height_mm
         if not 0 < height_mm < math.inf:
             raise ReachError("height_mm", height_mm, "above the surface: finite, greater than 0")

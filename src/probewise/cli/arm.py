@@ -194,10 +194,11 @@ def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
 def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
-    from probewise.arm import Pose
+    from probewise.arm import Pose, require_reach
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
     places = np.linspace(start, end, arguments.readings)
+    require_reach(geometry, places, "reading of the scan")
     with _arm(arguments, geometry) as arm:
         say("x_mm,y_mm,orientation_deg,time_s,reading,battery_mv")
         for (x_mm, y_mm), standing in zip(places, arm.orientation_rad(places), strict=True):

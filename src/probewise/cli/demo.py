@@ -53,8 +53,6 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
     import json
     import time
 
-    import numpy as np
-
     from probewise.arm import read_geometry, shipped_geometry
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb

@@ -313,8 +313,9 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
         for place, seen in seen_first(diagnosis, Chance.of(diagnosis))
     ]
     opening = paragraph(
-        "Residuals of the calibrated model against each covariate in which they stand out. First comes what the headline "
-        "names, then what is seen best. Each dot is a reading; 95 % of the means lie in the grey band by chance alone."
+        "Residuals of the calibrated model against each covariate in which they stand out. First comes what the "
+        "headline names, then what is seen best. Each dot is a reading; 95 % of the means lie in the grey band by "
+        "chance alone."
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
     more = (element("details", element("summary", f"{len(rest)} more"), *rest),) if rest else ()
@@ -328,7 +329,7 @@ def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
     return (
         figure(
             drawn["before_after.svg"],
-            f"{which}: readings (black) and predictions ({colours}), and below the residuals.",
+            f"{which}: readings (black) and predictions ({colours}), and below the residuals with their running means.",
         ),
         figure(drawn["residuals.svg"], "All residuals in time and by predicted reading, with running means."),
     )

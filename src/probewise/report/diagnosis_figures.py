@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import Diagnosis, Place
+from probewise.recordings import Plan
 from probewise.report.covariate import covariate_values, label_of
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
@@ -31,7 +32,7 @@ from probewise.report.witness import Chance, Witness, along_scan, is_line, of_pl
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
-__all__ = ["figures", "shown_first"]
+__all__ = ["changed_most", "figures", "shown_first"]
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
@@ -137,17 +138,24 @@ def _side_by_side(at: FloatArray) -> FloatArray:
 def _before_and_after(diagnosis: Diagnosis) -> bytes:
     """Draw the scan along a line that the repair changes most, or the longest: readings, models, residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    change = diagnosis.repair.after.readings - diagnosis.repair.before.readings
-    scans = [rows for rows in plan.rows_by_scan() if rows.size]
-    lines = [rows for rows in scans if is_line(plan, rows)]
-    rows = max(lines or scans, key=lambda r: (float(change[r] @ change[r]), r.size))
+    rows = changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
     shown = along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = unit_name(plan.instrumentation.unit)
     models = models if diagnosis.repair.changes_predictions else models[:1]
-    return svg(one_scan(shown.at[rows], readings, models, joined=bool(lines), label=shown.label, unit=unit))
+    return svg(one_scan(shown.at[rows], readings, models, joined=is_line(plan, rows), label=shown.label, unit=unit))
+
+
+def changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
+    """Choose the scan along a line whose readings change most in all, the longest where none do; any if none is a line.
+
+    `change` is that of each reading, (n_points,).
+    """
+    scans = [rows for rows in plan.rows_by_scan() if rows.size]
+    lines = [rows for rows in scans if is_line(plan, rows)]
+    return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
 
 
 def _residuals(diagnosis: Diagnosis) -> bytes:

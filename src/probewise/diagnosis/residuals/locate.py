@@ -263,7 +263,7 @@ def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> 
     return sorted(significant, key=lambda scan: -strength[scan])
 
 
-def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, FloatArray]:
+def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
     """Give the covariate at each reading, and the witness curve."""
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:

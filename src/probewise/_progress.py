@@ -20,7 +20,7 @@ _PATIENCE_S = 2.0  # what ends sooner needs no bar
 _BETWEEN_LINES_S = 5.0
 _SHARE_OF_ALL = 0.05  # of the time so far: hours of work fill no log
 _BEAT_S = 0.5
-_WITH_TOTAL = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]{postfix}"
+_WITH_TOTAL = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt} of {total_fmt} [{elapsed}, {remaining} left]{postfix}"
 _WITHOUT = "{desc} [{elapsed}]{postfix}"
 
 

@@ -73,7 +73,7 @@ def test_a_terminal_shows_the_stage_its_share_and_the_clock(hurried, monkeypatch
         time.sleep(0.1)
     shown = terminal.getvalue()
     assert "refitting effects:  25%|" in shown
-    assert "3/12" in shown
+    assert "3 of 12 [00:00, 00:00 left]" in shown
     assert "refitting effects: 100%" in shown
     assert "drawing the figures [00:00], slowly" in shown
 

@@ -222,3 +222,12 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
 
 def place_of(covariate, start):
     return Place(covariate, None, start, start + 1.0, 0.004, 4.0, *[np.zeros(0)] * 3, values=np.arange(3.0))
+
+
+def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():
+    plan = SimpleNamespace(plan=range(8), minutes=1.2, description="scan again", expected_log_bayes_factor=0.04)
+    words = SimpleNamespace(next_plan="next_plan.csv")
+    found = SimpleNamespace(next_measurement=plan, apparatus=SimpleNamespace(words=words))
+    said = page._next_in_words(found)
+    assert said.startswith("Nothing that is worth the time: of all plans of up to")
+    assert "tell 0.0 nats. It is in next_plan.csv, if you want it: scan again (8 readings, about 1 minute)." in said

@@ -7,16 +7,18 @@ import queue
 import sys
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 from probewise.cli._common import CommandError, a_path
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, LegoArm
+    from probewise.arm import Geometry, Instrument, LegoArm, Pose, Reading
     from probewise.arm.nxt import Brick
 
 __all__ = [
+    "Telling",
     "add_geometry",
     "asker",
     "geometry_of",
@@ -78,6 +80,32 @@ def open_brick(port: str) -> Brick:
     from probewise.arm.nxt import Brick
 
     return Brick.open(port)
+
+
+class Telling:
+    """An instrument that says where it moves before it does, and what it read: seconds pass on a real arm."""
+
+    def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
+        self._instrument, self._moving, self._read = instrument, moving, read
+        self.reachable, self.orientation_rad = instrument.reachable, instrument.orientation_rad
+        self.travel_s = instrument.travel_s
+
+    def __enter__(self) -> Self:
+        self._instrument.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Bring the instrument to rest."""
+        self._instrument.__exit__(kind, error, trace)
+
+    def measure(self, pose: Pose) -> Reading:
+        """Say it, measure, say what was read."""
+        self._moving(pose)
+        reading = self._instrument.measure(pose)
+        self._read(reading)
+        return reading
 
 
 def asker(arm: LegoArm) -> Callable[[str], None]:

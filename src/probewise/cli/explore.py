@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import add_geometry, geometry_of, open_nxt, parse_arm
+from probewise.cli._arm import Telling, add_geometry, geometry_of, open_nxt, parse_arm
 from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import require_going_on, saying_what_is_kept
@@ -163,15 +163,23 @@ def run(arguments: argparse.Namespace) -> int:
             return "nothing was read"
         return keeps(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
+    def tell(doing: str) -> None:
+        believed = f"; widest sd {steps[-1].widest_mm:.1f} mm" if steps else ""
+        progress("exploring", note=f"reading {len(steps) + 1}, {doing}{believed}")
+
     with (
         saying_what_is_kept(kept),
-        arm,
+        progress_shown(quiet=arguments.quiet) as progress,
+        Telling(
+            arm,
+            lambda pose: tell(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
+            lambda reading: tell(f"thinking about {reading.value:g}"),
+        ) as arm,
         closing(
             explore(arm, experiment, rng=streams.run, max_readings=arguments.max_readings, journal=before or journal)
         ) as own,
-        progress_shown(quiet=arguments.quiet) as progress,
     ):
-        progress("taking the first readings")
+        progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if other is not None:
             pairs = beside(own, other, posing.Field.under(arm, other.grid), rng=streams.shadow)
@@ -195,8 +203,6 @@ def run(arguments: argparse.Namespace) -> int:
                 write_text_atomically(out / "live.html", report.live_page(step, frames[-1]))
                 if len(frames) == 1:
                     webbrowser.open((out / "live.html").absolute().as_uri())
-            believed = f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits"
-            progress(f"reading {step.number} of at most {arguments.max_readings}", note=believed)
     result = Exploration(experiment, tuple(steps))
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:

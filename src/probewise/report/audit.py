@@ -46,8 +46,10 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
         drawn["audit.png"],
         "Left: of what each effect changes in the readings, the share that "
         f"{audit.words.null}'s own parameters cannot absorb. "
-        "Right: its cosine with each other effect. Circles mark aliases: at size "
-        f"λ = {LAMBDA:g} these readings tell the two apart by less than {LEAST_NATS:g} nats.",
+        "Right, read along a row: the effect of the row is there, at a typical setting; the cosine says how well the "
+        "effect of the column, at the setting that suits it best, would pass for it. So it matters which of the two is "
+        "there: an effect with many settings passes for a plain one, but not the other way round. A circle marks an "
+        f"alias: at size λ = {LAMBDA:g} these readings tell the row from the column by less than {LEAST_NATS:g} nats.",
     )
     sections = [
         Section("Not told apart", _classes(audit)) if audit.classes is not None else Section(_CURED_BY, _cures(audit)),

@@ -11,6 +11,27 @@ from probewise.report.words import number, unit_name
 
 __all__ = ["audit_table"]
 
+_SIZES = {
+    "albedo": "change of albedo",
+    "amp": "amplitude",
+    "amp_mm": "amplitude",
+    "deg": "turn",
+    "dx_mm": "along X",
+    "dy_mm": "along Y",
+    "frac": "relative change",
+    "mm": "height",
+    "mm_per_mm": "slope",
+    "offset_mm": "shift",
+    "per_hour": "change",
+    "per_mm_x": "along X",
+    "per_mm_y": "along Y",
+    "per_volt": "relative change",
+    "width_mm": "play",
+    "x": "along X",
+    "y": "along Y",
+}
+"""What a parameter that scales an effect is called in words."""
+
 
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
     """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows.
@@ -32,13 +53,26 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
         ),
-        caption="Status: fine (can be identified), aliased, or invisible (cannot be detected). Detectable share: of "
-        f"what it changes in the readings, the share that {of}'s own parameters do not absorb."
+        caption="Status: fine (these readings detect the effect and tell it from every other), aliased (they detect "
+        "it, but would take it for the one named, whose cosine stands behind it; where that one is there, they may "
+        "still tell it from this one), or invisible (they cannot detect it). Detectable share: of what the effect "
+        f"changes in the readings, the share that {of}'s own parameters do not absorb. Size at λ = 8: how large each "
+        "of its parameters must be to stand out from the noise by eight sds; – where none says how large it is."
         + (" Rows: so many like these show it where it changes readings by one noise sd rms." if counted else ""),
     )
 
 
 def _smallest(parameter: str, unit: str, amount: float | None) -> str:
-    name = "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " ")
-    value = "at no size" if amount is None else f"{amount:.2g} {'' if unit == '1' else unit_name(unit)}"
+    """Write a size with the name of its parameter in words, where that says more than its unit."""
+    name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
+    value = "at no size" if amount is None else f"{amount:.2g} {_unit(unit)}"
     return f"{name} {value}".strip()
+
+
+def _unit(unit: str) -> str:
+    """Write "1/V" as "per V" and "LEGO/h" as "LEGO units per h"; a unit of a person's own stays as it is."""
+    upper, _, lower = unit.partition("/")
+    if upper not in ("1", "LEGO", "mm"):
+        return unit_name(unit)
+    own = "" if upper == "1" else unit_name(upper)
+    return f"{own} per {lower}".strip() if lower else own

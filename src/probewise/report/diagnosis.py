@@ -209,9 +209,13 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
         return "Nothing that this apparatus can do would tell more."
     told = plan.expected_log_bayes_factor
     asked = f"{count(len(plan.plan), 'reading')}, about {count(max(round(plan.minutes), 1), 'minute')}"
-    said = f"{plan.description.rstrip('.')}: {asked}, {diagnosis.apparatus.words.next_plan}."
+    description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
     if told < _TELLS_SOMETHING:
-        return f"No plan of {MOST_READINGS} readings was found that tells more than {number(told, 1)} nats: {said}"
+        return (
+            f"Nothing that is worth the time: of all plans of up to {MOST_READINGS} readings the best is expected to "
+            f"tell {number(told, 1)} nats. It is in {file}, if you want it: {description} ({asked})."
+        )
+    said = f"{description}: {asked}, {file}."
     *others, last = map(_plain, plan.between)
     rivals = f"{others[0]} from {last}" if len(others) == 1 else f"apart {', '.join(others)} and {last}"
     return f"{said[:1].upper()}{said[1:]} Expected to tell {rivals}, by {number(told, 1)} nats."

@@ -13,7 +13,7 @@ from probewise.experiment import least_readings
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, readings_needed, widths_of_runs
 from probewise.report.words import count, number, with_error
-from probewise.study import REFERENCE, Estimate, Row, Study, Summary, experiment_of
+from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, Row, Study, Summary, experiment_of
 
 __all__ = ["answer", "table_csv", "table_of_bounds", "table_of_rows", "write_page"]
 
@@ -26,6 +26,10 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
     ("bits_each", "bits per reading, standard error"),
     ("held", "share of 95 % intervals that hold the truth, standard error"),
     ("arm_s", "arm time (s), standard error"),
+)
+_INTERVALS = (
+    "Readings that a run needs. The 95 % interval of the share is Wilson's, for the number of runs beside it; that of "
+    f"the median lies between two of the runs, and takes {LEAST_FOR_MEDIAN} of them."
 )
 
 
@@ -41,7 +45,15 @@ def answer(study: Study) -> str:
 
 def table_of_rows(study: Study) -> Markup:
     """Build the tables, one line a row: how many readings, and how much they tell and cost."""
-    readings = ("row", "runs", "reached (95 %)", "mean", "median (95 %)", "up to the first on white", "after it")
+    readings = (
+        "row",
+        "runs",
+        "reached (95 % interval)",
+        "mean",
+        "median (95 % interval)",
+        "up to the first on white",
+        "after it",
+    )
     worth = (
         "row",
         "bits per reading",
@@ -53,7 +65,7 @@ def table_of_rows(study: Study) -> Markup:
     )
     lines = [(_needed(row, found), _told(row, found)) for row, found in study.table().items()]
     return fragment(
-        table(readings, (first for first, _ in lines), caption="Readings that a run needs."),
+        table(readings, (first for first, _ in lines), caption=_INTERVALS),
         table(worth, (second for _, second in lines), caption="What readings tell, how right the runs are, the cost."),
     )
 
@@ -140,9 +152,15 @@ def _needed(row: Row, found: Summary) -> tuple[str, ...]:
         str(found.n_runs),
         f"{number(100 * reached.value, 1)} % ({number(100 * reached.low, 1)} to {number(100 * reached.high, 1)})",
         _shown(found.mean),
-        f"{found.median.value:g} ({found.median.low:g} to {found.median.high:g})",
+        _with_interval(found.median),
         _shown(found.to_white),
         _shown(found.after_white),
+    )
+
+
+def _with_interval(estimate: Estimate) -> str:
+    return f"{estimate.value:g}" + (
+        f" ({estimate.low:g} to {estimate.high:g})" if math.isfinite(estimate.low) else " (too few runs)"
     )
 
 

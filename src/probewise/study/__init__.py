@@ -7,10 +7,11 @@ the same noise, and differs from a reference row in one thing.
 from probewise.study.circles import POPULATIONS, Population, noise_of
 from probewise.study.rows import REFERENCE, Row, standard_rows
 from probewise.study.run import Study, read_study, run_study
-from probewise.study.table import Estimate, Summary, share_within, summarise
+from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_within, summarise
 from probewise.study.trial import Trial, arm_of, experiment_of, run_trial
 
 __all__ = [
+    "LEAST_FOR_MEDIAN",
     "POPULATIONS",
     "REFERENCE",
     "Estimate",

@@ -13,10 +13,13 @@ from scipy.stats import binom, poisson
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 
-__all__ = ["Estimate", "Summary", "share_within", "summarise"]
+__all__ = ["LEAST_FOR_MEDIAN", "Estimate", "Summary", "share_within", "summarise"]
 
 WRONG_MM = 12.0
 """An error that the stopping rule rules out, three times its 4 mm: a run that ends with it is sure and wrong."""
+
+LEAST_FOR_MEDIAN = 6
+"""Runs of which the least and the greatest enclose the median with 95 %: 1 - 2 / 2^6 is 97 %."""
 
 _CHANCE = 0.01
 
@@ -45,7 +48,8 @@ class Summary:
     reached
         Share of runs that came to know every length within the limit of readings, with its 95 % interval.
     mean, median
-        Readings needed, a miss counted as the limit; the mean's standard error, the median's 95 % interval.
+        Readings needed, a miss counted as the limit; the mean's standard error, the median's 95 % interval, NaN
+        of fewer than `LEAST_FOR_MEDIAN` runs.
     to_white
         Readings up to the first one on white, a run without one counted as the limit.
     after_white
@@ -135,7 +139,12 @@ def _mean(values: FloatArray) -> Estimate:
 
 
 def _median(values: FloatArray) -> Estimate:
-    """Median with the order statistics that enclose it with 95 %, whatever the distribution."""
+    """Median with the order statistics that enclose it with 95 %, whatever the distribution.
+
+    The least and the greatest of fewer than six enclose it more seldom: no interval is given.
+    """
     ordered = np.sort(values)
+    if len(ordered) < LEAST_FOR_MEDIAN:
+        return Estimate(float(np.median(ordered)), math.nan, math.nan)
     below = max(int(binom.ppf(0.025, len(ordered), 0.5)) - 1, 0)
     return Estimate(float(np.median(ordered)), float(ordered[below]), float(ordered[len(ordered) - 1 - below]))

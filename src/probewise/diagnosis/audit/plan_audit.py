@@ -41,6 +41,11 @@ Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 _MOST_READINGS = 4000  # of a recording that are looked at; of a longer one every second, every third, ...
 _SETTINGS = 48  # of an effect's bank, beside a diagnosis
 _LEVELS = (0.1, 0.9)  # of the range of a reading, black and white, where no sensor is known
+_READING_GUIDE = (
+    "(fine: these readings show the effect and tell it from every other. aliased (as X, c): they show it, but X at its",
+    " best setting passes for it, by a cosine c of 1 at most; where X is there, it may still be told from this one.",
+    " invisible: they cannot show it.)",
+)
 _NOISE = 0.01  # of the span between the levels, likewise
 # Two Gaussians, a core and a fainter skirt, off the centre and not round: nothing is invisible by symmetry alone.
 _TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.2, 0.0, 0.0])
@@ -166,6 +171,7 @@ class PlanAudit(ShowsItself):
         lines += _listed("fine", [e.name for e in self.seen_as("fine")])
         lines += _listed("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
         lines += _listed("invisible", [e.name for e in self.seen_as("invisible")])
+        lines += _READING_GUIDE
         if not self.cures:
             cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
             return "\n".join([*lines, f"cure       {cured}"])

@@ -25,20 +25,24 @@ __all__ = ["audit_matrix"]
 
 COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
 
+_NOT_COMPARED = "#e8e8e8"
 _MOST_NAMES = 36  # that stand side by side under the columns; of more their numbers do
 
 
 def audit_matrix(
     names: Sequence[str], sights: Sequence[str], cosines: FloatArray, *, alias: float, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw how much of each effect survives, and beside it how well each is imitated by each other.
+    """Draw how much of each effect is detectable, and beside it how well each is imitated by each other.
+
+    The matrix is not symmetric: the row stands for the effect that is there, at a typical setting, the column for the
+    one that it is taken for, at its best.
 
     Parameters
     ----------
     names, sights
         Effects, and whether each is "fine", "aliased" or "invisible".
     cosines
-        Row imitated by column, (n_effects, n_effects); the surviving share on the diagonal.
+        Row imitated by column, (n_effects, n_effects), 0 where not compared; the detectable share on the diagonal.
     alias
         Cosine from which two are not told apart: marked.
     axes
@@ -76,10 +80,14 @@ def audit_matrix(
 
 def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) -> None:
     shown = np.where(np.eye(len(labels), dtype=np.bool_), np.nan, cosines)
+    alone = ~(np.nan_to_num(shown).any(axis=0) | np.nan_to_num(shown).any(axis=1))
+    shown[alone, :] = shown[:, alone] = np.nan
+    ax.set_facecolor(_NOT_COMPARED)
     image = ax.imshow(shown, cmap=COPPER, vmin=0, vmax=1, aspect="auto")
     rows, columns = np.nonzero(np.nan_to_num(shown) >= alias)
     ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
     ax.set_xticks(np.arange(len(labels)), labels, rotation=0 if labels[0] == "" else 90, fontsize=SMALL_PT)
     ax.tick_params(left=False)
-    ax.figure.colorbar(image, ax=ax, label="cosine of row and column (no unit)", shrink=0.7)
-    tidy(ax, x="", y="", title="circles: aliased pairs")
+    bar = ax.figure.colorbar(image, ax=ax, label="cosine (no unit); circles from the line on", shrink=0.7)
+    bar.ax.axhline(alias, color="black", linewidth=1.2)
+    tidy(ax, x="effect that it may be taken for", y="", title="row: the effect that is there; grey: not compared")

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,6 +81,30 @@ def test_a_recording_that_is_not_there_is_refused(verb, tmp_path, capsys):
 def test_too_few_live_points_are_refused_before_any_work(recording_file, tmp_path, capsys):
     out = tmp_path / "out"
     assert "52 or more" in refused(capsys, out, "calibrate", recording_file, "--out", out, "--live", 51)
+
+
+def test_too_many_gaussians_are_blamed_on_the_option_that_asked_for_them(recording_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    said = refused(capsys, out, "calibrate", recording_file, "--out", out, "--orders", 1, 99)
+    assert "--orders is 99; allowed: up to 24 with --live 300" in said
+    assert "596 parameters, which take --live 1192" in said
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose", "audit"])
+def test_a_directory_that_nobody_can_write_to_is_refused_before_any_work(verb, recording_file, tmp_path, capsys):
+    """Root may write to /proc, by its permissions, and cannot."""
+    said = refused(capsys, tmp_path / "out", verb, recording_file, "--out", "/proc/foo")
+    assert said == f"probewise {verb}: /proc/foo: /proc cannot be written to; allowed: a directory you may write to\n"
+
+
+@pytest.mark.parametrize("verb", ["predict", "audit", "calibrate"])
+def test_a_journal_is_no_recording_and_it_is_said_what_to_do_with_it(verb, tmp_path, capsys):
+    journal = tmp_path / "journal.jsonl"
+    journal.write_text("{}\n")
+    more = ["sensor.json"] if verb == "predict" else []
+    said = refused(capsys, tmp_path / "out", verb, *more, journal, "--out", tmp_path / "out")
+    assert f"probewise diagnose {journal} --sensor S.json --out DIR" in said
 
 
 def test_a_recording_without_contrast_cannot_be_calibrated(recording_file, tmp_path, capsys):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from probewise.errors import ParameterError, ProbewiseError
+from probewise.errors import ProbewiseError
 
 __all__ = [
     "DEFAULT_SEED",
@@ -25,7 +25,6 @@ __all__ = [
     "add_common",
     "add_out_directory",
     "add_quiet",
-    "check_live",
     "keeps",
     "positive_int",
     "say",
@@ -148,13 +147,3 @@ def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"
     return f"{path} keeps {count}; go on with: {command}"
-
-
-def check_live(n_live: int, n_params: int) -> int:
-    """Refuse, before any work, too few live points for so many parameters."""
-    from probewise.nested import least_live  # here: most commands do without
-
-    least = least_live(n_params)
-    if n_live < least:
-        raise ParameterError("--live", n_live, f"{least} or more for {n_params} parameters")
-    return n_live

@@ -16,12 +16,28 @@ if TYPE_CHECKING:
     from probewise.recordings import Instrumentation, Recording
     from probewise.scene import Shape
 
-__all__ = ["is_journal", "journal_recording"]
+__all__ = ["is_journal", "journal_recording", "refuse_journal"]
 
 
 def is_journal(path: Path) -> bool:
     """Tell a journal from a recording by its name."""
     return path.suffix == ".jsonl"
+
+
+def refuse_journal(path: Path) -> None:
+    """Refuse a journal where a plan or a recording is needed: what lay under its sensor is not known.
+
+    Raises
+    ------
+    FileError
+        If it is one.
+    """
+    if is_journal(path):
+        raise FileError(
+            path,
+            "the journal of a run over a shape that is not known",
+            f"a plan or recording, CSV; a journal is for: probewise diagnose {path} --sensor S.json --out DIR",
+        )
 
 
 def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:

@@ -13,6 +13,7 @@ import itertools
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -58,8 +59,10 @@ def check_out_directory(path: Path) -> Path:
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
     if not parent.is_dir():
         raise ParameterError("--out", str(path), f"a directory; {parent} is a file")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise FileError(path, f"{parent} cannot be written to", "a directory you may write to")
+    try:  # a permission says too little: nobody can write to /proc, or to a disk that is mounted for reading
+        os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=parent))
+    except OSError as error:
+        raise FileError(path, f"{parent} cannot be written to", "a directory you may write to") from error
     return path
 
 

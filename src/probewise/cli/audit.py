@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._simulator import add_simulator, refuse_beside
 
@@ -48,6 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.diagnosis import audit_plan
     from probewise.recordings import read_plan
 
+    refuse_journal(arguments.plan)
     out = None if arguments.out is None else check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:

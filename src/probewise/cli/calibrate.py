@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, check_live, positive_int, say
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, positive_int, say
+from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
+from probewise.errors import ParameterError
 from probewise.verbs import N_LIVE, ORDERS
 
 __all__ = ["VERB"]
@@ -43,11 +46,12 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.recordings import read_recording, write_bytes_atomically, write_text_atomically
     from probewise.report import calibration as report
 
+    refuse_journal(arguments.recording)
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         recording = read_recording(arguments.recording, progress=progress)
         orders = tuple(sorted(set(arguments.orders)))
-        n_live = check_live(arguments.live, 6 * max(orders) + 2)
+        n_live = _enough_live(arguments.live, orders)
         rng = np.random.default_rng(arguments.seed)
         result = verbs.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=progress)
         prediction = predict(result.sensor, recording, progress=progress)
@@ -63,6 +67,21 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _enough_live(n_live: int, orders: Sequence[int]) -> int:
+    """Refuse, before any work, live points too few for the parameters of so many Gaussians."""
+    from probewise.nested import LIVE_PER_PARAM, least_live
+
+    n_params = 6 * max(orders) + 2
+    least, most = least_live(n_params), (n_live // LIVE_PER_PARAM - 2) // 6
+    if n_live >= least:
+        return n_live
+    if max(orders) <= max(ORDERS):
+        allowed = f"{least} or more for the {n_params} parameters of --orders {max(orders)}"
+        raise ParameterError("--live", n_live, allowed)
+    takes = f"{max(orders)} Gaussians have {n_params} parameters, which take --live {least}"
+    raise ParameterError("--orders", max(orders), f"up to {most} with --live {n_live}; {takes}")
 
 
 VERB = Verb("calibrate", "Fit the sensor model of a recording; weigh numbers of Gaussians.", add_arguments, run)

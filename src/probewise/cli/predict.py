@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from probewise.cli._common import Verb, a_path, add_common, say
+from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_file
 from probewise.cli._simulator import add_simulator
 
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict every row, and say how well the readings were expected where there are any."""
+    refuse_journal(arguments.plan)
     if arguments.simulator is not None:
         return _by_simulator(arguments)
     from probewise._progress import progress_shown

@@ -194,10 +194,10 @@ class Exploration(ShowsItself):
         lines = [
             f"readings     {len(self.steps)}",
             f"stopped      {self.stop_reason}",
-            f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} a reading "
-            f"(the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} a reading)",
+            f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} per reading "
+            f"(the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} per reading)",
             f"log Z        {self.posterior.log_z:.2f} ± {self.posterior.log_z_error:.2f}",
-            f"fit          p = {last.p_value:.2g}",
+            f"fit          p = {last.p_value:.2g} (how often readings fit no better where the best hypothesis is right)",
         ]
         if self.hidden is not None:
             lay = ", ".join(f"{name} {value:.{_decimals(name)}f}" for name, value in self.hidden.parameters.items())

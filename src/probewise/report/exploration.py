@@ -167,7 +167,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
 def steps_table(run: Exploration) -> Markup:
     """Build the table of steps: where, what, what was then known."""
     return table(
-        ("reading", "at (mm)", "value", "widest sd (mm)", "bits so far"),
+        ("number", "at (mm)", "reading (LEGO units)", "widest sd (mm)", "information so far (bits)"),
         (
             (
                 str(s.number),
@@ -217,7 +217,7 @@ def write_page(
         ("information", gained),
         ("the paper's count", f"{number(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"),
         (f"chance that a length is off by over {OFF_MM:g} mm", off),
-        ("fit of the best hypothesis", f"p = {run.last.p_value:.2g}"),
+        ("fit of the best hypothesis", _fit(run.last.p_value)),
         ("seed", str(seed)),
     ]
     if truth:
@@ -275,6 +275,11 @@ def write_page(
             "where it would read next."
         )
     return page("The robot's search", answer=answer(run), key_figure=figure(frames[-1], caption), sections=sections)
+
+
+def _fit(p_value: float) -> str:
+    """Write the p-value of the fit with what it means."""
+    return f"p = {p_value:.2g}: if it is right, {100 * p_value:.0f} of 100 runs fit it no better"
 
 
 def _own(step: Step, name: str) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import sys
 from typing import TYPE_CHECKING, Self
 
 from probewise.errors import LinkError
@@ -34,7 +36,8 @@ class SerialPort:
             import serial
         except ImportError as error:
             raise LinkError(
-                "the NXT needs pyserial, which is not installed; install it with: pip install pyserial"
+                "the NXT needs pyserial, which is not installed; install it with: "
+                f"{shlex.quote(sys.executable or 'python')} -m pip install pyserial"
             ) from error
         # A radio serial port has no baud rate; a pseudo-terminal on some systems refuses exclusive locks.
         try:

@@ -148,22 +148,27 @@ class Diagnosis(ShowsItself):
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""
-        lines = [f"{self.verdict}: {self.reason}", f"{p_in_words(self.p_value)} that nothing is missing from the mean"]
-        lines += [f"  {h.probability:.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
-        lines += [f"{e.name} ({e.probability:.3f}): {e.sentence}" for e in self.effects if e.probability > 0.05]
-        gain = self.improvement
+        lines = [f"{self.verdict}: {self.reason}", _p_value_said(self.p_value), "probability  explanation"]
+        lines += [f"  {h.probability:9.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
+        # What the reason says already is not said again.
+        lines += [
+            f"{e.name}, in all explanations together {e.probability:.3f}: {e.sentence}"
+            for e in self.effects
+            if e.probability > 0.05 and e.sentence.lower() not in self.reason.lower()
+        ]
+        gain, unit = self.improvement, self.recording.plan.instrumentation.unit
         if self.repair.changes_predictions:
-            held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats each"
-            kept_back = f"readings kept back {held}" if gain.heldout_by_scan else "no reading could be kept back"
+            held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats per held-out reading"
+            tested = held if gain.heldout_by_scan else "no reading could be held out"
             lines.append(
-                f"repaired: log evidence {gain.log_evidence:+.1f}, {kept_back}, "
-                f"rms {gain.rms_before:.4g} -> {gain.rms_after:.4g}"
+                f"repaired: log evidence {gain.log_evidence:+.1f} nats, {tested}, "
+                f"rms of the residuals {gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
             )
         elif self.verdict == "noise":
-            lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f}")
+            lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f} nats")
         if self.repair.by_rows:
             model = self.apparatus.words.model
-            lines.append(f"what has no name is put right in these readings alone: {model} does not carry it")
+            lines.append(f"what has no name is corrected in these readings alone: {model} does not carry it")
         lines += [f"in {share:.0%} of its samples: {sentence}" for _, share, sentence in self.carried]
         if self.repair.left_open:
             shares = ", ".join(
@@ -171,3 +176,9 @@ class Diagnosis(ShowsItself):
             )
             lines.append(f"left open in its samples: {shares}")
         return "\n".join(lines)
+
+
+def _p_value_said(p_value: float) -> str:
+    """Write the p-value with what it means."""
+    meant = "how often chance alone, with nothing missing from the mean, gives readings as odd as these"
+    return f"{p_in_words(p_value)} ({meant})"

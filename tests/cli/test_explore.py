@@ -1,14 +1,18 @@
 """What `probewise explore` says of the choices it offers."""
 
+import contextlib
 import csv
 import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
+from probewise.cli._arm import Telling
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -165,3 +169,28 @@ def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path
     share = sum(float(row["weight"]) for row in rows if row["shape"] == found["shape"]["name"])
     assert found["shape"]["probability"] == pytest.approx(share, abs=1e-3)
     assert found["chance_off_12mm"] >= 1 - share - 1e-3
+
+
+def test_the_bar_says_where_the_arm_moves_before_it_does():
+    told = []
+    arm = SimulatedArm(lambda pose, time_s, height_mm: 42.0)
+    with Telling(arm, told.append, told.append) as telling:
+        reading = telling.measure(Pose(500.0, 200.0))
+        assert telling.reachable(np.array([[500.0, 200.0], [0.0, 0.0]])).tolist() == [True, False]
+    assert told == [Pose(500.0, 200.0), reading]
+    assert arm.pose == Pose(*arm.reach.rest_mm)
+
+
+def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, monkeypatch, quick_frames):
+    told = []
+
+    @contextlib.contextmanager
+    def shown(*, quiet):
+        yield lambda stage, done=0, total=0, note="": told.append(note)
+
+    monkeypatch.setattr("probewise._progress.progress_shown", shown)
+    arguments = ["explore", "--sensor", sensor_file, "--out", tmp_path / "out", "--max-readings", 2, "--quiet"]
+    assert main([str(a) for a in arguments]) == 0
+    moves = [note for note in told if "moving to (" in note]
+    assert [note.partition(",")[0] for note in moves] == ["reading 1", "reading 2"]
+    assert "; widest sd" in moves[1]

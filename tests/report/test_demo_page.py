@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import probewise
 from probewise.arm import Pose, SimulatedArm
+from probewise.cli import demo, main
 from probewise.errors import ParameterError
 from probewise.experiment import Experiment, run_from
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
-from probewise.recordings import Disc
+from probewise.recordings import Disc, read_recording, shipped
+from probewise.report.demo import HEADER, comparison_lines
 from probewise.report.paper_view import fine_map, paper_view, window_mm
 from probewise.report.slides import side_by_side
 from probewise.scene import Circle, HypothesisScene
@@ -86,3 +89,34 @@ def test_a_colour_that_few_pixels_have_survives_in_a_slide():
     (slide,) = side_by_side([out.getvalue()], [picture(5, 0)])
     shown = Image.open(io.BytesIO(slide)).convert("RGB").getpixel((53, 103))
     np.testing.assert_allclose(shown, (0, 224, 138), atol=16)
+
+
+def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(monkeypatch, tmp_path):
+    """So that one recording has one exponent, in the README, on the page and in the terminal."""
+    states = []
+
+    def diagnose(*recordings, rng, **options):
+        states.append(rng.bit_generator.state)
+        raise ParameterError("readings", 0, "none: this is a rehearsal")
+
+    monkeypatch.setattr("probewise.diagnosis.diagnose", diagnose)
+    recording = shipped("concealed")
+    with pytest.raises(ParameterError, match="rehearsal"):
+        demo._diagnose(2013)
+    with pytest.raises(ParameterError, match="rehearsal"):
+        probewise.diagnose(read_recording(recording), rng=np.random.default_rng(2013), progress=False)
+    assert main(["diagnose", str(recording), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert len(states) == 3
+    assert states[0] == states[1] == states[2]
+
+
+def test_the_demos_comparison_is_two_tables_each_with_its_caption(monkeypatch):
+    rows = [("naive", "30", "9", "20.1", "0.67", "0.83", "12.5 mm", "x 1 mm"), ("SSF", *"12345", "2 mm", "x 2 mm")]
+    monkeypatch.setattr("probewise.report.demo.comparison_rows", lambda searches: rows)
+    first, second = "\n".join(comparison_lines([])).rstrip().split("\n\n")
+    for text, header in ((first, HEADER[:-2]), (second, (HEADER[0], *HEADER[-2:]))):
+        caption, names, *lines = text.splitlines()
+        assert "(" in caption or "±" in caption
+        assert all(name in names for name in header)
+        assert [line.split()[0] for line in lines] == ["naive", "SSF"]
+        assert max(map(len, text.splitlines())) <= 120

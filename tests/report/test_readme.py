@@ -7,7 +7,11 @@ from pathlib import Path
 import pytest
 
 from probewise import experiment
+from probewise.cli.diagnose import generators
+from probewise.diagnosis import diagnose
 from probewise.experiment import loop
+from probewise.recordings import read_recording, shipped
+from probewise.report.words import readable
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -38,11 +42,18 @@ def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
 
 
 def test_the_readme_quotes_what_the_demo_said_when_its_pictures_were_made():
-    for sentence in (QUOTED["equal_readings"], QUOTED["diagnosis"], f'("{QUOTED["concealed"]}")'):
+    for sentence in (QUOTED["equal_readings"], QUOTED["diagnosis"], QUOTED["reason"], f'("{QUOTED["concealed"]}")'):
         assert plain(sentence) in plain(README)
     assert plain(QUOTED["equal_readings"]) in plain(INDEX)
     assert QUOTED["combination"] == QUOTED["concealed"]
     assert QUOTED["verdict"] == "named"
+
+
+@pytest.mark.slow
+def test_the_readme_quotes_what_the_command_says_of_the_shipped_recording():
+    rng, *_ = generators(QUOTED["seed"])
+    found = diagnose(read_recording(shipped("concealed")), rng=rng)
+    assert readable(found.reason) == QUOTED["reason"]
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])

@@ -197,7 +197,7 @@ class Exploration(ShowsItself):
             f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} per reading "
             f"(the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} per reading)",
             f"log Z        {self.posterior.log_z:.2f} ± {self.posterior.log_z_error:.2f}",
-            f"fit          p = {last.p_value:.2g} (how often readings fit no better where the best hypothesis is right)",
+            f"fit          p = {last.p_value:.2g} (how often a right hypothesis fits no better)",
         ]
         if self.hidden is not None:
             lay = ", ".join(f"{name} {value:.{_decimals(name)}f}" for name, value in self.hidden.parameters.items())

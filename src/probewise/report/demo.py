@@ -43,7 +43,7 @@ from probewise.report.plots import (
     sensor_orientations,
 )
 from probewise.report.slides import side_by_side
-from probewise.report.words import count, number
+from probewise.report.words import count, number, readable
 
 __all__ = [
     "Search",
@@ -141,6 +141,7 @@ def answers(
         "combination": "+".join(diagnosis.combination),
         "concealed": concealed,
         "diagnosis": diagnosis_report.answer(diagnosis),
+        "reason": readable(diagnosis.reason),
     }
 
 

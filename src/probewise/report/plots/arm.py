@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, tidy
 from probewise.report.plots.scene import bar_beside, out_of_reach
+from probewise.report.words import number
 
 __all__ = ["reach_map"]
+
+_LINES_DEG = 15.0  # between lines of equal orientation
 
 
 def reach_map(
@@ -36,19 +41,26 @@ def reach_map(
     """
     ax = axes_or_new(ax, size_in=(8.2, 5.0))
     dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
-    degrees = np.degrees(orientation_rad)
+    degrees = _unwrapped(np.degrees(orientation_rad))
     image = ax.imshow(
         np.ma.masked_invalid(degrees),
         origin="lower",
         extent=(x_mm[0] - dx, x_mm[-1] + dx, y_mm[0] - dy, y_mm[-1] + dy),
-        cmap="twilight",
-        vmin=-180.0,
-        vmax=180.0,
+        cmap="cividis",
         interpolation="nearest",
     )
+    levels = _lines_within(degrees)
+    if levels.size:
+        style = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
+        lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
+        for label in ax.clabel(lines, fmt=_angle, fontsize=SMALL_PT):
+            label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])
     left, right, low, high = image.get_extent()
     out_of_reach(ax)
     bar_beside(ax, image, "orientation of the sensor (degrees)")
+    bar = ax.child_axes[-1].yaxis
+    bar.set_major_locator(MultipleLocator(_LINES_DEG) if levels.size else MaxNLocator())
+    bar.set_major_formatter(FuncFormatter(lambda angle, _: _angle(angle)))
     ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=BLACK, linewidth=0.8))
     ax.plot(*axis_mm, marker="o", markersize=9, color=BLACK)
     ax.annotate("arm's axis", axis_mm, textcoords="offset points", xytext=(8, 0), va="center", fontsize=SMALL_PT)
@@ -58,3 +70,23 @@ def reach_map(
     share = 100 * float(np.isfinite(degrees).mean())
     title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
     return tidy(ax, x="x (mm)", y="y (mm)", title=title)
+
+
+def _unwrapped(degrees: FloatArray) -> FloatArray:
+    """Write angles about their mean direction, so that 179 and -179 degrees are neighbours on the colour scale."""
+    known = np.radians(degrees[np.isfinite(degrees)])
+    middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
+    return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
+
+
+def _lines_within(degrees: FloatArray) -> FloatArray:
+    """Give the angles at which lines are drawn, (n_lines,)."""
+    known = degrees[np.isfinite(degrees)]
+    if not known.size:
+        return known
+    return np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
+
+
+def _angle(degrees: float) -> str:
+    """Write an angle between -180 and 180 degrees with a true minus sign."""
+    return number((degrees + 180.0) % 360.0 - 180.0, 0)

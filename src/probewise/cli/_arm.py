@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import queue
 import sys
 import threading
@@ -62,8 +63,10 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
     """Read "X,Y" in mm."""
     try:
         x_mm, y_mm = (float(cell) for cell in text.split(","))
-    except ValueError as error:
-        raise ParameterError(name, text, "X,Y in mm, such as 524,260") from error
+    except ValueError:
+        x_mm = y_mm = math.nan
+    if not (math.isfinite(x_mm) and math.isfinite(y_mm)):
+        raise ParameterError(name, text, "X,Y in mm, such as 524,260")
     return x_mm, y_mm
 
 

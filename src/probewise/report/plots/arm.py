@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
@@ -51,7 +53,7 @@ def reach_map(
     )
     levels = _lines_within(degrees)
     if levels.size:
-        style = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
+        style: dict[str, Any] = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
         lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
         for label in ax.clabel(lines, fmt=_angle, fontsize=SMALL_PT):
             label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])

@@ -193,6 +193,7 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
     alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
     assert len(changed_most(alone, np.ones(4))) == 4
+    assert not is_line(plan, np.arange(1))
 
 
 def scans_of(plan):

@@ -166,9 +166,10 @@ def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
     if isinstance(plan, RunTable):
         return True
     places = np.stack([plan.x_mm[rows], plan.y_mm[rows]])
+    if np.unique(places.round(6), axis=1).shape[1] < _LEAST_PLACES:
+        return False
     widest, across = np.linalg.svd(places - places.mean(axis=1, keepdims=True), compute_uv=False)
-    several = np.unique(places.round(6), axis=1).shape[1] >= _LEAST_PLACES
-    return bool(several and across <= _ASTRAY * widest)
+    return bool(across <= _ASTRAY * widest)
 
 
 def _likeness(diagnosis: Diagnosis, place: Place) -> float:

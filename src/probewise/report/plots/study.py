@@ -113,7 +113,8 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
             estimates = [getattr(summary, part) for summary in rows.values()]
             value, low, high = (np.array([getattr(e, k) for e in estimates]) for k in ("value", "low", "high"))
             whiskers = np.array([value - low, high - value])
-            label = "mean ± standard error" if part != "median" else "median, 95 % interval"
+            known = "median, 95 % interval" if np.isfinite(low).any() else "median"
+            label = "mean ± standard error" if part != "median" else known
             style = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 3, "label": label}
             ax.errorbar(value, y + shift, xerr=whiskers, **style)
         ax.set_xlim(left=0)

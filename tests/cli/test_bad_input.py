@@ -206,6 +206,7 @@ def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, r
         "predict": ["predict", sensor_file, recording_file, "--out", out / "p.csv"],
         "explore": ["explore", "--sensor", sensor_file, "--out", out],
         "diagnose": ["diagnose", recording_file, "--out", out],
+        "investigate": ["investigate", "--plan", recording_file, "--truth", "nothing", "--out", out],
         "study": ["study", "--out", out],
         "audit": ["audit", recording_file, "--out", out],
         "challenge": ["challenge", "--out", out],

@@ -37,7 +37,7 @@ class Printer(Protocol):
 
 
 class ShowsItself:
-    """Give a value the `_repr_html_` that notebooks look for, and a text for terminals that is no wall of numbers."""
+    """Give a value the `_repr_html_` that notebooks look for; `str` of it, and a terminal, show its summary."""
 
     __slots__ = ()
 
@@ -45,6 +45,10 @@ class ShowsItself:
         super().__init_subclass__()
         # IPython prefers a class's own __repr__, which dataclass makes, to a base's _repr_pretty_.
         cls._repr_pretty_ = ShowsItself._repr_pretty_  # type: ignore[method-assign]
+
+    def __str__(self) -> str:
+        summary = getattr(self, "summary", None)
+        return str(summary()) if callable(summary) else super().__str__()
 
     def _repr_html_(self) -> str:
         while _waiting:

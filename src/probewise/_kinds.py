@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import math
+import os
 from collections.abc import Sequence
 from numbers import Integral, Real
+from pathlib import Path
 
 import numpy as np
 
@@ -13,10 +16,14 @@ from probewise.errors import ParameterError
 __all__ = [
     "require_callable",
     "require_finite_number",
+    "require_flag",
     "require_kind",
     "require_like",
     "require_number",
+    "require_one_of",
+    "require_one_or_several",
     "require_pair",
+    "require_path",
     "require_rng",
     "require_whole",
 ]
@@ -61,10 +68,47 @@ def require_pair(name: str, value: object, allowed: str = "two finite numbers (x
     raise ParameterError(name, value, allowed)
 
 
+def require_one_or_several(
+    name: str, value: object, allowed: str = "a number, or several in a list"
+) -> tuple[float, ...]:
+    """Return a number, or each of a list of finite numbers, as a tuple; raise ParameterError for a text or None."""
+    if isinstance(value, Real):
+        value = (value,)
+    array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
+    if not array_like or not all(isinstance(v, Real) and math.isfinite(v) for v in value):  # type: ignore[attr-defined]
+        raise ParameterError(name, value, allowed)
+    return tuple(v.item() if isinstance(v, np.generic) else v for v in value)  # type: ignore[attr-defined]
+
+
+def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
+    """Raise ParameterError unless `value` is one of these names, saying which was perhaps meant."""
+    if isinstance(value, str) and value in known:
+        return
+    near = difflib.get_close_matches(value, known, n=1) if isinstance(value, str) else []
+    meant = f"; did you mean {near[0]!r}?" if near else ""
+    raise ParameterError(name, value, ", ".join(map(repr, known)) + meant)
+
+
+def require_flag(name: str, value: object) -> None:
+    """Raise ParameterError unless `value` is True or False; a text such as "no" would count as True."""
+    require_kind(name, value, (bool, np.bool_), "True or False")
+
+
+def require_path(name: str, value: object, allowed: str = "the name of a file: a text or a Path") -> Path:
+    """Return the name of a file as a Path, or raise ParameterError."""
+    if isinstance(value, os.PathLike) or (isinstance(value, str) and value):
+        named = os.fspath(value)
+        if isinstance(named, str):
+            return Path(named)
+    raise ParameterError(name, value, allowed)
+
+
 def require_kind(name: str, value: object, kind: type | tuple[type, ...], allowed: str) -> None:
     """Raise ParameterError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
-        raise ParameterError(name, value, allowed)
+        method = getattr(value, "__name__", "") if hasattr(value, "__self__") else ""
+        call = f"this is the method {method}, call it: {method}(); " if method else ""
+        raise ParameterError(name, value, call + allowed)
 
 
 def require_like(name: str, value: object, attributes: Sequence[str], allowed: str) -> None:

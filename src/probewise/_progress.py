@@ -11,6 +11,7 @@ from typing import NamedTuple, Never
 
 from tqdm import tqdm
 
+from probewise._kinds import require_callable
 from probewise.nested import State
 from probewise.progress import Progress, silent
 
@@ -64,11 +65,18 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
 
 @contextlib.contextmanager
 def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
-    """Yield what a caller wants told: a callable of his own, a bar where somebody looks (True), or nothing (False)."""
+    """Yield what a caller wants told: a callable of his own, a bar where somebody looks (True), or nothing (False).
+
+    Raises
+    ------
+    ParameterError
+        If it is none of these.
+    """
     if isinstance(progress, bool):
         with progress_shown(quiet=not progress, lines=False) as shown:
             yield shown
     else:
+        require_callable("progress", progress, "True, False, or a function progress(stage, done, total, note)")
         yield progress
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from probewise import scene
-    from probewise.arm import Instrument
+    from probewise.arm import Instrument, Measures
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis, PlanAudit
     from probewise.experiment import Exploration, Model, Step, Truth
@@ -141,15 +141,15 @@ def explore(
     *,
     shape: str | Sequence[str] | Shape = SHAPE,
     truth: Truth | None = None,
-    arm: Instrument | None = None,
+    arm: Instrument | Measures | None = None,
     field: scene.Field | None = None,
     model: Model = MODEL,
     utility: str | Utility = UTILITY,
     learn_sensor: bool = False,
     batch: int = 1,
-    orientations_rad: Sequence[float] = (0.0,),
-    heights_mm: Sequence[float] = (),
-    repeats: Sequence[int] = (1,),
+    orientations_rad: float | Sequence[float] = (0.0,),
+    heights_mm: float | Sequence[float] = (),
+    repeats: int | Sequence[int] = (1,),
     max_readings: int = MAX_READINGS,
     journal: str | Path | None = None,
     rng: np.random.Generator,
@@ -168,10 +168,13 @@ def explore(
         What may lie on the field: "circle", "ellipse", "rectangle", "triangle", "hexagon", several of them, or a shape
         of `probewise.scene`.
     truth
-        What the simulated field hides: the parameters of the (first) shape, for a circle x_mm, y_mm, radius_mm; or
-        {"rectangle": ...}, by name. By default drawn from the shape's prior.
+        What the simulated field hides: the parameters of the (first) shape, for a circle (x_mm, y_mm, radius_mm) or
+        {"x_mm": 600, "y_mm": 260, "radius_mm": 90}; or {"rectangle": ...}, by name. By default drawn from the shape's
+        prior.
     arm
-        Where the readings come from; entered and left here (`with arm:`). By default the simulated arm.
+        Where the readings come from; entered and left here (`with arm:`). By default the simulated arm. An instrument
+        of your own needs no more than `measure(pose)`, which returns a number or a dict; see
+        `probewise.arm.instrument_of`.
     field
         Width and height of the field; by default those of the paper.
     model
@@ -183,12 +186,13 @@ def explore(
     batch
         Readings that are chosen at a time.
     orientations_rad, heights_mm, repeats
-        What else may be chosen, of an arm that can: see `probewise.experiment.experiment_for`.
+        What else may be chosen, of an arm that can: see `probewise.experiment.experiment_for`. One number leaves no
+        choice.
     max_readings
         Stop here if the shape is not known by then.
     journal
-        File that gets one JSON line a measurement; where it exists already the run goes on from it, given an `rng` of
-        the same seed.
+        File that gets one JSON line a measurement, in a folder that is made if missing; where it exists already the run
+        goes on from it, given an `rng` of the same seed, the same sensor and the same truth.
     rng
         Source of randomness; with `np.random.default_rng(seed)` the run of `probewise explore --seed`.
     progress
@@ -223,12 +227,10 @@ def explore(
     >>> len(run.readings)
     2
     """
-    from pathlib import Path
-
     from probewise import experiment as posing
-    from probewise._kinds import require_kind, require_rng
+    from probewise._kinds import require_kind, require_one_or_several, require_path, require_rng, require_whole
     from probewise._progress import progress_or_bar
-    from probewise.arm.instrument import require_instrument
+    from probewise.arm import instrument_of
     from probewise.errors import ParameterError
     from probewise.inquiry import utility_named
     from probewise.scene import Field
@@ -243,21 +245,23 @@ def explore(
         model=model,
         utility=utility_named(utility) if isinstance(utility, str) else utility,
         learn_sensor=learn_sensor,
-        batch=batch,
-        orientations_rad=tuple(orientations_rad),
-        heights_mm=tuple(heights_mm),
-        repeats=tuple(repeats),
+        batch=require_whole("batch", batch),
+        orientations_rad=require_one_or_several("orientations_rad", orientations_rad),
+        heights_mm=require_one_or_several("heights_mm", heights_mm),
+        repeats=tuple(require_whole("repeats", n) for n in require_one_or_several("repeats", repeats)),
     )
     streams, hidden = posing.Streams.of(rng), None
-    before = posing.read_journal(journal) if journal is not None and Path(journal).exists() else None
+    path = None if journal is None else require_path("journal", journal)
+    before = posing.read_journal(path) if path is not None and path.exists() else None
+    about = {**posing.sensor_named(sensor), "arm": "simulated" if arm is None else type(arm).__name__}
+    taken = () if before is None else before.readings
     if arm is None:
         hidden = posing.Hidden.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
-        taken = () if before is None else before.readings
         arm = posing.arm_over(posing.world_like(sensor), hidden.surface, field, seed=streams.noise, taken=taken)
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
-    require_instrument(arm, "arm")
-    with arm, progress_or_bar(progress) as told:
+    instrument = instrument_of(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")
+    with instrument, progress_or_bar(progress) as told:
         told("taking the first readings")
 
         def show(step: Step) -> None:
@@ -265,13 +269,14 @@ def explore(
             told(f"reading {step.number} of at most {max_readings}", note=believed)
 
         return posing.run(
-            arm,
+            instrument,
             asked,
             rng=streams.run,
             max_readings=max_readings,
-            journal=journal if before is None else before,
+            journal=path if before is None else before,
             progress=show,
             hidden=hidden,
+            about=about,
         )
 
 

@@ -7,6 +7,7 @@ from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm, in_lego_units
 from probewise.arm.limits import SoftLimits
 from probewise.arm.machine import Machine, Rehearsal
+from probewise.arm.own import Measures, OwnInstrument, instrument_of
 from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_reach
 from probewise.arm.scale import LegoScale
 from probewise.arm.simulated import Light, SimulatedArm, Speed
@@ -20,6 +21,8 @@ __all__ = [
     "LegoScale",
     "Light",
     "Machine",
+    "Measures",
+    "OwnInstrument",
     "Pose",
     "Reach",
     "Reading",
@@ -30,6 +33,7 @@ __all__ = [
     "Workspace",
     "carry_out",
     "in_lego_units",
+    "instrument_of",
     "read_geometry",
     "recorded",
     "require_reach",

@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from probewise._kinds import require_path
 from probewise.arm.geometry import JOINTS, Geometry, Joint
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.text import read_text
@@ -33,7 +34,7 @@ def read_geometry(path: str | Path) -> Geometry:
         If the file is missing or no TOML, a number is missing or not allowed, or a name is not known:
         it names the file and the entry, what stood there and what is allowed.
     """
-    path = Path(path)
+    path = require_path("path", path)
     text = read_text(path, "an arm's geometry, TOML in UTF-8")
     try:
         content = tomllib.loads(text)

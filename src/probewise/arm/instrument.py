@@ -8,9 +8,9 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import require_kind, require_like, require_number
+from probewise._kinds import require_kind, require_number
 
-__all__ = ["Instrument", "Pose", "Reading", "require_instrument", "require_pose"]
+__all__ = ["Instrument", "Pose", "Reading", "require_pose"]
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,3 @@ class Instrument(Protocol):
             If the instrument does not answer.
         """
         ...
-
-
-def require_instrument(instrument: object, name: str = "instrument") -> None:
-    """Raise ParameterError unless `instrument` can be asked and moved."""
-    allowed = "an Instrument such as SimulatedArm(light) or LegoArm, of probewise.arm"
-    require_like(name, instrument, ("measure", "reachable", "travel_s", "orientation_rad"), allowed)

@@ -8,14 +8,13 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import require_kind
+from probewise._kinds import require_kind, require_path
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -399,7 +398,17 @@ class FittedSensor(ShowsItself):
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
-    """Write sensor.json in one piece or not at all."""
+    """Write sensor.json in one piece or not at all.
+
+    Raises
+    ------
+    ParameterError
+        If it is no FittedSensor: a Calibration has one, its `sensor`.
+    FileError
+        If the file cannot be written.
+    """
+    require_sensor(sensor)
+    path = require_path("path", path)
     write_text_atomically(path, sensor.to_json())
 
 
@@ -411,12 +420,15 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
     FileError
         If the file is missing, damaged, or of another format.
     """
-    return FittedSensor.from_json(read_text(Path(path), _ALLOWED), path)
+    path = require_path("path", path, "the name of a sensor.json file; a FittedSensor needs no reading")
+    return FittedSensor.from_json(read_text(path, _ALLOWED), path)
 
 
 def require_sensor(sensor: object, more: str = "") -> None:
     """Raise ParameterError unless `sensor` is a FittedSensor, saying how to come by one."""
     allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
+    if isinstance(getattr(sensor, "sensor", None), FittedSensor):
+        allowed = f"a FittedSensor: take its .sensor, this is the {type(sensor).__name__}"
     require_kind("sensor", sensor, FittedSensor, f"{allowed}{', ' if more else ''}{more}")
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probewise.cli._arm import Telling, add_geometry, geometry_of, open_nxt, parse_arm
 from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
@@ -141,6 +142,7 @@ def run(arguments: argparse.Namespace) -> int:
     taken = () if before is None else before.readings
     arm: Instrument
     truth_mm, known = None, None
+    about: dict[str, Any] = posing.sensor_named(sensor, _seen_from(out, arguments.sensor))
     if port is not None and geometry is not None:
         if arguments.truth is not None:
             raise ParameterError("--truth", arguments.truth, "none with a real arm: what lies there is for it to find")
@@ -150,6 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
         world = posing.world_like(sensor)
         arm = posing.arm_over(world, hidden.surface, field, seed=streams.noise, taken=taken, workspace=geometry)
         truth_mm, known = hidden.outline_mm, hidden.named_as(experiment.names)
+        about = {**about, "hidden": hidden.document}
     means = sensor.mean()
     levels = (means["I_min"], means["I_max"])
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
@@ -176,7 +179,14 @@ def run(arguments: argparse.Namespace) -> int:
             lambda reading: tell(f"thinking about {reading.value:g}"),
         ) as arm,
         closing(
-            explore(arm, experiment, rng=streams.run, max_readings=arguments.max_readings, journal=before or journal)
+            explore(
+                arm,
+                experiment,
+                rng=streams.run,
+                max_readings=arguments.max_readings,
+                journal=before or journal,
+                about={**about, "arm": arguments.arm.partition(":")[0]},
+            )
         ) as own,
     ):
         progress("exploring", note="choosing the first place")
@@ -224,6 +234,14 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _seen_from(folder: Path, path: Path) -> str:
+    """Name a file as seen from a folder, so that both can move together."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return str(path.absolute())
 
 
 def _numbers(text: str) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, floats, frozen
-from probewise._kinds import require_rng
+from probewise._kinds import require_finite_number, require_rng
 from probewise.errors import ParameterError
 from probewise.experiment.simulation import surface_under
 from probewise.priors import Prior
@@ -17,8 +17,8 @@ from probewise.world import Surface
 
 __all__ = ["Hidden", "Truth", "members_of"]
 
-Truth = Sequence[float] | Mapping[str, Sequence[float]]
-"""Parameters of the first shape, or of one by its name."""
+Truth = Sequence[float] | Mapping[str, float] | Mapping[str, Sequence[float]] | Mapping[str, Mapping[str, float]]
+"""Parameters of the first shape, in order or by name; or {"rectangle": ...}, those of a shape by its name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +74,19 @@ class Hidden:
         """
         if truth is None:
             return cls.drawn(members, rng=rng)
-        if not isinstance(truth, Mapping):
-            name = next(iter(members))
-            return cls.given(name, members[name], floats(truth, "truth"))
+        first = next(iter(members))
         known = {**{name: make(field) for name, make in SHAPES.items()}, **members}
-        if len(truth) != 1 or not set(truth) <= set(known):
+        if isinstance(truth, Mapping) and len(truth) == 1 and set(truth) <= set(known):
+            ((name, values),) = truth.items()
+            return cls.given(name, known[name], _in_order(known[name].prior.names, values))
+        if isinstance(truth, Mapping) and not set(truth) & set(members[first].prior.names):
             raise ParameterError("truth", truth, f"one shape of {', '.join(known)} with its parameters")
-        ((name, values),) = truth.items()
-        return cls.given(name, known[name], floats(values, "truth"))
+        return cls.given(first, members[first], _in_order(members[first].prior.names, truth))
+
+    @property
+    def document(self) -> dict[str, str | float]:
+        """What a journal keeps of it: a run that goes on must go on over the same."""
+        return {"shape": self.name, **self.parameters}
 
     @property
     def surface(self) -> Surface:
@@ -107,6 +112,15 @@ class Hidden:
 def members_of(shape: Shape) -> dict[str, Shape]:
     """List the shapes that may lie there by name: those of a set, or the one."""
     return dict(shape.shapes) if isinstance(shape, AnyOf) else {type(shape).__name__.lower(): shape}
+
+
+def _in_order(names: Sequence[str], values: object) -> FloatArray:
+    """Put parameters in the order of a shape's, (n_params,), where they are given by name."""
+    if not isinstance(values, Mapping):
+        return floats(values, "truth")  # type: ignore[arg-type]
+    if set(values) != set(names):
+        raise ParameterError("truth", values, f"one number for each of {', '.join(names)}")
+    return np.array([require_finite_number(f"truth[{name!r}]", values[name]) for name in names])
 
 
 def _bounds(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:

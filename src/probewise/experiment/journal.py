@@ -28,6 +28,7 @@ from typing import Any, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, shown
 from probewise.recordings.atomic import write_text_atomically
@@ -51,6 +52,8 @@ __all__ = [
 FORMAT = "journal/1"
 PATTERN = "field"
 BELIEF = ', "belief": '
+# Settings in which a run that goes on may differ: files and folders may have moved, an arm may be called otherwise.
+_FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ def read_journal(path: str | Path) -> Journal:
     FileError
         If the file is missing, is no journal of this version, or is damaged before its last line.
     """
-    raw = read_bytes(Path(path), "a journal written by this package")
+    raw = read_bytes(require_path("path", path), "a journal written by this package")
     *lines, tail = raw.split(b"\n")
     if not lines:
         raise FileError(path, "no whole first line", f'a journal, whose first line says "format": "{FORMAT}"', row=1)
@@ -256,9 +259,7 @@ def _pose_line(pose: Pose) -> dict[str, float]:
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
     """Raise FileError naming every setting in which a journal differs from the run that wants to resume it."""
     there, here = _flat(journal.settings), _flat(json.loads(json.dumps(settings)))
-    different = sorted(
-        name for name in {*there, *here} - {"format", "version", "spawn_key"} if there.get(name) != here.get(name)
-    )
+    different = sorted(name for name in {*there, *here} - _FREE if there.get(name) != here.get(name))
     if different:
         had = "; ".join(f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
         raise FileError(

@@ -9,13 +9,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from probewise._kinds import require_kind, require_rng, require_whole
-from probewise.arm.instrument import Instrument, Reading, require_instrument
+from probewise._kinds import require_callable, require_kind, require_path, require_rng, require_whole
+from probewise.arm.instrument import Instrument, Reading
+from probewise.arm.own import Measures, instrument_of
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.experiment.asking import Field, inquire, next_poses
 from probewise.experiment.hidden import Hidden
@@ -163,12 +165,13 @@ def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.
 
 
 def explore(
-    instrument: Instrument,
+    instrument: Instrument | Measures,
     experiment: Experiment,
     *,
     rng: np.random.Generator,
     max_readings: int = 100,
     journal: str | Path | Journal | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> Generator[Step, None, None]:
     """Let the robot find the shape: yield one step a reading until its lengths are known (paper, section 2).
 
@@ -177,7 +180,8 @@ def explore(
     Parameters
     ----------
     instrument
-        What takes the readings, entered already (`with arm:`).
+        What takes the readings, entered already (`with arm:`); or an object of your own with a `measure(pose)`, see
+        `probewise.arm.instrument_of`.
     experiment
         What is asked, of which sensor, how long.
     rng
@@ -191,7 +195,10 @@ def explore(
         readings it holds are taken from it, not from the instrument, and their steps are
         yielded again with `replayed` set. An instrument that cannot read its state from the world,
         such as a simulated one, must stand where the last of them left it: read the journal, place
-        the instrument, and hand the journal over as it was read.
+        the instrument, and hand the journal over as it was read. Folders that are missing are made.
+    about
+        What the journal's first line says besides, such as which sensor it is and what a simulated field hides:
+        a run that goes on must agree with it too (but for the names of arm and file, see `require_same_settings`).
 
     Raises
     ------
@@ -202,27 +209,28 @@ def explore(
     NotConvergedError
         If no hypothesis could have given the readings.
     """
-    require_instrument(instrument)
+    instrument = instrument_of(instrument)
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
     require_rng(rng)
     require_whole("max_readings", max_readings)
     seed = _child(rng)
-    path = None if journal is None else Path(journal.path if isinstance(journal, Journal) else journal)
+    path = None if journal is None else require_path("journal", getattr(journal, "path", journal))
     before = journal if isinstance(journal, Journal) else None
     if before is None and path is not None and path.exists():
         before = read_journal(path)
+    settings = {} if path is None else experiment.settings(seed) | dict(about or {})  # not all can be named
     if before is not None:
-        require_same_settings(before, experiment.settings(seed))
+        require_same_settings(before, settings)
         seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(before.settings["spawn_key"]))
         if len(before.entries) > max_readings:
             raise ParameterError(
                 "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
             )
-    return _steps(instrument, experiment, seed, max_readings, path, before)
+    return _steps(instrument, experiment, seed, max_readings, path, before, settings)
 
 
 def run(
-    instrument: Instrument,
+    instrument: Instrument | Measures,
     experiment: Experiment,
     *,
     rng: np.random.Generator,
@@ -230,13 +238,20 @@ def run(
     journal: str | Path | Journal | None = None,
     progress: Callable[[Step], None] | None = None,
     hidden: Hidden | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> Exploration:
     """Run `explore` to its end and collect the steps; `progress` is called with each as it comes.
 
-    `hidden` says what a simulated field holds, for those who look at the result; the run knows nothing of it.
+    `hidden` says what a simulated field holds, for those who look at the result and for the journal; the run knows
+    nothing of it.
     """
+    if progress is not None:
+        require_callable("progress", progress, "a function that is called with every Step, or None")
+    if hidden is not None:
+        require_kind("hidden", hidden, Hidden, "a Hidden: what a simulated field holds; or None")
+        about = {**(about or {}), "hidden": hidden.document}
     steps = []
-    for info in explore(instrument, experiment, rng=rng, max_readings=max_readings, journal=journal):
+    for info in explore(instrument, experiment, rng=rng, max_readings=max_readings, journal=journal, about=about):
         if progress is not None:
             progress(info)
         steps.append(info)
@@ -250,18 +265,22 @@ def _steps(
     max_readings: int,
     path: Path | None,
     before: Journal | None,
+    settings: Mapping[str, Any],
 ) -> Generator[Step, None, None]:
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
     field = Field.under(instrument, experiment.grid)
     first = _rng_of(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before there is a journal: what cannot begin leaves none
-    with _writer(path, before, experiment, seed) as writer:
+    with _writer(path, before, settings) as writer:
         stopped = False
         while not stopped:
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
+            experiment.readout.require(
+                reading.value
+            )  # before it is written: what cannot be used must not block a resume
             if writer is not None and (entry is None or entry.belief is None):
                 writer.reading(number, reading)
             state, info = step(
@@ -287,11 +306,11 @@ def _steps(
 
 
 def _writer(
-    path: Path | None, before: Journal | None, experiment: Experiment, seed: np.random.SeedSequence
+    path: Path | None, before: Journal | None, settings: Mapping[str, Any]
 ) -> contextlib.AbstractContextManager[JournalWriter | None]:
     if before is not None:
         return JournalWriter.resume(before)
-    return contextlib.nullcontext() if path is None else JournalWriter.begin(path, experiment.settings(seed))
+    return contextlib.nullcontext() if path is None else JournalWriter.begin(path, settings)
 
 
 def _child(rng: np.random.Generator) -> np.random.SeedSequence:

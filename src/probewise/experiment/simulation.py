@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
+import os
 from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple, TypeAlias, cast, get_args
@@ -40,6 +42,7 @@ __all__ = [
     "Streams",
     "arm_over",
     "experiment_for",
+    "sensor_named",
     "shape_named",
     "shape_of",
     "surface_of",
@@ -69,6 +72,13 @@ class Streams(NamedTuple):
         """Spawn them from one generator, so that one seed gives the whole run."""
         run, truth, shadow, noise = rng.spawn(4)
         return cls(run, truth, shadow, int(noise.integers(2**63)))
+
+
+def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
+    """Say for a journal which sensor a run is made with: the fingerprint of what it says, and its file if any."""
+    require_sensor(sensor)
+    named = {} if path is None else {"sensor_file": os.fspath(path)}
+    return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
 
 
 def shape_named(names: Sequence[str], field: Field) -> Shape:

@@ -17,7 +17,7 @@ import scipy
 
 from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
 from probewise._display import ShowsItself
-from probewise._kinds import require_rng, require_whole
+from probewise._kinds import require_number, require_path, require_rng, require_whole
 from probewise._version import __version__
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.nested import conversions
@@ -254,8 +254,10 @@ class NestedResult(ShowsItself):
 
     def interval(self, mass: float = 0.95) -> FloatArray:
         """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
-        if not 0 < mass < 1:
-            raise ParameterError("mass", mass, "greater than 0, less than 1")
+        share = "greater than 0, less than 1"
+        columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
+        if not 0 < require_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
+            raise ParameterError("mass", mass, share)
         return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
 
     def best(self) -> FloatArray:
@@ -304,6 +306,7 @@ class NestedResult(ShowsItself):
 
     def save(self, path: str | Path) -> None:
         """Write everything to one .npz file, in one piece or not at all."""
+        path = require_path("path", path)
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
@@ -322,6 +325,7 @@ class NestedResult(ShowsItself):
         FileError
             If the file is damaged, or no result of this version of the format.
         """
+        path = require_path("path", path)
         try:
             # Opened here, since np.load leaves a damaged file open.
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -329,10 +333,12 @@ class NestedResult(ShowsItself):
                 found = head.pop("format", None) if isinstance(head, dict) else None
                 # Before the arrays, which another version may store under other names.
                 arrays = {name: file[name] for name in _ARRAYS} if found == _FORMAT else {}
-        except FileNotFoundError:
-            raise
+        except FileNotFoundError as error:
+            raise FileError(path, "there is no such file", "a file written by NestedResult.save") from error
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise FileError(path, f"unreadable ({error})", "a file written by NestedResult.save") from error
+            # NumPy takes whatever is no archive for a pickle, and says how to load one all the same.
+            why = "no NumPy archive" if "pickle" in str(error) else f"unreadable ({error})"
+            raise FileError(path, why, "a file written by NestedResult.save") from error
         if found != _FORMAT:
             raise FileError(path, f"format {found!r}", f"{_FORMAT!r}; make the file anew with this version")
         wanted = {f.name for f in fields(cls)} - set(_ARRAYS)

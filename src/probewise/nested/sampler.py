@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -14,7 +15,15 @@ from pathlib import Path
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._kinds import require_rng, require_whole
+from probewise._kinds import (
+    require_callable,
+    require_finite_number,
+    require_flag,
+    require_like,
+    require_path,
+    require_rng,
+    require_whole,
+)
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
 from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
@@ -118,8 +127,8 @@ def run(
     max_calls
         Likelihood evaluations after which the run ends early with what it has.
     checkpoint
-        File that the run is saved to as it goes, whole or not at all. Where it exists already
-        the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill;
+        File that the run is saved to as it goes, whole or not at all, in a folder that is made if missing. Where it
+        exists already the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill;
         `rng` must be as it was at the run's start, made anew from its seed. `max_calls` may be another.
     checkpoint_every_s
         Seconds between savings, at least; ten times as long as a saving takes if that is more. 0: after every round.
@@ -149,20 +158,20 @@ def run(
         cannot be written: before anything is evaluated. Where a later saving fails, the run goes on and warns.
     """
     require_rng(rng)
+    _require_options(stop, move, progress, checkpoint, checkpoint_every_s, executor, return_interrupted)
+    if n_workers is not None:
+        n_workers = require_whole("n_workers", n_workers)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
     least = least_live(n_params)
     n_live = require_whole("n_live", n_live, least=None)
     if n_live < least:
         raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
-    if n_replaced is None:
-        n_replaced = n_live // 2
-    elif not 1 <= n_replaced <= n_live // 2:
+    n_replaced = n_live // 2 if n_replaced is None else require_whole("n_replaced", n_replaced, least=None)
+    if not 1 <= n_replaced <= n_live // 2:
         raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and max_calls < n_live:
+    if max_calls is not None and require_whole("max_calls", max_calls, least=None) < n_live:
         raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
-    if n_workers is not None and n_workers < 1:
-        raise ParameterError("n_workers", n_workers, "1 or more")
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(_plain(rng.bit_generator.state))
     if n_params == 0:
@@ -171,6 +180,8 @@ def run(
     keeper = None
     if checkpoint is not None:
         settings = settings_of(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
+        with contextlib.suppress(OSError):  # what cannot be made is told when the first saving fails
+            Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
         keeper = Keeper(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
     now = _first(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
@@ -228,6 +239,35 @@ def run(
     for note in result.warnings:
         warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
     return result
+
+
+def _require_options(
+    stop: object,
+    move: object,
+    progress: object,
+    checkpoint: object,
+    checkpoint_every_s: object,
+    executor: object,
+    return_interrupted: object,
+) -> None:
+    """Refuse options of the wrong kind before anything is evaluated."""
+    if stop is not None:
+        require_callable("stop", stop, "a rule such as RemainingEvidence(dlogz=0.1), of probewise.nested, or None")
+    if move is not None:
+        require_like("move", move, ("draw", "adapted"), "a move such as SliceMove(), of probewise.nested, or None")
+    if progress is not None:
+        allowed = "a function that is called with a State after every round, or None; a run shows no bar by itself"
+        require_callable("progress", progress, allowed)
+    if checkpoint is not None:
+        require_path("checkpoint", checkpoint)
+    if not require_finite_number("checkpoint_every_s", checkpoint_every_s) >= 0:
+        raise ParameterError("checkpoint_every_s", checkpoint_every_s, "0 or more")
+    if executor is not None:
+        allowed = (
+            "an executor such as concurrent.futures.ProcessPoolExecutor(), or None; for a count pass n_workers too"
+        )
+        require_like("executor", executor, ("map", "submit"), allowed)
+    require_flag("return_interrupted", return_interrupted)
 
 
 def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, State]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import datetime
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -11,6 +13,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray, IntArray, floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import PATTERNS, Pattern
+from probewise.recordings.table import MISSING
 
 __all__ = [
     "Table",
@@ -21,7 +24,9 @@ __all__ = [
     "pattern_codes",
     "require_patterns",
     "scan_codes",
+    "seconds",
     "undescribed",
+    "with_missing",
 ]
 
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
@@ -71,9 +76,41 @@ def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatAr
     if out.ndim == 0 and n_points is not None:
         return np.full(n_points, float(out))
     if out.ndim != 1 or (n_points is not None and len(out) != n_points):
-        allowed = "one number per reading" if n_points is None else f"({n_points},), as x_mm"
+        allowed = "one number per reading" if n_points is None else f"({n_points},), one per place (x_mm, y_mm)"
         raise ShapeError(f"{name} has shape {out.shape}; allowed: {allowed}")
     return out
+
+
+def with_missing(values: ArrayLike) -> ArrayLike:
+    """Take texts in a column as a file has them: numbers, and "", "nan", "n/a" and the like where one is missing.
+
+    What holds no such text is handed back as it is, and so is what holds a text that is neither.
+    """
+    cells = values if isinstance(values, str) else np.asarray(values)
+    if isinstance(cells, str) or cells.ndim != 1 or cells.dtype.kind not in "OUT":
+        return values
+    try:
+        read = [_number_or_missing(cell) for cell in cells.tolist()]
+    except ValueError:
+        return values
+    return np.array(read, dtype=np.float64)
+
+
+def _number_or_missing(cell: Any) -> Any:
+    if not isinstance(cell, str):
+        return math.nan if _is_missing(cell) else cell
+    return math.nan if cell.strip() in MISSING else float(cell)
+
+
+def seconds(values: ArrayLike) -> ArrayLike:
+    """Turn dates into seconds since the first; numbers are handed back as they are."""
+    array = np.asarray(values)
+    cells = array.tolist() if array.dtype == np.object_ and array.ndim == 1 else []
+    if cells and all(isinstance(cell, datetime.datetime) for cell in cells):
+        return [(cell - cells[0]).total_seconds() for cell in cells]
+    if array.dtype.kind == "M" and array.ndim == 1 and not np.isnat(array).any():
+        return np.asarray((array - array[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+    return values
 
 
 def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
@@ -83,7 +120,7 @@ def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArra
         if name in _KNOWN:
             continue
         try:
-            out[name] = column(name, values)
+            out[name] = column(name, with_missing(values))
         except ParameterError:
             notes.append(f"column {name} holds no numbers, ignored")
     return out, tuple(notes)
@@ -161,7 +198,15 @@ def undescribed(name: str, known: Sequence[str]) -> str:
 def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
     if not isinstance(values, Iterable):
         raise ParameterError(name, values, "a text, or one a reading")
-    cells = [str(value) for value in values]
+    cells = list(values)
     if len(cells) != n_points:
-        raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one a reading, or a single text")
-    return cells
+        raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one per reading, or a single text")
+    for k, cell in enumerate(cells):
+        if _is_missing(cell):
+            raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
+    return [str(cell) for cell in cells]
+
+
+def _is_missing(cell: object) -> bool:
+    """Tell None, NaN, and what a data frame has in their place."""
+    return cell is None or (isinstance(cell, float) and math.isnan(cell)) or str(cell) in ("<NA>", "NaT")

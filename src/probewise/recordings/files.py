@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
 from probewise.recordings.description import Description, degrees_of, description_text, read_description
 from probewise.recordings.images import image_bytes
 from probewise.recordings.patterns import Image
-from probewise.recordings.plan import Plan, Recording, range_in_words
+from probewise.recordings.plan import Plan, Recording, range_in_words, require_plan, require_recording
 from probewise.recordings.table import LARGEST, MISSING, Table, count_numbers, csv_text, number_text, read_table
 
 __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recording", "write_plan", "write_recording"]
@@ -40,7 +41,7 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     FileError
         If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
     """
-    plan, readings, notes = _read(Path(path), progress)
+    plan, readings, notes = _read(_named(path), progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -61,7 +62,7 @@ def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     FileError
         If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
     """
-    return _read(Path(path), progress)[0]
+    return _read(_named(path), progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
@@ -72,7 +73,7 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
     FileError
         If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
     """
-    plan, readings, _ = _read(Path(path), progress)
+    plan, readings, _ = _read(_named(path), progress)
     return plan, readings
 
 
@@ -86,10 +87,11 @@ def write_recording(recording: Recording, path: PathLike) -> None:
     FileError
         If the files cannot be written.
     """
+    require_recording(recording)
     inst = recording.plan.instrumentation
     largest = math.inf if inst.min is not None and inst.max is not None else LARGEST
     readings = _cells("readings", recording.readings, largest)
-    _write(recording.plan, Path(path), plan_columns(recording.plan) | {"reading": readings})
+    _write(recording.plan, require_path("path", path), plan_columns(recording.plan) | {"reading": readings})
 
 
 def write_plan(plan: Plan, path: PathLike) -> None:
@@ -102,7 +104,8 @@ def write_plan(plan: Plan, path: PathLike) -> None:
     FileError
         If the files cannot be written.
     """
-    _write(plan, Path(path), plan_columns(plan))
+    require_plan(plan)
+    _write(plan, require_path("path", path), plan_columns(plan))
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
@@ -131,6 +134,14 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         "time_s": _cells("time_s", plan.time_s),
     }
     return columns | {name: _cells(name, values) for name, values in plan.covariates.items()}
+
+
+def _named(path: object) -> Path:
+    """Take the name of a file; a table in memory is the usual mistake."""
+    allowed = (
+        "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"
+    )
+    return require_path("path", path, allowed)
 
 
 def _in_degrees(angles_rad: FloatArray) -> list[str]:

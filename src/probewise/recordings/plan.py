@@ -23,7 +23,9 @@ from probewise.recordings.columns import (
     pattern_codes,
     require_patterns,
     scan_codes,
+    seconds,
     undescribed,
+    with_missing,
 )
 from probewise.recordings.patterns import Pattern
 
@@ -156,7 +158,8 @@ class Plan:
         orientation_rad
             Turn of the sensor about its vertical axis, anticlockwise from above, (n_points,) or one for all.
         time_s
-            When, shape (n_points,); by default a second apart.
+            When, shape (n_points,), in seconds, or dates, which become seconds since the first; by default a second
+            apart.
         scan
             Name or number of the scan of each reading; where it changes a new scan begins. By default all are one scan.
         covariates
@@ -190,7 +193,9 @@ class Plan:
             x_mm=x,
             y_mm=column("y_mm", y_mm, n_points),
             orientation_rad=column("orientation_rad", orientation_rad, n_points),
-            time_s=np.arange(n_points, dtype=np.float64) if time_s is None else column("time_s", time_s, n_points),
+            time_s=np.arange(n_points, dtype=np.float64)
+            if time_s is None
+            else column("time_s", seconds(time_s), n_points),
             scan=code,
             scan_names=scan_names,
             pattern=pattern_codes(pattern, described, n_points),
@@ -311,7 +316,7 @@ class Recording(ShowsItself):
         x_mm, y_mm
             Where the sensor was commanded to be, shape (n_points,); a single number stands for all readings.
         readings
-            What was read, in `unit`, shape (n_points,); NaN or None where a reading is missing.
+            What was read, in `unit`, shape (n_points,); NaN, None or a text such as "n/a" where a reading is missing.
         patterns
             What lay under the sensor: patterns by name, or one pattern under every reading.
         unit
@@ -338,7 +343,8 @@ class Recording(ShowsItself):
         >>> recording.plan.pattern_names, int(recording.usable.sum())
         (('edge',), 3)
         """
-        values = column("readings", readings)
+        sizes = [np.size(places) for places in (x_mm, y_mm) if np.ndim(places) > 0]
+        values = column("readings", with_missing(readings), sizes[0] if sizes and np.ndim(readings) > 0 else None)
         plan = Plan.from_arrays(
             x_mm=column("x_mm", x_mm, len(values)),
             y_mm=y_mm,
@@ -454,6 +460,14 @@ class Recording(ShowsItself):
         n_outside = len(self) - n_missing - int(self.usable.sum())
         why = {"missing": n_missing, f"outside {range_in_words(inst.min, inst.max)}": n_outside}
         return tuple(f"{n} reading{'s' if n > 1 else ''} {reason}, left out" for reason, n in why.items() if n)
+
+    def summary(self) -> str:
+        """Say in one line how many readings there are, and what is to be noted of them."""
+        n_usable, unit = int(self.usable.sum()), self.plan.instrumentation.unit
+        first = (
+            f"{len(self)} readings in {unit}, {n_usable} usable" if unit else f"{len(self)} readings, {n_usable} usable"
+        )
+        return "; ".join([first, *self.notes])
 
     def with_readings(self, readings: FloatArray) -> Self:
         """Take other readings of the same plan, (n_points,), NaN where one is left out."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
+from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.files import plan_columns
@@ -99,7 +99,7 @@ def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArra
     FileError
         If the file is missing, or a cell is not such a number.
     """
-    table = read_table(Path(path))
+    table = read_table(require_path("path", path))
     table.require("mean", "sd", "log_density")
     mean, sd = table.numbers("mean"), table.numbers("sd")
     if np.any(sd <= 0):

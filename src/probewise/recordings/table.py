@@ -24,7 +24,16 @@ __all__ = ["LARGEST", "MISSING", "Table", "count_numbers", "csv_text", "number_t
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond it squares and differences lose their meaning."""
 
-MISSING = frozenset({"", *map("".join, itertools.product("nN", "aA", "nN"))})
+MISSING = frozenset(
+    {
+        "",
+        *(
+            name
+            for word in ("nan", "na", "n/a", "null", "none")
+            for name in map("".join, itertools.product(*zip(word, word.upper(), strict=True)))
+        ),
+    }
+)
 """What stands in a cell whose number is missing."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
+from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
@@ -46,7 +47,7 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     FileError
         If it cannot be read or run, or what it says does not fit together; it names the line where there is one.
     """
-    path = Path(path)
+    path = require_path("path", path, "the name of a Python file that describes a simulator")
     text = read_text(path, "a Python file that describes a simulator")
     try:
         code = compile(text, str(path), "exec")

@@ -6,13 +6,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
+from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.table import csv_text, number_text, read_table
@@ -154,7 +154,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
     FileError
         If the file cannot be used or lacks a column; it names row, column, what stood there and what is allowed.
     """
-    table = read_table(Path(path))
+    table = read_table(require_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
     if not len(table):
         raise FileError(path, "there is no row below the header", "one row for each reading")
     table.require(*(name for name in (time, run) if name is not None))

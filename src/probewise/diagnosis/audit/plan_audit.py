@@ -11,12 +11,13 @@ import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise._display import ShowsItself
+from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.audit.cures import cures_of
@@ -142,7 +143,14 @@ class PlanAudit(ShowsItself):
         object.__setattr__(self, "cosines", frozen(self.cosines))
 
     def seen_as(self, detectability: Detectability, *, after: bool = False) -> tuple[EffectAudit, ...]:
-        """Select the effects that are seen this way."""
+        """Select the effects that are seen this way, in the plan as it is or after its cures.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such way.
+        """
+        require_one_of("detectability", detectability, get_args(Detectability))
         return tuple(
             effect for effect in (self.after if after else self.effects) if effect.detectability == detectability
         )

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
+from probewise._kinds import require_kind
 from probewise.errors import ShapeError
 from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from probewise.report.words import readable
@@ -31,6 +32,7 @@ __all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "
 __all__ += ["key_below", "legend_above", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg", "tidy"]
 
 _LETTERS_PER_IN = 16.2  # of a legend, about
+_AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _LEAST_IN_FULL = 1e-5  # length of an axis whose labels are written without a power of ten
 
 AxesGrid: TypeAlias = NDArray[Any]
@@ -54,7 +56,15 @@ COPPER: Colormap = LinearSegmentedColormap.from_list(
 
 
 def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -> Axes:
-    """Return the axes given, or those of a new figure."""
+    """Return the axes given, or those of a new figure.
+
+    Raises
+    ------
+    ParameterError
+        If something else than axes is given: a figure is the usual mistake.
+    """
+    if ax is not None:
+        require_kind("ax", ax, Axes, _AXES)
     return ax if ax is not None else grid_of_axes(1, 1, size_in=size_in)[0, 0]
 
 
@@ -75,12 +85,16 @@ def axes_or_grid(
     ------
     ShapeError
         If those given have another shape.
+    ParameterError
+        If something else than axes is given.
     """
     if axes is None:
         return grid_of_axes(n_rows, n_columns, size_in=size_in, **options)
     given = np.asarray(axes, dtype=np.object_)
     if given.shape != (n_rows, n_columns):
         raise ShapeError(f"axes have shape {given.shape}; allowed: ({n_rows}, {n_columns})")
+    for ax in given.flat:
+        require_kind("axes", ax, Axes, _AXES)
     return given
 
 

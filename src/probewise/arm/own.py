@@ -1,0 +1,269 @@
+"""A person's own instrument: whatever has a `measure(pose)`, made what the loop asks for."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from numbers import Real
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise._kinds import require_callable, require_finite_number, require_like
+from probewise._signals import deferred
+from probewise.arm.basics import Clock
+from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.arm.lego import LegoArm
+from probewise.arm.simulated import SimulatedArm, Speed
+from probewise.errors import FileError, LinkError, ParameterError, ShapeError, shortened
+from probewise.recordings.python_file import run_python_file
+
+__all__ = ["Measures", "OwnInstrument", "instrument_of"]
+
+_A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
+_OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
+_TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # columns of a recording that no covariate may be called
+_LONGEST = 200
+
+
+class Measures(Protocol):
+    """The least that an instrument of one's own has; see `instrument_of` for what else it may have."""
+
+    def measure(self, pose: Pose, /) -> Any:
+        """Go there and read: a number, or a dict with "value" and what else is known."""
+        ...
+
+
+class OwnInstrument:
+    """An Instrument made of a person's own object.
+
+    Parameters
+    ----------
+    connect
+        Gives the object; called once, when the instrument is entered.
+    source
+        The file that it comes from. Errors inside are then told as a `LinkError` in one line, with the line of the
+        file; without, they pass through as they are.
+    start_s
+        What the clock starts at, to go on where an earlier run ended.
+    clock
+        What stamps readings that bring no time of their own.
+    """
+
+    def __init__(
+        self, connect: Callable[[], object], *, source: str = "", start_s: float = 0.0, clock: Clock = time
+    ) -> None:
+        require_callable("connect", connect, "a function without arguments that returns an object with measure(pose)")
+        self._connect, self.source, self._start_s, self._clock = connect, source, start_s, clock
+        self._own: Any = None
+        self._zero_s = clock.monotonic() - start_s
+        self._speed = Speed()
+
+    @classmethod
+    def from_file(cls, path: str | Path, *, start_s: float = 0.0, clock: Clock = time) -> Self:
+        """Read a person's file, whose function `connect()` returns the instrument; it is called on entering.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read or run, or has no function `connect`.
+        """
+        names = run_python_file(path, "a Python file with a function connect() that returns the instrument")
+        connect = names.get("connect")
+        if not callable(connect):
+            found = "connect is missing" if connect is None else f"connect is a {type(connect).__name__}"
+            raise FileError(path, found, "def connect(): ..., which returns an object with measure(pose)")
+        return cls(connect, source=str(path), start_s=start_s, clock=clock)
+
+    def __enter__(self) -> Self:
+        """Connect; what cannot measure is closed again and refused."""
+        with self._telling("connect"):
+            own = self._connect() if self._own is None else self._own
+            if hasattr(own, "__enter__") and hasattr(own, "__exit__"):
+                entered = own.__enter__()
+                own = entered if hasattr(entered, "measure") else own
+        self._own = own
+        try:
+            with self._telling(""):
+                require_measures("what connect() returned", own)
+        except BaseException as error:
+            self.__exit__(type(error), error, error.__traceback__)
+            raise
+        self._zero_s = self._clock.monotonic() - self._start_s
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave or close what was connected, once; after an exception an error in doing so is only warned of."""
+        own, self._own = self._own, None
+        leave = getattr(own, "__exit__", None)
+        close = getattr(own, "close", None)
+        try:
+            with deferred(), self._telling("close"):
+                if hasattr(own, "__enter__") and callable(leave):
+                    leave(kind, error, trace)
+                elif callable(close):
+                    close()
+        except Exception as failure:
+            if error is None:
+                raise
+            warnings.warn(f"the instrument may not be at rest: {_briefly(failure)}", RuntimeWarning, stacklevel=2)
+
+    def reachable(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n_places, 2), the instrument can take, all by default: shape (n_places,)."""
+        own = getattr(self._own, "reachable", None)
+        if own is None:
+            return np.ones(len(places_mm), dtype=np.bool_)
+        with self._telling("reachable"):
+            held = np.asarray(_per_place("reachable", own(places_mm), len(places_mm), "True or False"))
+            if held.dtype.kind not in "biu":
+                raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
+            return held.astype(np.bool_)
+
+    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor stands at each place, (n_places, 2), 0 by default: shape (n_places,)."""
+        own = getattr(self._own, "orientation_rad", 0.0)
+        with self._telling("orientation_rad"):
+            angles = own(places_mm) if callable(own) else own
+            return _finite("orientation_rad", angles, len(places_mm), "a finite number of radians")
+
+    def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
+        """Seconds to move from `start` to each place and read there, by distance by default: shape (n_places,)."""
+        own = getattr(self._own, "travel_s", None)
+        if own is None:
+            away = np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm)
+            return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
+        with self._telling("travel_s"):
+            seconds = _finite("travel_s", own(start, places_mm), len(places_mm), "seconds, finite, 0 or more")
+            if (seconds < 0).any():
+                raise ParameterError("what travel_s returned", float(seconds.min()), "seconds, finite, 0 or more")
+            return seconds
+
+    def measure(self, pose: Pose) -> Reading:
+        """Measure, and make a Reading of what comes back: stamped by the clock, where it was asked for, unless it says.
+
+        Raises
+        ------
+        ParameterError, LinkError
+            If it is nothing that a reading could be made of: LinkError for an instrument of a file.
+        """
+        with self._telling("measure"):
+            return self._reading(self._own.measure(pose), pose)
+
+    def _reading(self, found: object, pose: Pose) -> Reading:
+        if isinstance(found, Reading):
+            return found
+        now_s = self._clock.monotonic() - self._zero_s
+        if not isinstance(found, Mapping):
+            return Reading(_value("what measure returned", found), pose, now_s)
+        if "value" not in found:
+            raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
+        known = {name: _known(name, number) for name, number in found.items() if name != "value"}
+        time_s = known.pop("time_s", now_s)
+        place = {name: known.pop(name, getattr(pose, name)) for name in _OF_THE_POSE}
+        for name, number in (("time_s", time_s), *place.items()):
+            require_finite_number(f"{name} of what measure returned", number)
+        value = _value("value of what measure returned", found["value"])
+        return Reading(value, Pose(**place, height_mm=pose.height_mm), time_s, known)
+
+    @contextlib.contextmanager
+    def _telling(self, what: str) -> Iterator[None]:
+        """Tell in one line, with the line of the person's file, of what goes wrong inside `what`."""
+        try:
+            yield
+        except (Exception, SystemExit) as error:
+            if not self.source:
+                raise
+            raise LinkError(self._told(what, error)) from error
+
+    def _told(self, what: str, error: BaseException) -> str:
+        frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
+        where = f"{self.source}, line {frames[-1]}" if frames else self.source
+        if isinstance(error, ParameterError | ShapeError) and not frames:  # what came back, not what was raised
+            return f"{where}: {error}"
+        return f"{where}: {what} raises {type(error).__name__}: {_briefly(error)}".rstrip(": ")
+
+
+def instrument_of(own: Instrument | Measures, *, start_s: float = 0.0, name: str = "instrument") -> Instrument:
+    """Make an Instrument of any object with a `measure(pose)`; those of this package are handed back as they are.
+
+    Parameters
+    ----------
+    own
+        Its `measure(pose)` goes to `pose.x_mm`, `pose.y_mm`, turned to `pose.orientation_rad`, `pose.height_mm` up
+        where that is not None, and returns a number; or a dict with "value" and what is known of the reading:
+        `x_mm`, `y_mm`, `orientation_rad` where it was really taken, `time_s`, and any other numbers, which are kept
+        as covariates. It may also have `reachable(places_mm)`, True or False for each place (n_places, 2);
+        `travel_s(start, places_mm)`, seconds from a pose to each; `orientation_rad(places_mm)`, how the sensor stands
+        at each; one value stands for all places. `close()`, or `__exit__`, is called at the end, whatever ends it.
+    start_s
+        What the clock starts at, to go on where an earlier run ended.
+    name
+        What messages call it.
+
+    Raises
+    ------
+    ParameterError
+        If it cannot measure.
+    """
+    if isinstance(own, OwnInstrument | LegoArm | SimulatedArm):
+        return own
+    require_measures(name, own)
+    made = OwnInstrument(lambda: own, start_s=start_s)
+    made._own = own  # it may have been entered already: what is asked of it before `with` is answered too
+    return made
+
+
+def require_measures(name: str, own: object) -> None:
+    """Raise ParameterError unless `own` has a method `measure`."""
+    allowed = "an Instrument such as SimulatedArm(light) or LegoArm, of probewise.arm, or an object with measure(pose)"
+    require_like(name, own, ("measure",), allowed)
+    require_callable(f"measure of {name}", getattr(own, "measure", None), "a method measure(pose)")
+
+
+def _value(name: str, found: object) -> float:
+    """Take a reading: a number, also one of NumPy's or an array of none but it."""
+    number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
+    if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
+        raise ParameterError(name, found, _A_READING)
+    return float(number)
+
+
+def _known(name: object, number: object) -> float:
+    """Take a number beside a reading; NaN where it is missing."""
+    if not isinstance(name, str) or not name.isprintable() or name != name.strip() or name in ("", *_TAKEN):
+        taken = "no name that a recording has a column for" if name in _TAKEN else "a printable text"
+        raise ParameterError("a name in what measure returned", name, f"{taken}; of an angle: orientation_rad")
+    number = number.item() if isinstance(number, np.generic | np.ndarray) and np.ndim(number) == 0 else number
+    if not isinstance(number, Real) or math.isinf(number):
+        raise ParameterError(f"{name} of what measure returned", number, "a finite number, or nan where it is missing")
+    return float(number)
+
+
+def _per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
+    """Take one value for each place, or one for all, as an array (n_places,)."""
+    array = np.asarray(found)
+    if array.ndim == 0:
+        array = np.full(n_places, array)
+    if array.shape != (n_places,):
+        raise ShapeError(f"{name} returned shape {array.shape}; allowed: ({n_places},), {allowed} for each place")
+    return array
+
+
+def _finite(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+    array = _per_place(name, found, n_places, allowed)
+    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+        raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
+    return np.asarray(array, dtype=np.float64)
+
+
+def _briefly(error: BaseException) -> str:
+    return shortened(" ".join(str(error).split()), _LONGEST)

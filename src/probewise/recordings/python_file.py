@@ -1,0 +1,61 @@
+"""A person's Python file, run so that what goes wrong in it is told in one line."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+from probewise._kinds import require_path
+from probewise.errors import FileError, shortened
+from probewise.recordings.text import read_text
+
+__all__ = ["run_python_file"]
+
+_LONGEST = 200
+
+
+def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
+    """Run a person's file as `import` would, and give the names that it defines.
+
+    Its folder is searched for modules from then on, as if it had been started by `python FILE.py`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        What it should be, for messages.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read or run; it names the line where there is one.
+    """
+    path = require_path("path", path, what)
+    text = read_text(path, what)
+    try:
+        code = compile(text, str(path), "exec")
+    except (SyntaxError, ValueError) as error:
+        found = f"is no Python: {_briefly(error)}"
+        raise FileError(path, found, "a file that Python can run", row=getattr(error, "lineno", None)) from error
+    module = ModuleType(f"probewise_file_{path.stem}")  # not the stem alone, lest serial.py hide the package serial
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    folder = str(path.absolute().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        exec(code, module.__dict__)
+    except (Exception, SystemExit) as error:
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        found = f"stops with {type(error).__name__}: {_briefly(error)}"
+        raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
+    return module.__dict__
+
+
+def _briefly(error: BaseException) -> str:
+    return shortened(" ".join(str(error).split()), _LONGEST)

@@ -1,17 +1,29 @@
 """What a newcomer gets wrong first is said in words, where it is made: never a KeyError or a TypeError from below."""
 
+import warnings
+
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import probewise
 from probewise.arm import Pose, Reading, SimulatedArm
-from probewise.calibration import FittedSensor
+from probewise.calibration import Calibration, FittedSensor, read_sensor, write_sensor
 from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
-from probewise.experiment import Experiment, experiment_for, explore, shape_named
+from probewise.experiment import Experiment, Exploration, experiment_for, explore, shape_named
 from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
-from probewise.nested import diversify, run
+from probewise.nested import NestedResult, RemainingEvidence, SliceMove, diversify, run
 from probewise.priors import Joint, LogUniform, Normal, Product, Uniform
-from probewise.recordings import HalfPlane, Plan, Recording
+from probewise.recordings import (
+    HalfPlane,
+    Plan,
+    Recording,
+    read_plan,
+    read_recording,
+    write_plan,
+    write_recording,
+)
+from probewise.report.plots import corner_plot, readings_by_orientation, spatial_sensitivity
 from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, Rectangle, RegularPolygon
 from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture, NaiveSensor
 from probewise.world import Blob, World, gaussian_spot
@@ -62,6 +74,31 @@ class NoPrior(Bell):
     prior = {"x": (0, 1)}  # noqa: RUF012
 
 
+class OfOne(Calibration):
+    """A calibration, whatever it was made of."""
+
+    sensor = SENSOR
+
+
+CALIBRATION = OfOne(RECORDING, ())
+
+
+class Own:
+    """An instrument of one's own that returns whatever it is told to."""
+
+    def __init__(self, reading):
+        self.reading = reading
+
+    def measure(self, pose):
+        return self.reading
+
+
+def found():
+    """Run nested sampling, short."""
+    with warnings.catch_warnings(action="ignore"):
+        return run(Bell(), rng=np.random.default_rng(1), n_live=20, stop=RemainingEvidence(5.0))
+
+
 A_GENERATOR = r"allowed: a NumPy random generator: np.random.default_rng\("
 A_RECORDING = "allowed: a Recording: read_recording"
 A_PLAN = "allowed: a Plan: read_plan"
@@ -103,6 +140,10 @@ MISTAKES = {
     "a path to audit": (lambda: probewise.audit("plan.csv"), f"plan is 'plan.csv'; {A_PLAN}"),
     "a table to audit": (lambda: probewise.audit(Frame()), A_PLAN),
     "a sensor's path to audit": (lambda: probewise.audit(PLAN, sensor="s.json"), f"sensor is 's.json'; {A_SENSOR}"),
+    "a misspelt word of an audit": (
+        lambda: probewise.audit(PLAN).seen_as("invisibel"),
+        "detectability is 'invisibel'; .*; did you mean 'invisible'",
+    ),
     "an unknown pattern to audit": (lambda: probewise.audit(UNDESCRIBED), "'edge' is named but not described"),
     # diagnose
     "a path to diagnose": (lambda: probewise.diagnose("mine.csv", rng=RNG), A_RECORDING),
@@ -150,6 +191,18 @@ MISTAKES = {
     "a text as likelihood": (lambda: run(Bell(lambda theta: "high"), rng=RNG), "what are no numbers"),
     "live points in quotes": (lambda: run(Bell(), rng=RNG, n_live="100"), "n_live is '100'; allowed: a whole number"),
     "no live point": (lambda: run(Bell(), rng=RNG, n_live=0), "n_live is 0; allowed: 10 or more"),
+    "a bar of nested sampling": (lambda: run(Bell(), rng=RNG, progress=True), "progress is True; allowed: a function"),
+    "a number as stopping rule": (lambda: run(Bell(), rng=RNG, stop=0.1), r"stop is 0.1; .*RemainingEvidence\(dlogz"),
+    "a text as move": (lambda: run(Bell(), rng=RNG, move="slice"), r"move is 'slice'; .*SliceMove\(\)"),
+    "a class as move": (lambda: run(Bell(), rng=RNG, move=SliceMove), r"a value of it is SliceMove\("),
+    "half a replacement": (lambda: run(Bell(), rng=RNG, n_replaced=2.5), "n_replaced is 2.5; allowed: a whole number"),
+    "calls as text": (lambda: run(Bell(), rng=RNG, max_calls="many"), "max_calls is 'many'; allowed: a whole number"),
+    "a number as checkpoint": (lambda: run(Bell(), rng=RNG, checkpoint=3), "checkpoint is 3; allowed: the name of"),
+    "seconds as text": (lambda: run(Bell(), rng=RNG, checkpoint_every_s="1"), "checkpoint_every_s is '1'; allowed"),
+    "a count as executor": (lambda: run(Bell(), rng=RNG, executor=4), "executor is 4; allowed: an executor"),
+    "half a worker": (lambda: run(Bell(), rng=RNG, n_workers=1.5), "n_workers is 1.5; allowed: a whole number"),
+    "a text as flag": (lambda: run(Bell(), rng=RNG, return_interrupted="no"), "'no'; allowed: True or False"),
+    "an interval by name": (lambda: found().interval("x"), "mass is 'x'; .*columns of the result are x 0, y 1"),
     # priors
     "bounds for a distribution": (
         lambda: Product({"a": (0, 1)}),
@@ -188,6 +241,75 @@ MISTAKES = {
         lambda: SimulatedArm(lambda pose, time_s, height_mm: None).measure(Pose(500.0, 200.0)),
         "what light returned is None; allowed: a number",
     ),
+    # instruments of one's own
+    "an arm that measures nothing": (
+        lambda: probewise.explore(SENSOR, arm=Own(None), rng=RNG, max_readings=1),
+        "what measure returned is None; allowed: a finite number, or a dict",
+    ),
+    "an arm that measures several": (
+        lambda: probewise.explore(SENSOR, arm=Own(np.array([1.0, 2.0])), rng=RNG, max_readings=1),
+        r"what measure returned is array\(\[1., 2.\]\); allowed: a finite number",
+    ),
+    "an arm that cannot measure": (
+        lambda: probewise.explore(SENSOR, arm=Bell(), rng=RNG),
+        r"object with measure\(pose",
+    ),
+    "a class as arm": (lambda: probewise.explore(SENSOR, arm=Own, rng=RNG), r"a value of it is Own\("),
+    "a batch as text": (lambda: probewise.explore(SENSOR, batch="2", rng=RNG), "batch is '2'; allowed: a whole number"),
+    "half a repeat": (lambda: probewise.explore(SENSOR, repeats=1.5, rng=RNG), "repeats is 1.5; allowed: a whole"),
+    "an angle as text": (lambda: probewise.explore(SENSOR, orientations_rad="0", rng=RNG), "a number, or several in a"),
+    "a number as journal": (
+        lambda: probewise.explore(SENSOR, journal=3, rng=RNG),
+        "journal is 3; allowed: the name of",
+    ),
+    "a number as progress": (lambda: probewise.explore(SENSOR, progress=3, rng=RNG), "progress is 3; allowed: True"),
+    "a Calibration to explore": (
+        lambda: probewise.explore(CALIBRATION, rng=RNG),
+        "take its .sensor, this is the OfOne",
+    ),
+    "a truth by wrong names": (
+        lambda: probewise.explore(SENSOR, truth={"x_mm": 500, "radius_mm": 90}, rng=RNG),
+        "truth is .*; allowed: one number for each of x_mm, y_mm, radius_mm",
+    ),
+    # files
+    "a Calibration to write": (lambda: write_sensor(CALIBRATION, "s.json"), "take its .sensor, this is the OfOne"),
+    "a Calibration to predict": (lambda: probewise.predict(CALIBRATION, PLAN), "take its .sensor, this is the OfOne"),
+    "a Calibration to audit": (
+        lambda: probewise.audit(PLAN, sensor=CALIBRATION),
+        "take its .sensor, this is the OfOne",
+    ),
+    "a sensor to nowhere": (lambda: write_sensor(SENSOR, None), "path is None; allowed: the name of a file"),
+    "a method to write": (
+        lambda: write_recording(Exploration(EXPERIMENT, ()).recording, "r.csv"),
+        r"this is the method recording, call it: recording\(\)",
+    ),
+    "a recording's path to write": (
+        lambda: write_recording("r.csv", RECORDING),
+        f"recording is 'r.csv'; {A_RECORDING}",
+    ),
+    "a recording as plan": (lambda: write_plan(RECORDING, "p.csv"), A_PLAN),
+    "a table to read": (lambda: read_recording(Frame()), r"Recording.from_table\(\.\.\.\)"),
+    "a table to read as plan": (lambda: read_plan(Frame()), r"Recording.from_table\(\.\.\.\)"),
+    "a sensor to read": (
+        lambda: read_sensor(SENSOR),
+        "allowed: the name of a sensor.json file; a FittedSensor needs no",
+    ),
+    "nothing to load": (lambda: NestedResult.load(None), "path is None; allowed: the name of a file"),
+    "a result that is none": (
+        lambda: NestedResult.load(__file__),
+        "no NumPy archive; allowed: a file written by Nested",
+    ),
+    "a result that is not there": (lambda: NestedResult.load("nowhere.npz"), "nowhere.npz: there is no such file"),
+    # drawings
+    "a figure as axes": (
+        lambda: spatial_sensitivity(SENSOR.field, ax=Figure()),
+        "ax is <Figure.*; allowed: axes of mat",
+    ),
+    "a figure as many": (lambda: corner_plot(found(), axes=Figure()), r"axes have shape \(\)"),
+    "texts as many": (lambda: corner_plot(found(), axes=[["a"] * 2] * 2), "axes is 'a'; allowed: axes of matplotlib"),
+    "a sensor to draw": (lambda: spatial_sensitivity(SENSOR), "field is .*; allowed: an SSFField"),
+    "a plan to draw": (lambda: readings_by_orientation(PLAN), A_RECORDING),
+    "a run to draw": (lambda: corner_plot(Bell()), "result is .*; allowed: a NestedResult"),
     # recordings and plans
     "arrays as plan": (lambda: Recording(np.zeros(3), np.zeros(3)), f"plan is .*; {A_PLAN}"),
     "a swapped recording": (lambda: Recording(RECORDING.readings, PLAN), f"plan is .*; {A_PLAN}"),

@@ -334,7 +334,8 @@ def diagnose(
     sensor
         An earlier calibration, whose posterior becomes the prior.
     thorough
-        Weigh the leading hypotheses again by nested sampling, which wins where it disagrees (a minute or two).
+        Weigh the leading hypotheses again by nested sampling, which wins where it disagrees. The bar says how many
+        minutes that takes, about: more with more readings and more leading hypotheses.
     rng
         Source of randomness; with `np.random.default_rng(seed)` the result of `probewise diagnose --seed`.
     progress
@@ -368,11 +369,12 @@ def diagnose(
     from functools import partial
 
     from probewise import diagnosis
-    from probewise._kinds import require_rng
-    from probewise._progress import of_nested, progress_or_bar
+    from probewise._kinds import require_flag, require_rng
+    from probewise._progress import progress_or_bar
 
     require_rng(rng)
+    require_flag("thorough", thorough)
     own, nested_rng = rng.spawn(2)
     with progress_or_bar(progress) as told:
-        again = partial(diagnosis.weigh_thoroughly, rng=nested_rng, progress=of_nested(told)) if thorough else None
+        again = partial(diagnosis.weigh_thoroughly, rng=nested_rng, progress=told) if thorough else None
         return diagnosis.diagnose(recordings, sensor=sensor, thorough=again, rng=own, progress=told)

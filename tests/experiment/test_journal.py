@@ -11,14 +11,17 @@ from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import (
     Belief,
+    Hidden,
     JournalWriter,
     read_journal,
     recording_of,
     require_same_settings,
+    run,
     value_digest,
 )
 from probewise.recordings.patterns import Disc
 from probewise.recordings.plan import Instrumentation
+from probewise.scene import Circle
 
 SETTINGS = {"shape": "Circle()", "seed": "7", "spawn_key": [0], "options": {"n_live": 60}}
 
@@ -175,3 +178,40 @@ def test_a_digest_tells_values_by_type_fields_and_every_bit():
 def test_a_value_that_cannot_be_recognised_again_is_refused():
     with pytest.raises(ParameterError, match="frozen dataclasses"):
         value_digest(Holder(lambda: 1))
+
+
+def test_a_run_over_another_hidden_shape_does_not_go_on_from_a_journal(small, tmp_path):
+    """The readings that it holds are of what lay there, whatever the caller believes now."""
+    path = tmp_path / "new" / "folder" / "journal.jsonl"
+    here, there = (Hidden("circle", Circle(), np.array([x_mm, 140.0, 60.0])) for x_mm in (250.0, 300.0))
+
+    def go_on(hidden):
+        rng = np.random.default_rng(5)
+        return run(small.arm(), small.experiment(), rng=rng, max_readings=1, journal=path, hidden=hidden)
+
+    assert len(go_on(here).steps) == len(go_on(here).steps) == 1
+    for other, said in ((there, "hidden.x_mm 250.0 there, 300.0 here"), (None, "hidden.x_mm 250.0 there, None here")):
+        with pytest.raises(FileError, match=said):
+            go_on(other)
+
+
+def test_what_a_journal_says_of_its_files_may_differ_when_the_run_goes_on(tmp_path):
+    with JournalWriter.begin(tmp_path / "j", {**SETTINGS, "arm": "COM5", "sensor_file": "../s.json"}):
+        pass
+    journal = read_journal(tmp_path / "j")
+    require_same_settings(journal, {**SETTINGS, "arm": "COM6", "sensor_file": "elsewhere/s.json"})
+    with pytest.raises(FileError, match="sensor_sha256 None there, 'abc' here"):
+        require_same_settings(journal, {**SETTINGS, "sensor_sha256": "abc"})
+
+
+def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path):
+    """Else a run could never go on: its journal would hold what it refuses."""
+
+    class Broken:
+        def measure(self, pose):
+            return 1023.0
+
+    experiment = small.experiment(reading_range=(0.0, 100.0))
+    with pytest.raises(ParameterError, match="reading is 1023.0; allowed: 0 to 100"):
+        run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
+    assert read_journal(tmp_path / "j").entries == ()

@@ -1,5 +1,7 @@
 """Recordings and plans made from arrays, lists, dicts of columns and data frames."""
 
+import datetime
+
 import numpy as np
 import pytest
 
@@ -97,6 +99,18 @@ def test_text_columns_of_a_table_are_noted_and_left_out():
     assert recording.notes == ("column who holds no numbers, ignored",)
 
 
+def test_a_table_may_say_n_a_where_a_number_is_missing_and_hold_dates():
+    begun = datetime.datetime(2026, 11, 23, 18, 0, tzinfo=datetime.UTC)
+    dates = [begun + datetime.timedelta(seconds=s) for s in (0, 2, 5)]
+    table = {"x_mm": [0, 1, 2], "y_mm": [0, 0, 0], "reading": [1, "n/a", 3], "lux": ["7", "NA", ""], "time_s": dates}
+    recording = Recording.from_table(table, patterns=EDGE, unit="V")
+    assert np.isnan(recording.readings).tolist() == [False, True, False]
+    assert np.isnan(recording.plan.covariates["lux"]).tolist() == [False, True, True]
+    assert recording.plan.time_s.tolist() == [0.0, 2.0, 5.0]
+    stamps = np.array(["2026-11-23T18:00:00", "2026-11-23T18:00:00.5"], dtype="datetime64[ms]")
+    assert made(x_mm=[0, 1], readings=[1, 2], time_s=stamps).plan.time_s.tolist() == [0.0, 0.5]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -109,10 +123,15 @@ def test_text_columns_of_a_table_are_noted_and_left_out():
         ({"unit": None}, "unit is None; allowed: a text"),
         ({"x_mm": ["a", "b", "c"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": ["1", "2", "3"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
-        ({"x_mm": [0, 1]}, r"x_mm has shape \(2,\); allowed: \(3,\)"),
+        ({"x_mm": [0, 1]}, r"readings has shape \(3,\); allowed: \(2,\), one per place \(x_mm, y_mm\)"),
+        ({"x_mm": [0, 1], "y_mm": [0, 1, 2]}, r"x_mm has shape \(2,\); allowed: \(3,\), one per reading"),
+        ({"readings": [1, 2]}, r"readings has shape \(2,\); allowed: \(3,\), one per place"),
+        ({"pattern": ["edge", None, "edge"]}, r"pattern\[1\] is None; allowed: a name in every row"),
+        ({"pattern": ["edge", np.nan, "edge"]}, r"pattern\[1\] is nan; allowed: a name in every row"),
+        ({"scan": ["a", "b", None]}, r"scan\[2\] is None; allowed: a name in every row"),
         ({"x_mm": [0, None, 1]}, r"x_mm\[1\] is nan; allowed: finite numbers"),
-        ({"y_mm": [[0, 1, 2]]}, r"y_mm has shape \(1, 3\); allowed: \(3,\), as x_mm"),
-        ({"readings": 3.0}, r"readings has shape \(\); allowed: one number per reading"),
+        ({"y_mm": [[0, 1, 2]]}, r"y_mm has shape \(1, 3\); allowed: \(3,\), one per reading"),
+        ({"readings": 3.0}, r"readings has shape \(\); allowed: one number per place"),
         ({"readings": "0.4,1.6,2.9"}, "readings is '0.4,1.6,2.9'; allowed: numbers"),
         ({"readings": [np.nan] * 3}, "allowed: at least one number within the declared range"),
         ({"readings": [1 + 2j, 0, 0]}, "readings is .*; allowed: numbers"),

@@ -26,7 +26,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from probewise._progress import of_nested, progress_shown
+    from probewise._progress import progress_shown
     from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
     from probewise.report import diagnosis as report
     from probewise.systems import read_simulator
@@ -37,7 +37,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
     table, notes = read_tables(simulator, arguments.recordings)
     diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
     with progress_shown(quiet=arguments.quiet) as progress:
-        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=of_nested(progress))
+        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=progress)
         diagnosis = diagnose_system(
             simulator,
             table,

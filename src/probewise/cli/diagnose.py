@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thorough",
         action="store_true",
-        help="weigh the leading hypotheses again by nested sampling, which wins where it disagrees (a minute or two)",
+        help="weigh the leading hypotheses again by nested sampling, which wins where it disagrees (says how long)",
     )
     add_out_directory(parser)
     add_common(parser)
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         return diagnose_simulator(arguments)
     from functools import partial
 
-    from probewise._progress import of_nested, progress_shown
+    from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
     from probewise.recordings import read_recording, write_text_atomically
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         if sensor is not None and shapes:
             progress("looking for shapes that fit")
             null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
-        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=of_nested(progress))
+        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=progress)
         diagnosis = diagnose(
             joined,
             sensor=None if shapes else sensor,

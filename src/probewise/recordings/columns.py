@@ -76,7 +76,8 @@ def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatAr
     if out.ndim == 0 and n_points is not None:
         return np.full(n_points, float(out))
     if out.ndim != 1 or (n_points is not None and len(out) != n_points):
-        allowed = "one number per reading" if n_points is None else f"({n_points},), one per place (x_mm, y_mm)"
+        each = "place (x_mm, y_mm)" if name == "readings" else "reading"
+        allowed = f"one number per {each}" if n_points is None else f"({n_points},), one per {each}"
         raise ShapeError(f"{name} has shape {out.shape}; allowed: {allowed}")
     return out
 

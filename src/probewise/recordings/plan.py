@@ -344,7 +344,8 @@ class Recording(ShowsItself):
         (('edge',), 3)
         """
         sizes = [np.size(places) for places in (x_mm, y_mm) if np.ndim(places) > 0]
-        values = column("readings", with_missing(readings), sizes[0] if sizes and np.ndim(readings) > 0 else None)
+        fitting = np.ndim(readings) == 0 or not sizes or np.size(readings) in sizes
+        values = column("readings", with_missing(readings), None if fitting else sizes[0])
         plan = Plan.from_arrays(
             x_mm=column("x_mm", x_mm, len(values)),
             y_mm=y_mm,

@@ -53,6 +53,31 @@ def stepped():
     return searched(line_recording(0.3))
 
 
+def test_the_weighing_says_first_how_long_it_may_take_and_then_how_far_it_is(stepped):
+    """A bar over all hypotheses that never goes back; its title holds minutes from the time that one call takes."""
+    told = []
+    _, weighings = weigh_thoroughly(
+        stepped,
+        rng=np.random.default_rng(2),
+        n_live=20,
+        progress=lambda stage, done=0, total=0, note="": told.append((stage, done, total, note)),
+    )
+    stage, first, total, _ = told[0]
+    assert stage == f"weighing {len(weighings)} hypotheses again, about a minute"
+    assert (first, total) == (0, 100 * len(weighings))
+    done = [own for _, own, _, _ in told]
+    assert done == sorted(done)
+    assert total - 100 < done[-1] < total
+    assert {each for each, *_ in told} == {stage}
+
+
+def test_the_time_of_a_weighing_grows_with_its_live_points_and_its_hypotheses(stepped):
+    leaders = thorough._leaders(stepped)
+    few, many = (thorough._minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000))
+    assert few[0] < few[1] < many[1]
+    assert thorough._in_words((3.2, 14.1)) == "3 to 15 minutes"
+
+
 def test_a_line_weighs_what_quadrature_says():
     """The noise's sd integrated out in closed form, 1/2 Gamma(n/2) (pi rss)^(-n/2), then a fine grid over a and b."""
     recording = line_recording(0.0)
@@ -193,7 +218,10 @@ def test_a_recording_is_weighed_alike_both_ways():
 
     def again(found):
         return weigh_thoroughly(
-            found, rng=np.random.default_rng(4), n_live=60, progress=lambda label, _: seen.append(label)
+            found,
+            rng=np.random.default_rng(4),
+            n_live=60,
+            progress=lambda stage, done=0, total=0, note="": seen.append((stage, done, total, note)),
         )
 
     names = (*(f"{p}_1" for p in ("a", "u", "v", "A", "B", "C")), "I_min", "I_max")
@@ -203,7 +231,7 @@ def test_a_recording_is_weighed_alike_both_ways():
     known = SimpleNamespace(names=names, samples=samples)
     found = diagnose(recording, sensor=known, thorough=again, rng=np.random.default_rng(1))
     assert "ambient_step" in {w.label for w in found.report.weighings}
-    assert {w.label for w in found.report.weighings} == set(seen)
+    assert {w.label for w in found.report.weighings} == {note.partition(", run ")[0] for _, _, _, note in seen[1:]}
     assert all(w.agree for w in found.report.weighings)
     assert found.reason.endswith("nested sampling agrees within a nat.")
     assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.report.weighings)

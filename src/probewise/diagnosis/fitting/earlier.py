@@ -69,6 +69,8 @@ class SensorPrior(Protocol):
 def require_sensor_prior(sensor: object) -> None:
     """Raise ParameterError unless `sensor` has names and samples."""
     allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
+    if hasattr(getattr(sensor, "sensor", None), "samples"):
+        allowed = f"a FittedSensor: take its .sensor, this is the {type(sensor).__name__}"
     require_like("sensor", sensor, ("names", "samples"), allowed)
 
 

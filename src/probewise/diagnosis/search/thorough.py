@@ -7,8 +7,9 @@ integral over the parameters: here the whole prior is searched, there the poster
 from __future__ import annotations
 
 import math
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,6 +26,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.errors import DoubtfulResultWarning
+from probewise.progress import Progress, silent
 
 __all__ = ["weigh_thoroughly"]
 
@@ -37,13 +39,20 @@ _N_SAMPLES = 2000  # that say where that is
 _SHARP = 0.3  # nats: an error that leaves it open whether two evidences are a nat apart is too large
 _APART = 3.3  # standard errors: one in a thousand
 
+# Calls of a run for each live point and parameter (39 to 47 were counted), and runs of a hypothesis: most often two
+# to five, at most the first, four about its samples and four about Laplace's peak.
+_CALLS = 43
+_FEWEST_RUNS, _MOST_RUNS_IN_ALL = 2, 1 + 2 * _MOST_RUNS
+_USUAL_RUNS = 5  # a bar that counts so many ends early, or waits near its end
+_TIMED = 100  # hypotheses whose evaluation is timed
+_STEPS = 100  # of the bar, for each hypothesis
+
 Names = tuple[str, ...]
-Progress = Callable[[str, nested.State], None]
 Run = Callable[..., nested.NestedResult]
 
 
 def weigh_thoroughly(
-    searched: Searched, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress | None = None
+    searched: Searched, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress = silent
 ) -> tuple[Searched, tuple[Weighing, ...]]:
     """Weigh two or three leading hypotheses, and the null, by nested sampling.
 
@@ -62,7 +71,8 @@ def weigh_thoroughly(
         Live points of each run. One of the whole prior looks for where the posterior is; from priors near that
         (`probewise.nested.repartitioned`) others say what the evidence is, until that is sharp.
     progress
-        Called after every round with the label of what is being weighed, and the state.
+        Told first how many minutes it will take, about, from the time that these readings take under the leading
+        hypothesis; then after every round.
 
     Returns
     -------
@@ -71,9 +81,11 @@ def weigh_thoroughly(
     """
     require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
-    for (candidate, noise), own in zip(leaders := _leaders(searched), rng.spawn(len(leaders)), strict=True):
+    leaders = _leaders(searched)
+    bar = _Bar(progress, len(leaders), _minutes(leaders, searched, n_live, rng=np.random.default_rng(0)))
+    for k, ((candidate, noise), own) in enumerate(zip(leaders, rng.spawn(len(leaders)), strict=True)):
         key = candidate.n_gaussians, candidate.names
-        weighings[key] = _weigh(candidate, noise, searched, rng=own, n_live=n_live, progress=progress)
+        weighings[key] = _weigh(candidate, noise, searched, rng=own, n_live=n_live, rounds=partial(bar.told, k))
     told = tuple(weighings.values())
     if all(w.agree for w in told) or any(w.doubts for w in told):
         return searched, told
@@ -116,19 +128,19 @@ def _weigh(
     *,
     rng: np.random.Generator,
     n_live: int,
-    progress: Progress | None,
+    rounds: Callable[[str, nested.State], None],
 ) -> Weighing:
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = JointProblem(candidate.found.model, searched.prepared.recording, evidence)
+    problem = _problem(candidate, noise, searched)
     once = folded(problem, candidate.found.z)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
         nested.run,
         rng=rng,
         n_live=n_live,
-        progress=None if progress is None else lambda state: progress(weighing.label, state),
+        progress=lambda state: rounds(weighing.label, state),
         return_interrupted=False,
     )
     with warnings.catch_warnings():
@@ -149,6 +161,54 @@ def _weigh(
         return told
     doubt = f"the whole prior holds more than what was found in it, by {apart:.1f} standard errors"
     return replace(told, doubts=(*told.doubts, doubt))
+
+
+def _problem(candidate: WeighedFit, noise: Names, searched: Searched) -> JointProblem:
+    return JointProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
+
+
+def _minutes(
+    leaders: Sequence[tuple[WeighedFit, Names]], searched: Searched, n_live: int, *, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Estimate how long the weighing takes, least and most: evaluations, times the seconds that one takes here."""
+    seconds = 0.0
+    for candidate, noise in leaders:
+        problem = _problem(candidate, noise, searched)
+        n_params, z = problem.model.n_params, candidate.found.z
+        theta = np.clip(z + 1e-3 * rng.standard_normal((_TIMED, len(z))), -FARTHEST, FARTHEST)
+        began = time.perf_counter()
+        problem.log_likelihood(theta)
+        each = (time.perf_counter() - began) / _TIMED
+        seconds += each * _CALLS * max(n_live, nested.LIVE_PER_PARAM * n_params) * n_params
+    return _FEWEST_RUNS * seconds / 60, _MOST_RUNS_IN_ALL * seconds / 60
+
+
+class _Bar:
+    """One bar over all hypotheses: how far the runs are, and in its title how long it may take."""
+
+    def __init__(self, progress: Progress, n: int, minutes: tuple[float, float]) -> None:
+        self._progress, self._n, self._runs = progress, n, 0
+        self._at, self._depth = -1, 0.0
+        self._stage = f"weighing {n} hypotheses again, about {_in_words(minutes)}"
+        progress(self._stage, 0, n * _STEPS)
+
+    def told(self, k: int, label: str, state: nested.State) -> None:
+        """Take in a round of a run of the hypothesis number `k`."""
+        depth = -state.log_volume
+        if k != self._at or depth < self._depth:  # a new run begins with the whole prior
+            self._runs = 1 if k != self._at else self._runs + 1
+        self._at, self._depth = k, depth
+        to_come = max(state.log_z_remaining - state.log_z, 0.0)  # nats to go, more or less
+        share = (self._runs - 1 + depth / (depth + to_come + 1.0)) / _USUAL_RUNS
+        done = int((k + min(share, 0.99)) * _STEPS)
+        self._progress(self._stage, done, self._n * _STEPS, f"{label}, run {self._runs}")
+
+
+def _in_words(minutes: tuple[float, float]) -> str:
+    least, most = minutes
+    if most < 1:
+        return "a minute"
+    return f"{max(least, 1):.0f} to {math.ceil(most):.0f} minutes"
 
 
 def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:

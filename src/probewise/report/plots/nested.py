@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.stats import binom
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_kind, require_like
 from probewise.errors import ParameterError
 from probewise.nested import NestedResult, Weighted
 from probewise.report.plots.canvas import (
@@ -229,6 +230,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     ax
         Axes to draw on; a new figure without.
     """
+    require_kind("result", result, NestedResult, "a NestedResult, as nested.run returns it")
     ax = axes_or_new(ax, size_in=(6.4, 3.6))
     n = result.insertion_rank.size
     if n == 0:
@@ -272,6 +274,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     -------
     Axes, (4, 1). The likelihood's lower end is cut off where nothing of the posterior lies.
     """
+    require_kind("result", result, NestedResult, "a NestedResult, as nested.run returns it")
     axes = axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
     depth, mass = -result.log_volume, _mass_per_nat(result)
     likelihood, posterior, alive, evidence = axes[:, 0]
@@ -305,6 +308,7 @@ def _evidence(result: Posterior) -> str:
 
 
 def _columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
+    require_like("result", result, ("names", "theta"), "a NestedResult, as nested.run returns it, or weighted samples")
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there is nothing to draw")
     if parameters is None:

@@ -8,6 +8,7 @@ from matplotlib.patches import Rectangle
 
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Quadrant, Recording
+from probewise.recordings.plan import require_recording
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, CYCLE, GREY, AxesGrid, axes_or_new, grid_of_axes
 from probewise.report.plots.readings import MARKERS, tracks
@@ -35,6 +36,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
     ParameterError
         If no scan crosses a half-plane.
     """
+    require_recording(recording)
     plan = recording.plan
     lines = [(k, track) for k, track in enumerate(tracks(plan)[0]) if track.from_edge]
     if not lines:
@@ -88,6 +90,7 @@ def quadrant_patterns(recording: Recording) -> AxesGrid:
     ParameterError
         If it has none.
     """
+    require_recording(recording)
     plan = recording.plan
     found = [
         (name, pattern, rows[recording.usable[rows]])

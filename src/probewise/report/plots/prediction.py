@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Recording
+from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import (
     BLACK,
     BLUE,
@@ -47,6 +48,7 @@ def predicted_against_recorded(
     -------
     Axes, three columns (two where there are two or four panels, one for one panel).
     """
+    require_recording(recording)
     found, alone = tracks(recording.plan)
     shown = [found[i] for i in _spread(len(found), MAX_PANELS - bool(alone.size))]
     n_panels = max(len(shown) + bool(alone.size), 1)
@@ -113,6 +115,7 @@ def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *,
     ax
         Axes to draw on; a new figure without.
     """
+    require_recording(recording)
     ax = axes_or_new(ax, size_in=(7.2, 2.8))
     ok = np.flatnonzero(recording.usable)
     ax.plot(ok + 1, (recording.readings[ok] - mean[ok]) / sd[ok], ".", color=BLUE, markersize=3)

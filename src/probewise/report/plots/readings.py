@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Plan, Recording
 from probewise.recordings.patterns import HalfPlane
+from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import CYCLE, axes_or_new, legend_above, tidy
 from probewise.report.words import unit_name
 
@@ -98,6 +99,7 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     ax
         Axes to draw on; a new figure without.
     """
+    require_recording(recording)
     ax = axes_or_new(ax)
     found, _ = tracks(recording.plan)
     for k, track in enumerate(found):

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from probewise._arrays import FloatArray
 from probewise.recordings import Recording
+from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import (
     BLACK,
     BLUE,
@@ -151,6 +152,7 @@ def one_scan(
 
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     """Draw readings in the order of taking: all that there is to see of a few."""
+    require_recording(recording)
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings import Recording
+from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, tidy
 from probewise.report.plots.readings import Track, tracks
 from probewise.report.words import unit_name
@@ -43,6 +44,7 @@ def residuals_by_scan(
     -------
     Axes, (n_rows, columns); those without a scan are hidden.
     """
+    require_recording(recording)
     found, _ = tracks(recording.plan)
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in found]
     shown = [found[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
@@ -90,6 +92,7 @@ def before_and_after(
     ParameterError
         If no three of the readings lie along a line.
     """
+    require_recording(recording)
     axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
     above, below = axes[:, 0]
     found, _ = tracks(recording.plan.take(rows))

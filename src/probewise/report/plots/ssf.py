@@ -9,6 +9,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_kind
 from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_grid, axes_or_new, tidy
 from probewise.report.plots.scene import bar_beside
 from probewise.report.words import with_error
@@ -31,6 +32,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     title
         Its title.
     """
+    require_kind("field", field, SSFField, "an SSFField: the .field of a FittedSensor")
     ax = axes_or_new(ax, size_in=(4.8, 4.0))
     values = np.asarray(field.values)
     x, y = field.u_mm, field.v_mm

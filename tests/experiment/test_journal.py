@@ -212,6 +212,6 @@ def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path)
             return 1023.0
 
     experiment = small.experiment(reading_range=(0.0, 100.0))
-    with pytest.raises(ParameterError, match="reading is 1023.0; allowed: 0 to 100"):
+    with pytest.raises(ParameterError, match=r"reading is 1023\.0; allowed: 0 to 100"):
         run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
     assert read_journal(tmp_path / "j").entries == ()

@@ -257,7 +257,8 @@ def explore(
     taken = () if before is None else before.readings
     if arm is None:
         hidden = posing.Hidden.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
-        arm = posing.arm_over(posing.world_like(sensor), hidden.surface, field, seed=streams.noise, taken=taken)
+        world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
+        arm = posing.arm_over(world, hidden.surface, field, seed=streams.noise, taken=taken, scale=scale)
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
     instrument = instrument_of(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")

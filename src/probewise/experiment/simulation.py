@@ -22,7 +22,7 @@ from probewise.experiment.learning import AdjustedMixture, sensor_prior
 from probewise.experiment.setting import Experiment
 from probewise.inference import Naive, Rounded
 from probewise.inquiry import Finishing, Grid, Utility
-from probewise.recordings import Disc, Polygon
+from probewise.recordings import Disc, Instrumentation, Polygon
 from probewise.scene import (
     SHAPES,
     AnyOf,
@@ -42,6 +42,7 @@ __all__ = [
     "Streams",
     "arm_over",
     "experiment_for",
+    "scale_of",
     "sensor_named",
     "shape_named",
     "shape_of",
@@ -52,6 +53,7 @@ __all__ = [
 
 Model: TypeAlias = Literal["ssf", "naive"]
 
+_CELLS_PER_SD = 8.0  # of a reading that is not rounded
 _USUAL_HEIGHT_MM = 14.0  # of the paper's sensor above the surface
 _PAINTED_VERTICES = 512  # of a curved outline that is no ellipse: within 0.01 mm of a circle of 150 mm
 
@@ -128,7 +130,7 @@ def experiment_for(
     repeats: tuple[int, ...] = (1,),
     heights_mm: tuple[float, ...] = (),
 ) -> Experiment:
-    """Pose the experiment: a fitted sensor over a shape that is not known, read in whole LEGO units.
+    """Pose the experiment: a fitted sensor over a shape that is not known, read on the sensor's own scale.
 
     Parameters
     ----------
@@ -163,15 +165,15 @@ def experiment_for(
     levels = FixedLevels(means["I_min"], means["I_max"])
     scene = HypothesisScene(shape)
     noise_sd = float(sensor.noise_sd.mean())
-    lego = LegoScale()
+    scale = scale_of(sensor.instrumentation)
     pose = partial(
         Experiment,
         shape,
         noise_sd=noise_sd,
         grid=Grid(field.width_mm, field.height_mm),
         utility=Finishing() if utility is None else utility,
-        step=lego.step,
-        reading_range=(lego.low, lego.high),
+        step=scale.step,
+        reading_range=(scale.low, scale.high),
         orientations_rad=orientations_rad,
         repeats=repeats,
         heights_mm=heights_mm,
@@ -182,7 +184,7 @@ def experiment_for(
     if model == "naive":
         if learn_sensor:
             raise ParameterError("learn_sensor", learn_sensor, 'False with the model "naive", which has no SSF')
-        sd = math.hypot(noise_sd, 1 / math.sqrt(12))
+        sd = math.hypot(noise_sd, (scale.step or 0.0) / math.sqrt(12))
         # A reading on the edge never fits two levels, and the naive model knows no edge.
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
     mixture = sensor.mixture()
@@ -191,7 +193,8 @@ def experiment_for(
         for effect in sensor.carried_effects
         if effect.stage is not Stage.NOISE  # readings far apart in place and time share no noise
     )
-    likelihood = Rounded(noise_sd, lego.step or 1.0, lego.low, lego.high)
+    # Without steps cells are taken as fine as the noise asks for: at the ends a reading stands for all beyond.
+    likelihood = Rounded(noise_sd, scale.step or noise_sd / _CELLS_PER_SD, scale.low, scale.high)
     if learn_sensor:
         free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, effects, n_nodes=FAST_NODES)
         return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
@@ -207,6 +210,14 @@ def _calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[flo
         allowed = "none with this sensor: its description does not say at which height_mm it was calibrated"
         raise ParameterError("heights_mm", heights_mm, allowed)
     return height_mm
+
+
+def scale_of(instrumentation: Instrumentation) -> LegoScale:
+    """Take the scale that readings come in: the LEGO brick's for its unit, else step and range as they are declared."""
+    if instrumentation.unit == "LEGO":
+        return LegoScale()
+    low, high = instrumentation.min, instrumentation.max
+    return LegoScale(-math.inf if low is None else low, math.inf if high is None else high, instrumentation.step)
 
 
 def world_like(sensor: FittedSensor) -> World:
@@ -252,6 +263,7 @@ def arm_over(
     seed: int,
     taken: Sequence[Reading] = (),
     workspace: Workspace | None = None,
+    scale: LegoScale | None = None,
 ) -> SimulatedArm:
     """Stand the simulated arm over a surface.
 
@@ -266,6 +278,8 @@ def arm_over(
         Readings that the run took before it was stopped: the arm stands, and its clock, where the last one left them.
     workspace
         Where the arm can go and how its sensor then stands; by default nearly everywhere, and never turned.
+    scale
+        What readings are rounded to and kept within; by default the LEGO brick's.
     """
     number = itertools.count(len(taken))
 
@@ -275,4 +289,10 @@ def arm_over(
         return world.read(surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
     reach = Reach((field.width_mm, field.height_mm)) if workspace is None else workspace
-    return SimulatedArm(light, reach=reach, height_mm=world.height_mm, last=taken[-1] if taken else None)
+    return SimulatedArm(
+        light,
+        reach=reach,
+        scale=LegoScale() if scale is None else scale,
+        height_mm=world.height_mm,
+        last=taken[-1] if taken else None,
+    )

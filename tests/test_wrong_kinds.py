@@ -297,7 +297,7 @@ MISTAKES = {
     "nothing to load": (lambda: NestedResult.load(None), "path is None; allowed: the name of a file"),
     "a result that is none": (
         lambda: NestedResult.load(__file__),
-        "no NumPy archive; allowed: a file written by Nested",
+        r"unreadable \(no NumPy archive\); allowed: a file wr",
     ),
     "a result that is not there": (lambda: NestedResult.load("nowhere.npz"), "nowhere.npz: there is no such file"),
     # drawings

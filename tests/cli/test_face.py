@@ -213,3 +213,19 @@ def test_results_of_audit_and_predict_show_themselves(sensor, recording):
 def test_an_audit_takes_the_noise_of_the_sensor_that_it_is_given(sensor, recording):
     plan = recording.plan.take(np.arange(20))
     assert "noise 0.6" in audit_plan(plan, sensor=sensor, effects=FEW).assumed
+
+
+def test_the_reports_package_shows_what_people_use_and_loads_it_when_asked():
+    assert dir(probewise.report) == probewise.report.__all__
+    code = "import probewise; print(probewise.report.plots.png.__name__, 'heart' in dir(probewise.report))"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["png", "False"]
+    with pytest.raises(AttributeError, match="has no attribute 'heart'"):
+        _ = probewise.report.heart
+
+
+def test_a_result_printed_is_its_summary(sensor, recording):
+    audit = probewise.audit(recording)
+    for result in (sensor, recording, audit, probewise.predict(sensor, recording)):
+        assert str(result) == result.summary()
+    assert str(recording).startswith("102 readings in LEGO, 102 usable")

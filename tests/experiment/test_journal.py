@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probewise.arm.instrument import Pose, Reading
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, LinkError, ParameterError
 from probewise.experiment import (
     Belief,
     Hidden,
@@ -212,6 +212,36 @@ def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path)
             return 1023.0
 
     experiment = small.experiment(reading_range=(0.0, 100.0))
-    with pytest.raises(ParameterError, match=r"reading is 1023\.0; allowed: 0 to 100"):
+    with pytest.raises(LinkError, match=r"beyond the sensor: reading is 1023\.0; allowed: 0 to 100"):
         run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
     assert read_journal(tmp_path / "j").entries == ()
+
+
+def test_the_clock_of_ones_own_instrument_goes_on_where_an_earlier_run_ended(small, tmp_path):
+    class Own:
+        def measure(self, pose):
+            return {"value": 10.0, **({"time_s": 500.0} if not (tmp_path / "j").read_text().count("index") else {})}
+
+    for n in (1, 2):
+        rng = np.random.default_rng(5)
+        found = run(Own(), small.experiment(), rng=rng, max_readings=n, journal=tmp_path / "j")
+    first, second = found.readings
+    assert first.time_s == 500.0 <= second.time_s < 600.0
+    volts = Instrumentation(unit="V", max=20.0)
+    assert found.recording(instrumentation=volts).plan.instrumentation == volts
+
+
+@pytest.mark.parametrize(
+    ("truth", "name", "theta"),
+    [
+        ({"radius_mm": 90, "x_mm": 600, "y_mm": 260}, "circle", [600.0, 260.0, 90.0]),
+        ({"circle": {"radius_mm": 90, "x_mm": 600, "y_mm": 260}}, "circle", [600.0, 260.0, 90.0]),
+        ({"ellipse": (600, 260, 90, 60, 0.5)}, "ellipse", [600.0, 260.0, 90.0, 60.0, 0.5]),
+        ((600, 260, 90), "circle", [600.0, 260.0, 90.0]),
+    ],
+)
+def test_what_lies_there_may_be_said_in_order_or_by_name(truth, name, theta):
+    members = {"circle": Circle()}
+    hidden = Hidden.of(truth, members, Circle().field, rng=np.random.default_rng(0))
+    assert (hidden.name, hidden.theta.tolist()) == (name, theta)
+    assert hidden.document["shape"] == name

@@ -464,7 +464,7 @@ def test_a_reading_outside_the_sensors_range_is_an_error(small):
         def measure(self, pose):
             return replace(super().measure(pose), value=1023.0)
 
-    with pytest.raises(ParameterError, match=r"reading is 1023.0; allowed: 1 to 100, the range of the sensor"):
+    with pytest.raises(LinkError, match=r"beyond the sensor: reading is 1023.0; allowed: 1 to 100, the range of"):
         run(Broken(), small.experiment(reading_range=(1.0, 100.0)), rng=rng())
 
 

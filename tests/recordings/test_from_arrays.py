@@ -190,3 +190,13 @@ def test_patterns_take_lists_and_numpy_numbers_as_they_take_tuples_and_floats():
 def test_a_pattern_or_an_instrumentation_of_the_wrong_kind_is_refused_in_words(make, message):
     with pytest.raises(ParameterError, match=message):
         make()
+
+
+def test_a_file_may_say_n_a_too_and_other_words_stay_texts(tmp_path):
+    write_recording(made(), tmp_path / "r.csv")
+    text = "x_mm,y_mm,pattern,reading,lux,lamp\n0,0,edge,1,N/A,none\n1,0,edge,n/a,NA,none\n2,0,edge,3,5,none\n"
+    (tmp_path / "r.csv").write_text(text)
+    recording = read_recording(tmp_path / "r.csv")
+    assert np.isnan(recording.readings).tolist() == [False, True, False]
+    assert np.isnan(recording.plan.covariates["lux"]).tolist() == [True, True, False]
+    assert "column lamp is text, ignored" in recording.notes

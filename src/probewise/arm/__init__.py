@@ -1,6 +1,6 @@
 """Where readings come from: one interface, simulated arm and LEGO arm behind it (paper, "Robotic Arm Test Bed")."""
 
-from probewise.arm.carry_out import carry_out, recorded
+from probewise.arm.carry_out import Request, carry_out, recorded
 from probewise.arm.geometry import Geometry, Joint
 from probewise.arm.geometry_file import read_geometry, shipped_geometry
 from probewise.arm.instrument import Instrument, Pose, Reading
@@ -27,6 +27,7 @@ __all__ = [
     "Reach",
     "Reading",
     "Rehearsal",
+    "Request",
     "SimulatedArm",
     "SoftLimits",
     "Speed",

@@ -1,4 +1,4 @@
-"""Carry out a plan with the real arm: row after row, with a person who turns the sensor and changes the pattern."""
+"""Carry out a plan with an arm: row after row, with a person who turns the sensor and changes the pattern."""
 
 from __future__ import annotations
 
@@ -8,41 +8,75 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from probewise.arm.instrument import Pose, Reading
+from probewise._arrays import FloatArray
+from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
-from probewise.arm.reach import require_reach
+from probewise.arm.own import Measures, OwnInstrument, instrument_of
+from probewise.arm.reach import Bounds, require_reach
+from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["carry_out", "recorded"]
+__all__ = ["Request", "bounds_of", "carry_out", "recorded"]
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
+_SAME_TURN_RAD = math.radians(0.5)
+
+
+class Request(str):
+    """What a person at the bench is asked to do, as a sentence; a simulated bench does what it is about.
+
+    Attributes
+    ----------
+    pattern
+        The pattern to be laid under the arm, by its name; None: none.
+    turned_rad
+        How the sensor is to be turned on its mount; None: as it is.
+    """
+
+    __slots__ = ("pattern", "turned_rad")
+
+    pattern: str | None
+    turned_rad: float | None
+
+    def __new__(cls, text: str, *, pattern: str | None = None, turned_rad: float | None = None) -> Request:
+        """Make one of a sentence."""
+        request = super().__new__(cls, text)
+        request.pattern, request.turned_rad = pattern, turned_rad
+        return request
 
 
 def carry_out(
-    arm: LegoArm, plan: Plan, *, origin_mm: tuple[float, float], ask: Callable[[str], None], first: int = 0
+    arm: Instrument | Measures,
+    plan: Plan,
+    *,
+    origin_mm: tuple[float, float],
+    ask: Callable[[Request], None],
+    first: int = 0,
 ) -> Iterator[Reading]:
     """Take a plan's readings, in order.
 
-    The sensor's orientation follows from the arm; the person turns it on its mount by right angles,
-    to come as near to the planned orientation as that allows. The reading tells the true one.
+    The LEGO arm's orientation follows from the arm; the person turns its sensor on its mount by right angles,
+    to come as near to the planned orientation as that allows. The sensor of an instrument of one's own that does not
+    turn by itself is turned by the person too, to the planned orientation. The reading tells the true one.
 
     Parameters
     ----------
     arm
-        The arm, entered already.
+        The arm, entered already; or any object with a `measure(pose)`, see `instrument_of`.
     plan
         Where to read and over what.
     origin_mm
         Where on the field the plan's origin lies, lab frame.
     ask
-        Asks a person to do something, and returns when it is done.
+        Asks a person to do something, and returns when it is done: a `Request` is a text.
     first
         Row to start at: rows before it have been taken.
 
     Yields
     ------
-    A reading for each row, its place the plan's, as commanded, its orientation the true one.
+    A reading for each row, its place the plan's, as commanded, its orientation the true one. An instrument of one's own
+    may know the true place too: then that, in the plan's frame.
 
     Raises
     ------
@@ -51,30 +85,87 @@ def carry_out(
     ParameterError
         If the plan commands what this arm has not: another height, the LED off.
     """
+    arm = instrument_of(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    require_reach(arm.geometry, places, "row of the plan", way_out="; move the plan's origin")
+    require_reach(bounds_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_settings(arm, plan)
-    arm.turned_rad = 0.0
-    turns = np.rint((plan.orientation_rad - arm.orientation_rad(places)) / QUARTER_RAD) % 4
-    mounted, lying = 0, -1
+    handed = _Lego(arm) if isinstance(arm, LegoArm) else _Own(arm)
+    turns = handed.turns(plan, places)
+    mounted, lying = 0.0, -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
             lying = int(plan.pattern[row])
-            ask(
-                f"put pattern {plan.pattern_names[lying]!r} under the arm, its origin at "
-                f"({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
-            )
-        if int(turns[row]) != mounted:
-            mounted = int(turns[row])
-            ask(
-                f"turn the sensor on its mount to {90 * mounted} degrees, anticlockwise seen from above, "
-                "from where the geometry has it"
-            )
-            arm.turned_rad = mounted * QUARTER_RAD
-        x_mm, y_mm = places[row]
-        reading = arm.measure(Pose(float(x_mm), float(y_mm), float(arm.orientation_rad(places[row : row + 1])[0])))
-        there = Pose(float(plan.x_mm[row]), float(plan.y_mm[row]), reading.pose.orientation_rad)
+            name = plan.pattern_names[lying]
+            where = f"its origin at ({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
+            ask(Request(f"put pattern {name!r} under the arm, {where}", pattern=name))
+        if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
+            mounted = float(turns[row])
+            text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {handed.from_where}"
+            ask(Request(text, turned_rad=mounted))
+        x_mm, y_mm = places[row].tolist()
+        reading = handed.measure(x_mm, y_mm, mounted, plan, row)
+        there = Pose(*handed.place(reading, plan, row, origin_mm), reading.pose.orientation_rad)
         yield dataclasses.replace(reading, pose=there)
+
+
+class _Lego:
+    """The LEGO arm: its sensor turns with its base, and on its mount by right angles."""
+
+    from_where = "anticlockwise seen from above, from where the geometry has it"
+
+    def __init__(self, arm: LegoArm) -> None:
+        self._arm = arm
+        arm.turned_rad = 0.0
+
+    def turns(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor is to be turned by hand for each row, (n_points,)."""
+        off = plan.orientation_rad - self._arm.orientation_rad(places_mm)
+        return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
+
+    def measure(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
+        """Take the reading of a row, its place in the lab frame."""
+        self._arm.turned_rad = turned_rad
+        standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
+        return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
+
+    def place(self, reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
+        """Give the place to be written down: as commanded."""
+        return float(plan.x_mm[row]), float(plan.y_mm[row])
+
+
+class _Own:
+    """A person's own instrument, or the simulated arm: it turns its sensor itself, or a person does."""
+
+    from_where = "anticlockwise seen from above, from how it stands by itself"
+
+    def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
+        self._arm = arm
+        self._turns, self._lifts = _skills(arm)
+
+    def turns(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
+        """Tell how the sensor is to be turned by hand for each row, (n_points,)."""
+        if self._turns:
+            return np.zeros(len(plan))
+        off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
+        return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
+
+    def measure(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
+        """Take the reading of a row, its place in the lab frame."""
+        height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
+        up_mm = None if math.isnan(height_mm) else float(height_mm)
+        return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
+
+    def place(self, reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
+        """Give the place to be written down: as commanded, where the instrument knows none better."""
+        x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
+        if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
+            return x_mm, y_mm
+        return reading.pose.x_mm - origin_mm[0], reading.pose.y_mm - origin_mm[1]
+
+
+def _skills(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
+    """Tell whether an arm turns its sensor itself, and reads at a height that is asked for."""
+    return (True, True) if isinstance(arm, SimulatedArm) else (arm.turns, arm.lifts)
 
 
 def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
@@ -99,8 +190,23 @@ def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
     return Recording(taken, np.array([reading.value for reading in readings]))
 
 
-def _require_settings(arm: LegoArm, plan: Plan) -> None:
-    there = {"led": 1.0, "height_mm": arm.geometry.read_height_mm}
+def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
+    """Take what says where an arm can put its sensor."""
+    match arm:
+        case LegoArm():
+            return arm.geometry
+        case SimulatedArm():
+            return arm.reach
+        case _:
+            return arm
+
+
+def _require_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:
+    there = {"led": 1.0}
+    if isinstance(arm, LegoArm):
+        there["height_mm"] = arm.geometry.read_height_mm
+    elif not _skills(arm)[1] and plan.instrumentation.height_mm is not None:
+        there["height_mm"] = plan.instrumentation.height_mm
     for name, value in there.items():
         wanted = plan.covariates.get(name, np.empty(0))
         other = wanted[np.isfinite(wanted) & (wanted != value)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import sys
 import time
 import traceback
 import warnings
@@ -25,7 +26,7 @@ from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError, shortened
 from probewise.recordings.python_file import run_python_file
 
-__all__ = ["Measures", "OwnInstrument", "instrument_of"]
+__all__ = ["Measures", "OwnInstrument", "instrument_of", "require_measures"]
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
@@ -117,6 +118,20 @@ class OwnInstrument:
                 raise
             warnings.warn(f"the instrument may not be at rest: {_briefly(failure)}", RuntimeWarning, stacklevel=2)
 
+    @property
+    def turns(self) -> bool:
+        """Whether it turns its sensor to `pose.orientation_rad` itself: it says so by `turns = True`."""
+        return bool(getattr(self._own, "turns", False))
+
+    @property
+    def lifts(self) -> bool:
+        """Whether it reads at `pose.height_mm` where that is given: it says so by `lifts = True`."""
+        return bool(getattr(self._own, "lifts", False))
+
+    def sentence(self) -> str:
+        """Say where a place may be."""
+        return f"places that reachable of {self.source or 'the instrument'} allows"
+
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Tell which places, shape (n_places, 2), the instrument can take, all by default: shape (n_places,)."""
         own = getattr(self._own, "reachable", None)
@@ -127,6 +142,10 @@ class OwnInstrument:
             if held.dtype.kind not in "biu":
                 raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
             return held.astype(np.bool_)
+
+    def holds(self, places_mm: FloatArray) -> BoolArray:
+        """Say the same by the name that every arm's bounds have."""
+        return self.reachable(places_mm)
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Tell how the sensor stands at each place, (n_places, 2), 0 by default: shape (n_places,)."""
@@ -176,9 +195,14 @@ class OwnInstrument:
 
     @contextlib.contextmanager
     def _telling(self, what: str) -> Iterator[None]:
-        """Tell in one line, with the line of the person's file, of what goes wrong inside `what`."""
+        """Tell in one line, with the line of the person's file, of what goes wrong inside `what`.
+
+        What a file prints goes to standard error, where it does not mix with results.
+        """
+        aside = contextlib.redirect_stdout(sys.stderr) if self.source else contextlib.nullcontext()
         try:
-            yield
+            with aside:
+                yield
         except (Exception, SystemExit) as error:
             if not self.source:
                 raise
@@ -192,7 +216,9 @@ class OwnInstrument:
         return f"{where}: {what} raises {type(error).__name__}: {_briefly(error)}".rstrip(": ")
 
 
-def instrument_of(own: Instrument | Measures, *, start_s: float = 0.0, name: str = "instrument") -> Instrument:
+def instrument_of(
+    own: Instrument | Measures, *, start_s: float = 0.0, name: str = "instrument"
+) -> OwnInstrument | LegoArm | SimulatedArm:
     """Make an Instrument of any object with a `measure(pose)`; those of this package are handed back as they are.
 
     Parameters

@@ -11,10 +11,22 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError, ReachError
 
-__all__ = ["FIELD_MM", "Reach", "Workspace", "require_reach"]
+__all__ = ["FIELD_MM", "Bounds", "Reach", "Workspace", "require_reach"]
 
 FIELD_MM = (1048.0, 520.0)
 """Width and height of the paper's playing field, 131 x 65 LEGO units of 8 mm."""
+
+
+class Bounds(Protocol):
+    """Where an arm can put its sensor."""
+
+    def holds(self, places_mm: FloatArray) -> BoolArray:
+        """Tell which places, shape (n_places, 2), can be taken: shape (n_places,)."""
+        ...
+
+    def sentence(self) -> str:
+        """Say where a place may be."""
+        ...
 
 
 class Workspace(Protocol):
@@ -38,7 +50,7 @@ class Workspace(Protocol):
         ...
 
 
-def require_reach(workspace: Workspace, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
+def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
     """Refuse places of which one is out of reach, before anything moves.
 
     Parameters

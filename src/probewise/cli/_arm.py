@@ -1,4 +1,4 @@
-"""What the verbs that use a real arm share: which arm, its geometry, a person to ask."""
+"""What the verbs that use an arm share: which arm, its geometry, how it is opened, a person to ask."""
 
 from __future__ import annotations
 
@@ -7,27 +7,46 @@ import math
 import queue
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from probewise.cli._common import CommandError, a_path
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Instrument, LegoArm, Pose, Reading
+    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Pose, Reading
     from probewise.arm.nxt import Brick
+    from probewise.emulator import Table
+    from probewise.world import Surface, World
 
 __all__ = [
+    "ARMS",
+    "SCENE",
+    "ArmName",
     "Telling",
     "add_geometry",
     "asker",
     "geometry_of",
     "open_brick",
+    "open_emulated",
     "open_nxt",
+    "open_own",
     "parse_arm",
     "parse_place",
+    "require_choices",
 ]
+
+ARMS = (
+    "simulated; emulator, the LEGO arm in software; nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, "
+    "an instrument of your own"
+)
+"""How arms are named, the same in every verb."""
+
+SCENE = "600,250,80"
+"""What lies on the field of an emulated or simulated bench where nobody says otherwise: a circle, in mm."""
 
 WAIT_S = 0.5  # where a wait for a person hears no signal, it lasts so long; the brick is then kept awake
 
@@ -49,14 +68,68 @@ def geometry_of(arguments: argparse.Namespace) -> Geometry:
     return read_geometry(arguments.geometry or shipped_geometry())
 
 
-def parse_arm(text: str) -> str | None:
-    """Read "simulated" (None) or "nxt:PORT" (the port)."""
-    kind, _, port = text.partition(":")
+@dataclass(frozen=True)
+class ArmName:
+    """Which arm: its kind, and the port or the file that it is behind."""
+
+    kind: Literal["simulated", "emulator", "nxt", "file"]
+    where: str = ""
+
+    @property
+    def is_lego(self) -> bool:
+        """Whether it is the LEGO arm, whose geometry says how far it reaches."""
+        return self.kind in ("nxt", "emulator")
+
+
+def parse_arm(text: str) -> ArmName:
+    """Read the name of an arm: "simulated", "emulator", "nxt:PORT" or "FILE.py".
+
+    Raises
+    ------
+    ParameterError
+        If it is none of these.
+    """
     if text == "simulated":
-        return None
-    if kind != "nxt" or not port:
-        raise ParameterError("--arm", text, "simulated, or nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5")
-    return port
+        return ArmName("simulated")
+    if text == "emulator":
+        return ArmName("emulator")
+    kind, _, port = text.partition(":")
+    if kind == "nxt" and port:
+        return ArmName("nxt", port)
+    if text.endswith(".py"):
+        return ArmName("file", text)
+    raise ParameterError("--arm", text, ARMS)
+
+
+def open_own(path: str, *, start_s: float = 0.0) -> OwnInstrument:
+    """Read a person's file; what its `connect()` returns is the instrument, from when it is entered."""
+    from probewise.arm import OwnInstrument
+
+    return OwnInstrument.from_file(path, start_s=start_s)
+
+
+def open_emulated(
+    geometry: Geometry,
+    geometry_file: Path | None,
+    world: World,
+    surface: Surface,
+    *,
+    seed: int,
+    start_s: float = 0.0,
+) -> tuple[LegoArm, Table]:
+    """Hang the LEGO arm on a brick in software, over a table; its clock runs as fast as it can.
+
+    The emulator reads the geometry by itself: `geometry_file`, or the shipped one.
+    """
+    from probewise.arm import LegoArm
+    from probewise.arm.nxt import Brick, BrickMachine, Link
+    from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
+
+    clock = VirtualClock()
+    numbers = read_geometry(geometry_file or shipped_geometry())
+    bench = set_up(numbers, world, surface, clock, seed=seed, sleep_min=0)
+    brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
+    return LegoArm(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench.table
 
 
 def parse_place(name: str, text: str) -> tuple[float, float]:
@@ -111,8 +184,35 @@ class Telling:
         return reading
 
 
-def asker(arm: LegoArm) -> Callable[[str], None]:
-    """Make what asks a person and waits for Enter, while the arm is kept awake."""
+def require_choices(
+    arm: Instrument, orientations_deg: Sequence[float] | None, heights_mm: Sequence[float] | None
+) -> None:
+    """Refuse poses that a person's instrument, entered already, does not say that it can take.
+
+    Raises
+    ------
+    ParameterError
+        If it neither turns its sensor nor lifts it, and is asked to.
+    """
+    from probewise.arm import OwnInstrument
+
+    if not isinstance(arm, OwnInstrument):
+        return
+    wanted = (
+        ("--orientations", orientations_deg, arm.turns, "turn its sensor to pose.orientation_rad; turns"),
+        ("--heights", heights_mm, arm.lifts, "read at pose.height_mm; lifts"),
+    )
+    for option, values, can, what in wanted:
+        if values and not can:
+            listed = ",".join(f"{value:g}" for value in values)
+            raise ParameterError(
+                option, listed, f"none with {arm.source}: it does not say that it can {what} = True does"
+            )
+
+
+def asker(arm: Instrument) -> Callable[[str], None]:
+    """Make what asks a person and waits for Enter, while an arm that may fall asleep is kept awake."""
+    keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
 
     def ask(text: str) -> None:
         sys.stderr.write(f"{text[0].upper()}{text[1:]}, then press Enter: ")
@@ -124,7 +224,7 @@ def asker(arm: LegoArm) -> Callable[[str], None]:
             try:
                 answer = answers.get(timeout=WAIT_S)
             except queue.Empty:
-                arm.keep_awake()
+                keep_awake()
             else:
                 break
         if not answer:

@@ -28,6 +28,7 @@ __all__ = [
     "keeps",
     "positive_int",
     "say",
+    "seed_number",
 ]
 
 DEFAULT_SEED = 2013  # the year of the paper; printed with every run
@@ -82,7 +83,7 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     """Add the options that every verb with randomness or progress has."""
     parser.add_argument(
         "--seed",
-        type=_seed,
+        type=seed_number,
         default=DEFAULT_SEED,
         metavar="N",
         help=f"seed of all randomness, printed with the result (default {DEFAULT_SEED})",
@@ -124,7 +125,8 @@ def positive_int(text: str) -> int:
     return value
 
 
-def _seed(text: str) -> int:
+def seed_number(text: str) -> int:
+    """Read a whole number from 0 on, for argparse."""
     try:
         value = int(text)
     except ValueError:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from probewise.recordings import Instrumentation, Recording
     from probewise.scene import Shape
 
-__all__ = ["is_journal", "journal_recording", "refuse_journal"]
+__all__ = ["is_journal", "journal_recording", "journal_sensor", "refuse_journal"]
 
 
 def is_journal(path: Path) -> bool:
@@ -55,6 +55,30 @@ def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shap
         raise FileError(path, "no reading", "a journal with at least one measurement")
     recording = journal.recording(instrumentation=_instrumentation(path, sensor, journal.settings))
     return replace(recording, notes=(*recording.notes, *journal.notes)), _shape_of(path, journal.settings)
+
+
+def journal_sensor(path: Path) -> Path:
+    """Find the sensor.json that a journal's run was made with: where it was, or beside the journal.
+
+    Raises
+    ------
+    FileError
+        If the journal names none, or what stands there is another.
+    """
+    from probewise.calibration import read_sensor
+    from probewise.experiment import read_journal, sensor_named
+
+    settings = read_journal(path).settings
+    named, wanted = settings.get("sensor_file"), settings.get("sensor_sha256")
+    give = "--sensor S.json, that of the run or a newer one"
+    if not isinstance(named, str) or not isinstance(wanted, str):
+        raise FileError(path, "it does not name its sensor's file", give)
+    standing = [place for place in (path.parent / named, path.parent / Path(named).name) if place.exists()]
+    for place in standing:
+        if sensor_named(read_sensor(place))["sensor_sha256"] == wanted:
+            return place
+    found = "is another by now" if standing else "is not there any more"
+    raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)
 
 
 def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:

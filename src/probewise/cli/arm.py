@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import (
+    ARMS,
+    SCENE,
     add_geometry,
     asker,
     geometry_of,
@@ -16,18 +19,32 @@ from probewise.cli._arm import (
     parse_arm,
     parse_place,
 )
-from probewise.cli._common import CommandError, OneLineParser, Verb, a_path, add_quiet, keeps, positive_int, say
+from probewise.cli._common import (
+    DEFAULT_SEED,
+    CommandError,
+    OneLineParser,
+    Verb,
+    a_path,
+    add_quiet,
+    keeps,
+    positive_int,
+    say,
+    seed_number,
+)
 from probewise.cli._output import check_out_file
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, LegoArm, Reading
+    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, SimulatedArm
+    from probewise.cli._bench import Bench
     from probewise.recordings import Plan
 
 __all__ = ["TASKS", "VERB"]
 
 PAPER = "paper"
+_COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
+_OFF_PLAN_MM = 5.0  # an instrument of one's own may know better where it read
 UNITS = "LEGO units (1 dark to 100 bright)"
 
 
@@ -52,38 +69,66 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     _task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
 
-    scan = _task(tasks, "scan", "Read along a line; readings in LEGO units go to standard output as CSV.", moves=True)
+    scan = _task(tasks, "scan", "Read along a line; readings go to standard output as CSV.", moves=True, own=True)
     scan.add_argument("start", metavar="X,Y", help="from here, mm")
     scan.add_argument("end", metavar="X,Y", help="to here, mm")
     scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="how many (default 21)")
 
     record = _task(
-        tasks, "record", "Carry out a plan and write the recording; asks when there is something to do.", moves=True
+        tasks,
+        "record",
+        "Carry out a plan and write the recording; asks when there is something to do.",
+        moves=True,
+        own=True,
     )
     record.add_argument(
         "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER}, the paper's"
     )
     record.add_argument("--out", type=a_path, required=True, metavar="REC.csv", help="where the recording goes")
     record.add_argument(
-        "--origin-mm", metavar="X,Y", help="where on the field the plan's origin lies (default: the field's middle)"
+        "--origin-mm",
+        metavar="X,Y",
+        help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)",
     )
+    own = record.add_argument_group("with FILE.py", "what its readings are, where the plan's JSON does not say it")
+    own.add_argument("--unit", metavar="UNIT", help="unit of a reading, such as V or counts")
+    own.add_argument("--range", metavar="LOW,HIGH", help="least and greatest reading there is, such as 0,1023")
+    own.add_argument("--step", metavar="STEP", help="what readings are whole multiples of, such as 1")
+    for task, scene in ((scan, True), (record, False)):
+        simulated = task.add_argument_group("with simulated and emulator")
+        simulated.add_argument(
+            "--sensor", type=a_path, metavar="S.json", help="its sensor (default: that of the shipped recordings)"
+        )
+        simulated.add_argument("--seed", type=seed_number, metavar="N", help=f"of its noise (default {DEFAULT_SEED})")
+        if scene:
+            simulated.add_argument("--scene", metavar="X,Y,R", help="what lies there, as emulate-nxt takes it")
+    record.set_defaults(scene=None)
     record.add_argument("--resume", action="store_true", help="go on behind the readings that REC.csv holds")
 
 
 def _task(
-    tasks: argparse._SubParsersAction[OneLineParser], name: str, summary: str, *, moves: bool = False
+    tasks: argparse._SubParsersAction[OneLineParser],
+    name: str,
+    summary: str,
+    *,
+    moves: bool = False,
+    own: bool = False,
 ) -> OneLineParser:
     parser = tasks.add_parser(name, help=summary, description=summary)
     if moves:
-        _add_arm(parser)
+        _add_arm(parser, own=own)
         parser.add_argument("--dry-run", action="store_true", help="print the moves, from home, and make none")
     add_geometry(parser)
     add_quiet(parser)
     return parser
 
 
-def _add_arm(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
+def _add_arm(parser: argparse.ArgumentParser, *, own: bool = False) -> None:
+    brick = "the brick, such as nxt:/dev/rfcomm0 or nxt:COM5"
+    if own:
+        parser.add_argument("--arm", metavar="ARM", help=f"where the readings come from: {ARMS}")
+    else:
+        parser.add_argument("--arm", metavar="nxt:PORT", help=brick)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -93,8 +138,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    import math
-
     import numpy as np
 
     from probewise.arm.geometry import JOINTS
@@ -144,8 +187,6 @@ def _check_brick(port: str, geometry: Geometry) -> None:
 
 
 def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    import math
-
     from probewise.arm.geometry import JOINTS
 
     match arguments.where:
@@ -169,8 +210,6 @@ def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 
 def _home(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    import math
-
     from probewise.arm.geometry import JOINTS
 
     with _arm(arguments, geometry) as arm:
@@ -194,29 +233,47 @@ def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
 def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
-    from probewise.arm import Pose, require_reach
+    from probewise.arm import LegoArm, Pose, require_reach
+    from probewise.arm.carry_out import bounds_of
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
     places = np.linspace(start, end, arguments.readings)
-    require_reach(geometry, places, "reading of the scan")
-    with _arm(arguments, geometry) as arm:
-        say("x_mm,y_mm,orientation_deg,time_s,reading,battery_mv")
-        for (x_mm, y_mm), standing in zip(places, arm.orientation_rad(places), strict=True):
+    if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before the brick is called
+        require_reach(geometry, places, "reading of the scan")
+    names: list[str] = ["battery_mv"]
+    instrument, _ = _instrument(arguments, geometry)
+    with instrument as arm:
+        require_reach(bounds_of(arm), places, "reading of the scan")
+        if isinstance(arm, LegoArm):
+            say(",".join((_COLUMNS, *names)))
+        for k, ((x_mm, y_mm), standing) in enumerate(zip(places, arm.orientation_rad(places), strict=True)):
             reading = arm.measure(Pose(float(x_mm), float(y_mm), float(standing)))
+            if k == 0 and not isinstance(arm, LegoArm):
+                names = list(reading.covariates)
+                say(",".join((_COLUMNS, *names)))
             turned = np.degrees(reading.pose.orientation_rad)
-            battery = reading.covariates["battery_mv"]
-            say(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:g},{battery:g}")
+            more = (f",{reading.covariates.get(name, math.nan):.9g}" for name in names)
+            say(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:.9g}{''.join(more)}")
 
 
 def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    from functools import partial
+
     from probewise._progress import progress_shown
     from probewise.arm import carry_out, recorded
     from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
 
     named = arguments.plan == PAPER
     out = check_out_file(arguments.out, *([] if named else [Path(arguments.plan)]))
-    plan = _as_read(paper_plan() if named else read_plan(arguments.plan), geometry)
-    width, height = geometry.field_mm
+    own = _is_own(arguments)
+    asked = paper_plan() if named else read_plan(arguments.plan)
+    if own:
+        plan = _as_said(asked, arguments)
+    elif arguments.sensor is not None:
+        plan = _simulated_sensor(asked, arguments.sensor)
+    else:
+        plan = _as_read(asked, geometry, arguments)
+    width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
     taken = _taken_before(out, plan, resume=arguments.resume, dry=arguments.dry_run)
     start_s = taken[-1].time_s if taken else 0.0
@@ -226,8 +283,10 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
             return "nothing was read"
         return keeps(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
-    with saying_what_is_kept(kept), _arm(arguments, geometry, start_s=start_s) as arm:
-        readings = carry_out(arm, plan, origin_mm=origin, ask=_asker(arguments, arm), first=len(taken))
+    instrument, bench = _instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
+    with saying_what_is_kept(kept), instrument as arm:
+        ask = _asker(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
+        readings = carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
         with progress_shown(quiet=arguments.quiet, beat=False) as progress:
             progress("readings", len(taken), len(plan))
             for reading in readings:
@@ -239,10 +298,46 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
         say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 
 
-def _as_read(plan: Plan, geometry: Geometry) -> Plan:
-    """Take the plan for what this arm reads: percent, at its height."""
+def _as_said(plan: Plan, arguments: argparse.Namespace) -> Plan:
+    """Take the plan for what an instrument of one's own reads: as its JSON says, or the options."""
     import dataclasses
 
+    said: dict[str, object] = {} if arguments.unit is None else {"unit": arguments.unit}
+    if arguments.unit is not None:  # what was declared was of another unit
+        said |= {"min": None, "max": None, "step": None, "sensor": ""}
+    if arguments.range is not None:
+        said |= dict(zip(("min", "max"), _numbers("--range", arguments.range, 2), strict=True))
+    if arguments.step is not None:
+        (said["step"],) = _numbers("--step", arguments.step, 1)
+    return _commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
+
+
+def _commanded(plan: Plan) -> Plan:
+    """Keep of a plan's covariates those that can be commanded: others were read when it was carried out before."""
+    import dataclasses
+
+    commanded = {*plan.instrumentation.controls, "led", "height_mm"}
+    kept = {name: values for name, values in plan.covariates.items() if name in commanded}
+    return dataclasses.replace(plan, covariates=kept)
+
+
+def _numbers(option: str, text: str, n: int) -> list[float]:
+    try:
+        numbers = [float(cell) for cell in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        raise ParameterError(option, text, "LOW,HIGH such as 0,1023" if n == 2 else "a number such as 1")
+    return numbers
+
+
+def _as_read(plan: Plan, geometry: Geometry, arguments: argparse.Namespace) -> Plan:
+    """Take the plan for what the LEGO arm reads: percent, at its height."""
+    import dataclasses
+
+    for option in ("unit", "range", "step"):
+        if getattr(arguments, option) is not None:
+            raise ParameterError(f"--{option}", getattr(arguments, option), "none with the LEGO arm: it is known")
     step = 1.0 if geometry.whole_percent else None
     instrumentation = dataclasses.replace(
         plan.instrumentation,
@@ -253,7 +348,16 @@ def _as_read(plan: Plan, geometry: Geometry) -> Plan:
         sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
         height_mm=geometry.read_height_mm,
     )
-    return dataclasses.replace(plan, instrumentation=instrumentation)
+    return _commanded(dataclasses.replace(plan, instrumentation=instrumentation))
+
+
+def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
+    """Take the plan for what the sensor of a simulated arm reads."""
+    import dataclasses
+
+    from probewise.calibration import read_sensor
+
+    return _commanded(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
 
 
 def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
@@ -271,7 +375,9 @@ def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Rea
         return []
     before = read_recording(out)
     rows, first = before.plan, plan.take(np.arange(min(len(before), len(plan))))
-    same = len(first) == len(before) and np.array_equal(rows.x_mm, first.x_mm) and np.array_equal(rows.y_mm, first.y_mm)
+    same_length = len(first) == len(before)
+    off_mm = [abs(getattr(rows, axis) - getattr(first, axis)) for axis in ("x_mm", "y_mm")] if same_length else []
+    same = same_length and all((off <= _OFF_PLAN_MM).all() for off in off_mm)
     if not same or [rows.pattern_names[k] for k in rows.pattern] != [first.pattern_names[k] for k in first.pattern]:
         raise FileError(out, "readings of another plan", "the first rows of this plan, as an earlier go left them")
     return [
@@ -297,20 +403,61 @@ def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 
     return open_nxt(_port(arguments.arm), geometry, start_s=start_s)
 
 
-def _port(arm: str) -> str:
-    port = parse_arm(arm)
-    if port is None:
-        raise ParameterError("--arm", arm, "nxt:PORT; a simulated arm has no bench, --dry-run prints the moves")
-    return port
+def _instrument(
+    arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0, n_taken: int = 0
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
+    """Open the arm of a task that every arm can do, and the bench below it if that is simulated too."""
+    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    if chosen is None or chosen.kind == "nxt":
+        _refuse(arguments, "a real arm", "sensor", "scene", "seed")
+        return _arm(arguments, geometry, start_s=start_s), None
+    if arguments.dry_run:
+        raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
+    if chosen.kind == "file":
+        _refuse(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
+    from probewise.cli._bench import open_arm
+
+    seed = DEFAULT_SEED if arguments.seed is None else arguments.seed
+    opened = open_arm(
+        chosen,
+        geometry,
+        arguments.geometry,
+        sensor=arguments.sensor,
+        scene=SCENE if arguments.scene is None else arguments.scene,
+        seed=seed,
+        start_s=start_s,
+        n_taken=n_taken,
+    )
+    say(f"seed {seed}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
+    return opened
 
 
-def _asker(arguments: argparse.Namespace, arm: LegoArm) -> Callable[[str], None]:
+def _refuse(arguments: argparse.Namespace, what: str, *names: str) -> None:
+    for name in names:
+        value = getattr(arguments, name, None)
+        if value is not None:
+            raise ParameterError(f"--{name}", str(value), f"none with {what}")
+
+
+def _is_own(arguments: argparse.Namespace) -> bool:
+    """Tell an instrument of one's own."""
+    return arguments.arm is not None and parse_arm(arguments.arm).kind == "file"
+
+
+def _port(name: str) -> str:
+    chosen = parse_arm(name)
+    if chosen.kind != "nxt":
+        own = "; FILE.py is for `arm scan`, `arm record` and `explore`" if chosen.kind == "file" else ""
+        without = f"; {name} has no bench, --dry-run prints the moves" if not own else ""
+        raise ParameterError("--arm", name, f"nxt:PORT{own}{without}")
+    return chosen.where
+
+
+def _asker(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
     return (lambda text: say(f"ask: {text}")) if arguments.dry_run else asker(arm)
 
 
 def _say_position(arm: LegoArm, *, quiet: bool) -> None:
-    import math
-
     (x_mm, y_mm, height_mm), angles = arm.position_mm, [math.degrees(angle) for angle in arm.angles_rad]
     say(
         f"sensor at ({x_mm:.1f}, {y_mm:.1f}) mm, {height_mm:.1f} mm above the surface; base {angles[0]:.1f}, "

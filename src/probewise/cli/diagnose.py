@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, say
 from probewise.cli._diagnose_system import diagnose_simulator
-from probewise.cli._journal import is_journal, journal_recording
+from probewise.cli._journal import is_journal, journal_recording, journal_sensor
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sensor",
         type=a_path,
         metavar="S.json",
-        help="an earlier calibration, whose posterior becomes the prior",
+        help="an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)",
     )
     add_simulator(parser)
     parser.add_argument(
@@ -64,16 +64,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
+        journals = [path for path in arguments.recordings if is_journal(path)]
+        if arguments.sensor is None and journals:
+            arguments.sensor = journal_sensor(journals[0])
         sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
         recordings, shapes = [], []
         for path in arguments.recordings:
-            if not is_journal(path):
+            if sensor is None or path not in journals:
                 recordings.append(read_recording(path, progress=progress))
                 continue
-            if sensor is None:
-                raise CommandError(
-                    f"--sensor is missing: {path} needs the sensor.json that its run was made with, or a newer one"
-                )
             recording, shape = journal_recording(path, sensor)
             recordings.append(recording)
             shapes.append(shape)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise.cli._arm import SCENE
 from probewise.cli._common import Verb, a_path, add_common, say
 from probewise.cli._output import check_out_file
 from probewise.cli._stopping import saying_what_is_kept
@@ -19,7 +20,6 @@ from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
     from probewise.emulator import Table, Trace
-    from probewise.world import World
 
 __all__ = ["VERB"]
 
@@ -28,9 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
     parser.add_argument(
         "--scene",
-        default="600,250,80",
+        default=SCENE,
         metavar="X,Y,R",
-        help="the circle on the field, in mm (default 600,250,80), or ellipse:X,Y,A,B,ANGLE, "
+        help=f"the circle on the field, in mm (default {SCENE}), or ellipse:X,Y,A,B,ANGLE, "
         "polygon:X,Y,X,Y,..., edge:ANGLE,OFFSET, corner:X,Y,DX,DY, uniform:ALBEDO",
     )
     parser.add_argument(
@@ -76,13 +76,14 @@ def run(arguments: argparse.Namespace) -> int:
     if not hasattr(os, "openpty"):
         raise LinkError("emulate-nxt needs pseudo-terminals, which this system has not; Linux, macOS and WSL do")
 
+    from probewise.cli._bench import world_of
     from probewise.emulator import Faults, parse_scene, read_geometry, set_up, shipped_geometry
     from probewise.emulator.pty import Terminal, serve
 
     geometry = read_geometry(shipped_geometry() if arguments.geometry is None else arguments.geometry)
     surface = parse_scene(arguments.scene)
     faults = Faults.parse(arguments.fault)
-    world = _world(arguments.sensor)
+    world, _ = world_of(arguments.sensor)
     with _trace(arguments.log) as trace, Terminal(arguments.link) as terminal:
         bench = set_up(
             geometry,
@@ -104,17 +105,6 @@ def run(arguments: argparse.Namespace) -> int:
             serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench.table).listen)
     say(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
     return 0
-
-
-def _world(sensor: Path | None) -> World:
-    if sensor is None:
-        from probewise.world.shipped import truth
-
-        return truth("paper")
-    from probewise.calibration import read_sensor
-    from probewise.experiment import world_like
-
-    return world_like(read_sensor(sensor))
 
 
 class _Listener:

@@ -9,7 +9,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probewise.cli._arm import Telling, add_geometry, geometry_of, open_nxt, parse_arm
+from probewise.cli._arm import (
+    ARMS,
+    Telling,
+    add_geometry,
+    geometry_of,
+    open_emulated,
+    open_nxt,
+    open_own,
+    parse_arm,
+    require_choices,
+)
 from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import require_going_on, saying_what_is_kept
@@ -51,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--arm",
         default="simulated",
         metavar="ARM",
-        help="where the readings come from: simulated (the default), or nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5",
+        help=f"where the readings come from: {ARMS} (default simulated)",
     )
     add_geometry(parser, "the file that ships; the simulated arm has its reach, and a sensor that does not turn")
     parser.add_argument(
@@ -116,10 +126,16 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report.animation import gif
 
     out = check_out_directory(arguments.out)
-    port = parse_arm(arguments.arm)
-    geometry = geometry_of(arguments) if port is not None or arguments.geometry is not None else None
+    chosen = parse_arm(arguments.arm)
+    if chosen.kind == "file" and arguments.geometry is not None:
+        raise ParameterError(
+            "--geometry", str(arguments.geometry), "none with FILE.py, which says itself what it reaches"
+        )
+    geometry = geometry_of(arguments) if chosen.is_lego or arguments.geometry is not None else None
     field = _field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
+    if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
+        raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
     streams = posing.Streams.of(np.random.default_rng(arguments.seed))
     shape, utility = posing.shape_named(arguments.shape, field), utility_named(arguments.utility)
     orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
@@ -141,16 +157,26 @@ def run(arguments: argparse.Namespace) -> int:
     before = _before(journal, resume=arguments.resume)
     taken = () if before is None else before.readings
     arm: Instrument
+    start_s = taken[-1].time_s if taken else 0.0
     truth_mm, known = None, None
     about: dict[str, Any] = posing.sensor_named(sensor, _seen_from(out, arguments.sensor))
-    if port is not None and geometry is not None:
+    if chosen.kind in ("nxt", "file"):
         if arguments.truth is not None:
             raise ParameterError("--truth", arguments.truth, "none with a real arm: what lies there is for it to find")
-        arm = open_nxt(port, geometry, start_s=taken[-1].time_s if taken else 0.0)
+        if chosen.kind == "file":
+            arm = open_own(chosen.where, start_s=start_s)
+        elif geometry is not None:
+            arm = open_nxt(chosen.where, geometry, start_s=start_s)
     else:
         hidden = parse_truth(arguments.truth, arguments.shape, field, rng=streams.truth)
-        world = posing.world_like(sensor)
-        arm = posing.arm_over(world, hidden.surface, field, seed=streams.noise, taken=taken, workspace=geometry)
+        world, surface = posing.world_like(sensor), hidden.surface
+        if chosen.is_lego and geometry is not None:
+            arm, _ = open_emulated(geometry, arguments.geometry, world, surface, seed=streams.noise, start_s=start_s)
+        else:
+            scale = posing.scale_of(sensor.instrumentation)
+            arm = posing.arm_over(
+                world, surface, field, seed=streams.noise, taken=taken, workspace=geometry, scale=scale
+            )
         truth_mm, known = hidden.outline_mm, hidden.named_as(experiment.names)
         about = {**about, "hidden": hidden.document}
     means = sensor.mean()
@@ -177,10 +203,10 @@ def run(arguments: argparse.Namespace) -> int:
             arm,
             lambda pose: tell(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
             lambda reading: tell(f"thinking about {reading.value:g}"),
-        ) as arm,
+        ) as telling,
         closing(
             explore(
-                arm,
+                telling,
                 experiment,
                 rng=streams.run,
                 max_readings=arguments.max_readings,
@@ -189,6 +215,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
         ) as own,
     ):
+        require_choices(arm, arguments.orientations, arguments.heights)
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if other is not None:

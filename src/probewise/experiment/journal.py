@@ -257,7 +257,10 @@ def _pose_line(pose: Pose) -> dict[str, float]:
 
 
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
-    """Raise FileError naming every setting in which a journal differs from the run that wants to resume it."""
+    """Raise FileError naming every setting in which a journal differs from the run that wants to resume it.
+
+    Version, arm and the name of the sensor's file may differ.
+    """
     there, here = _flat(journal.settings), _flat(json.loads(json.dumps(settings)))
     different = sorted(name for name in {*there, *here} - _FREE if there.get(name) != here.get(name))
     if different:

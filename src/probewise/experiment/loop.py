@@ -17,8 +17,8 @@ import numpy as np
 
 from probewise._kinds import require_callable, require_kind, require_path, require_rng, require_whole
 from probewise.arm.instrument import Instrument, Reading
-from probewise.arm.own import Measures, instrument_of
-from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.arm.own import Measures, instrument_of, require_measures
+from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
 from probewise.experiment.asking import Field, inquire, next_poses
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import (
@@ -208,8 +208,10 @@ def explore(
         If the journal is damaged, belongs to a run with other settings, or is written to by another process.
     NotConvergedError
         If no hypothesis could have given the readings.
+    LinkError
+        If the instrument fails, or returns what the sensor cannot read.
     """
-    instrument = instrument_of(instrument)
+    require_measures("instrument", instrument)
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
     require_rng(rng)
     require_whole("max_readings", max_readings)
@@ -226,6 +228,8 @@ def explore(
             raise ParameterError(
                 "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
             )
+    start_s = before.readings[-1].time_s if before is not None and before.entries else 0.0
+    instrument = instrument_of(instrument, start_s=start_s)
     return _steps(instrument, experiment, seed, max_readings, path, before, settings)
 
 
@@ -278,9 +282,7 @@ def _steps(
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
-            experiment.readout.require(
-                reading.value
-            )  # before it is written: what cannot be used must not block a resume
+            _require_readable(experiment, reading)  # before it is written, lest a resume fail on it again
             if writer is not None and (entry is None or entry.belief is None):
                 writer.reading(number, reading)
             state, info = step(
@@ -303,6 +305,14 @@ def _steps(
                 info = dataclasses.replace(info, notes=(*info.notes, *notes))
             stopped = info.stop_reason is not None
             yield info
+
+
+def _require_readable(experiment: Experiment, reading: Reading) -> None:
+    """Refuse what the sensor cannot have read: the instrument is at fault, and the run goes on when it is mended."""
+    try:
+        experiment.readout.require(reading.value)
+    except ParameterError as error:
+        raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
 
 
 def _writer(

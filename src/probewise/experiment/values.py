@@ -16,7 +16,7 @@ from probewise.experiment.journal import recording_of
 from probewise.experiment.setting import Experiment, widest_mm
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
-from probewise.recordings.plan import Recording
+from probewise.recordings.plan import Instrumentation, Recording
 
 __all__ = ["PAPER_BITS", "Exploration", "State", "Step"]
 
@@ -184,9 +184,9 @@ class Exploration(ShowsItself):
         """Doubts about the last step: why the result should not be trusted blindly."""
         return self.last.notes
 
-    def recording(self) -> Recording:
-        """Turn the readings into a recording over the pattern "field"."""
-        return recording_of(self.readings)
+    def recording(self, *, instrumentation: Instrumentation | None = None) -> Recording:
+        """Turn the readings into a recording over the pattern "field"; of a sensor with its `instrumentation`."""
+        return recording_of(self.readings, instrumentation=instrumentation)
 
     def summary(self) -> str:
         """Describe the run in plain text."""

@@ -337,8 +337,8 @@ class NestedResult(ShowsItself):
             raise FileError(path, "there is no such file", "a file written by NestedResult.save") from error
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             # NumPy takes whatever is no archive for a pickle, and says how to load one all the same.
-            why = "no NumPy archive" if "pickle" in str(error) else f"unreadable ({error})"
-            raise FileError(path, why, "a file written by NestedResult.save") from error
+            why = "no NumPy archive" if "pickle" in str(error) else error
+            raise FileError(path, f"unreadable ({why})", "a file written by NestedResult.save") from error
         if found != _FORMAT:
             raise FileError(path, f"format {found!r}", f"{_FORMAT!r}; make the file anew with this version")
         wanted = {f.name for f in fields(cls)} - set(_ARRAYS)

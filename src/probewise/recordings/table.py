@@ -24,16 +24,9 @@ __all__ = ["LARGEST", "MISSING", "Table", "count_numbers", "csv_text", "number_t
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond it squares and differences lose their meaning."""
 
-MISSING = frozenset(
-    {
-        "",
-        *(
-            name
-            for word in ("nan", "na", "n/a", "null", "none")
-            for name in map("".join, itertools.product(*zip(word, word.upper(), strict=True)))
-        ),
-    }
-)
+_WORDS = ("nan", "na", "n/a")
+_SPELT = (map("".join, itertools.product(*zip(word, word.upper(), strict=True))) for word in _WORDS)
+MISSING = frozenset(itertools.chain([""], *_SPELT))
 """What stands in a cell whose number is missing."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -101,7 +94,7 @@ class Table:
         values = _parsed(list(itertools.compress(cells, there)))
         if values is None or not (np.abs(values) <= most).all():
             allowed = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
-            allowed += ", or empty or nan where it is missing" if missing else ""
+            allowed += ", or empty, nan or n/a where it is missing" if missing else ""
             k, cell = next(
                 (k, cell)
                 for k, cell in enumerate(cells)

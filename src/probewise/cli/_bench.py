@@ -1,0 +1,161 @@
+"""A bench of arithmetic for the tasks of `arm`: patterns lie down by themselves under a simulated arm."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probewise.arm import LegoArm, LegoScale, OwnInstrument, Reading, Request, SimulatedArm
+from probewise.cli._arm import SCENE, ArmName, open_emulated, open_nxt, open_own
+from probewise.cli._common import DEFAULT_SEED
+from probewise.emulator import Table, parse_scene
+from probewise.errors import ParameterError
+from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
+
+if TYPE_CHECKING:
+    from probewise.arm import Geometry, Pose
+    from probewise.recordings import Instrumentation
+    from probewise.world import Surface, World
+
+__all__ = ["Bench", "moved", "open_arm", "world_of"]
+
+
+class Bench:
+    """A table under a simulated or an emulated arm.
+
+    Parameters
+    ----------
+    world
+        How the sensor reads.
+    scene
+        What lies there at first, as `emulate-nxt` takes it.
+    scale
+        What the simulated arm's readings are rounded to and kept within.
+    seed
+        Of the noise.
+    n_taken
+        Readings that an earlier go has taken: the noise goes on behind them.
+    """
+
+    def __init__(self, world: World, scene: str, *, scale: LegoScale, seed: int, n_taken: int = 0) -> None:
+        self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
+        self._table = Table(parse_scene(scene))
+
+    def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
+        """Stand the simulated arm over it, which turns its sensor itself."""
+        number = itertools.count(self._n_taken)
+
+        def light(pose: Pose, time_s: float, height_mm: float) -> float:
+            rng = np.random.default_rng([self._seed, next(number)])
+            place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
+            return self._world.read(self._table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
+
+        make = partial(SimulatedArm, light, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
+        rest = make().pose
+        return make(last=Reading(math.nan, rest, start_s))
+
+    def emulated(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
+        """Stand the LEGO arm over it, on a brick in software."""
+        surface, seed = self._table.surface, self._seed + self._n_taken
+        arm, self._table = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
+        return arm
+
+    def lay(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
+        """Do what `carry_out` asks of a person: lay a pattern with its origin there, or turn the sensor."""
+        if isinstance(request, Request) and request.pattern is not None:
+            self._table.surface = moved(patterns[request.pattern], origin_mm)
+        if isinstance(request, Request) and request.turned_rad is not None:
+            self._table.turned_rad = request.turned_rad
+
+
+def open_arm(
+    chosen: ArmName,
+    geometry: Geometry,
+    geometry_file: Path | None,
+    *,
+    sensor: Path | None = None,
+    scene: str = SCENE,
+    seed: int = DEFAULT_SEED,
+    start_s: float = 0.0,
+    n_taken: int = 0,
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
+    """Open any arm for a plan to be carried out, and the bench below it where that is simulated too.
+
+    Parameters
+    ----------
+    chosen
+        Which.
+    geometry, geometry_file
+        Of the LEGO arm, and the file that was asked for; given one, the simulated arm has its reach.
+    sensor, scene, seed
+        Of a simulated or emulated arm: the file of its sensor, what lies there at first, the seed of the noise.
+    start_s, n_taken
+        What the clock starts at, and how many readings an earlier go has taken.
+
+    Raises
+    ------
+    ParameterError
+        If the brick cannot read in the sensor's unit.
+    """
+    if chosen.kind == "nxt":
+        return open_nxt(chosen.where, geometry, start_s=start_s), None
+    if chosen.kind == "file":
+        return open_own(chosen.where, start_s=start_s), None
+    from probewise.experiment import scale_of
+
+    world, instrumentation = world_of(sensor)
+    if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
+        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
+    scale = LegoScale() if instrumentation is None else scale_of(instrumentation)
+    bench = Bench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
+    if chosen.is_lego:
+        return bench.emulated(geometry, geometry_file, start_s=start_s), bench
+    return bench.simulated(None if geometry_file is None else geometry, start_s=start_s), bench
+
+
+def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:
+    """Take the world of a sensor.json and what it says of its readings, or the world of the shipped recordings."""
+    if sensor is None:
+        from probewise.world.shipped import truth
+
+        return truth("paper"), None
+    from probewise.calibration import read_sensor
+    from probewise.experiment import world_like
+
+    found = read_sensor(sensor)
+    return world_like(found), found.instrumentation
+
+
+def moved(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
+    """Lay a pattern elsewhere: its origin at `by_mm`."""
+    x_mm, y_mm = by_mm
+    match pattern:
+        case Uniform():
+            return pattern
+        case HalfPlane():
+            return replace(pattern, offset_mm=pattern.offset_mm + _along(pattern.normal_rad, by_mm))
+        case Quadrant():
+            return replace(pattern, corner_mm=(pattern.corner_mm[0] + x_mm, pattern.corner_mm[1] + y_mm))
+        case Disc():
+            return replace(pattern, center_mm=(pattern.center_mm[0] + x_mm, pattern.center_mm[1] + y_mm))
+        case Polygon():
+            return replace(pattern, vertices_mm=tuple((x + x_mm, y + y_mm) for x, y in pattern.vertices_mm))
+        case Stripes():
+            return replace(pattern, phase_mm=pattern.phase_mm + _along(pattern.normal_rad, by_mm))
+        case Image():
+            return replace(pattern, origin_mm=(pattern.origin_mm[0] + x_mm, pattern.origin_mm[1] + y_mm))
+        case Ramp():
+            if by_mm != (0.0, 0.0):
+                raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, whose zero is the field's")
+            return pattern
+
+
+def _along(normal_rad: float, by_mm: tuple[float, float]) -> float:
+    return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)

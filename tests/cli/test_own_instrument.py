@@ -1,0 +1,206 @@
+"""`--arm FILE.py`: a person's own instrument runs explore, arm scan and arm record, and its mistakes lose nothing."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+
+from probewise.calibration import read_sensor, write_sensor
+from probewise.cli import main
+from probewise.experiment import read_journal
+from probewise.recordings import Instrumentation, Plan, Quadrant, read_recording, write_plan
+
+ARM = """
+import math, os, signal
+LOG = {log!r}
+def connect():
+    return Arm()
+class Arm:
+    n = 0
+    def measure(self, pose):
+        self.n += 1
+        {more}
+        inside = math.hypot(pose.x_mm - 600, pose.y_mm - 260) < 90
+        return {{"value": 840 if inside else 140, "temperature_c": 20.0 + self.n}}
+    def close(self):
+        with open(LOG, "a") as log:
+            log.write("closed\\n")
+"""
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+@pytest.fixture
+def arm_file(tmp_path):
+    """Write the file of an instrument whose sensor gives ten bits; `more` is done at every measurement."""
+
+    def write(more="pass", name="my_arm.py"):
+        path = tmp_path / name
+        path.write_text(ARM.format(log=str(tmp_path / "log"), more=more))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def closed(tmp_path):
+    """Count how often the instrument was closed."""
+    return lambda: (tmp_path / "log").read_text().count("closed") if (tmp_path / "log").exists() else 0
+
+
+@pytest.fixture
+def ten_bits(sensor_file):
+    """Scale the hand-made sensor to ten bits."""
+    sensor = read_sensor(sensor_file)
+    samples = sensor.samples.copy()
+    samples[:, -2:] *= 14.0
+    scale = Instrumentation(unit="counts", min=0.0, max=1023.0)  # without steps, which costs less
+    path = sensor_file.with_name("ten_bits.json")
+    write_sensor(dataclasses.replace(sensor, samples=samples, noise_sd=np.full(500, 20.0), instrumentation=scale), path)
+    return path
+
+
+@pytest.mark.usefixtures("quick_frames")
+def test_a_run_goes_on_where_the_instrument_failed_and_keeps_what_its_readings_brought(
+    arm_file, ten_bits, tmp_path, capsys, closed
+):
+    out = tmp_path / "out"
+    words = ("explore", "--sensor", ten_bits, "--out", out, "--max-readings", 2, "--quiet", "--arm")
+    broken = arm_file("if self.n == 2: raise RuntimeError('the head is jammed')")
+    assert run(*words, broken) == 1
+    said = capsys.readouterr().err
+    assert f"{broken}, line 10: measure raises RuntimeError: the head is jammed; " in said
+    assert f"keeps 1 reading; go on with: probewise explore --sensor {ten_bits}" in said
+    assert "Traceback" not in said
+    assert closed() == 1
+    assert len(read_journal(out / "journal.jsonl").entries) == 1
+
+    assert run(*words, arm_file(name="mended.py"), "--resume") == 0
+    assert closed() == 2
+    journal = read_journal(out / "journal.jsonl")
+    first, second = journal.readings
+    assert {first.value, second.value} <= {140.0, 840.0}
+    assert second.time_s >= first.time_s
+    assert journal.recording().plan.covariates["temperature_c"].tolist() == [21.0, 21.0]
+    assert json.loads((out / "result.json").read_text())["readings"] == 2
+    assert journal.settings["options"]["reading_range"] == [0.0, 1023.0]
+
+
+def test_ctrl_c_closes_the_instrument_and_keeps_the_journal(arm_file, ten_bits, tmp_path, capsys, closed):
+    out = tmp_path / "out"
+    struck = arm_file("os.kill(os.getpid(), signal.SIGINT)")
+    assert run("explore", "--sensor", ten_bits, "--out", out, "--quiet", "--arm", struck) == 130
+    assert "keeps 0 readings; go on with: probewise explore" in capsys.readouterr().err
+    assert closed() == 1
+
+
+REFUSED = {
+    "a file that is not there": (["--arm", "nowhere.py"], "nowhere.py: there is no such file"),
+    "another word": (
+        ["--arm", "printer"],
+        "--arm is 'printer'; allowed: simulated; emulator, .*; nxt:PORT .*; or FILE",
+    ),
+    "a geometry": (["--geometry", "a.toml"], "--geometry is 'a.toml'; allowed: none with FILE.py"),
+    "a truth": (["--truth", "600,260,90"], "--truth is '600,260,90'; allowed: none with a real arm"),
+    "the brick with ten bits": (["--arm", "emulator"], "--sensor is .*ten_bits.json'; allowed: one that reads in LEGO"),
+    "a turn": (["--orientations", "0,45"], "--orientations is '0,45'; allowed: none with .*turns = True"),
+}
+
+
+@pytest.mark.parametrize(("more", "message"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_does_not_go_with_an_instrument_of_ones_own_is_refused_and_nothing_written(
+    more, message, arm_file, ten_bits, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    words = ["explore", "--sensor", ten_bits, "--out", out, "--quiet", "--arm", arm_file(), *more]
+    assert run(*words) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert re.search(message, error), error
+    assert not (out / "journal.jsonl").exists()
+
+
+def test_a_plan_is_recorded_in_the_instruments_own_unit_and_goes_on_when_it_was_cut(
+    arm_file, tmp_path, capsys, monkeypatch, closed
+):
+    monkeypatch.setattr("probewise.cli.arm.asker", lambda arm: lambda text: None)
+    plan = tmp_path / "plan.csv"
+    write_plan(
+        Plan.from_arrays(
+            x_mm=[0, 20, 40], y_mm=0, patterns={"corner": Quadrant((0.0, 0.0), (1, 1))}, unit="LEGO", min=0, max=100
+        ),
+        plan,
+    )
+    out = tmp_path / "mine.csv"
+    words = ["arm", "record", plan, "--out", out, "--quiet", "--origin-mm", "500,260"]
+    words += ["--unit", "counts", "--range", "0,1023", "--step", "1", "--arm"]
+    assert run(*words, arm_file("if self.n == 3: raise OSError('unplugged')")) == 1
+    assert "line 10: measure raises OSError: unplugged; " in (said := capsys.readouterr().err)
+    assert "keeps 2 of 3 readings" in said
+    assert run(*words, arm_file(), "--resume") == 0
+    recording = read_recording(out)
+    assert recording.readings.tolist() == [140.0, 840.0, 840.0]
+    assert recording.plan.instrumentation == Instrumentation(unit="counts", min=0.0, max=1023.0, step=1.0)
+    assert recording.plan.covariates["temperature_c"].tolist() == [21.0, 22.0, 21.0]
+    assert closed() == 2
+
+
+def test_a_scan_shows_what_readings_bring(arm_file, capsys):
+    assert run("arm", "scan", "500,260", "600,260", "--readings", "2", "--arm", arm_file()) == 0
+    header, *rows = capsys.readouterr().out.splitlines()
+    assert header == "x_mm,y_mm,orientation_deg,time_s,reading,temperature_c"
+    assert [row.split(",")[4:] for row in rows] == [["140", "21"], ["840", "22"]]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["home"], "--arm is .*allowed: nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`"),
+        (["scan", "0,0", "1,1", "--dry-run"], "--dry-run is True; allowed: none with .*my_arm.py: it is for"),
+        (["scan", "0,0", "1,1", "--geometry", "a.toml"], "a.toml"),
+        (["record", "paper", "--out", "r.csv", "--range", "5"], "--range is '5'; allowed: LOW,HIGH"),
+        (["record", "paper", "--out", "r.csv", "--unit", "V", "--range", "5,1"], "max is 1.0; allowed: greater than"),
+    ],
+)
+def test_tasks_of_the_bench_that_need_the_lego_arm_say_so(words, message, arm_file, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("arm", *words, "--arm", arm_file()) == 2
+    assert re.search(message, capsys.readouterr().err)
+
+
+@pytest.mark.usefixtures("quick_frames")
+def test_the_emulator_is_an_arm_like_the_others(sensor_file, tmp_path):
+    out = tmp_path / "out"
+    words = ("explore", "--sensor", sensor_file, "--out", out, "--max-readings", 1, "--quiet", "--arm", "emulator")
+    assert run(*words) == 0
+    (reading,) = read_journal(out / "journal.jsonl").readings
+    assert reading.covariates["battery_mv"] > 6000
+
+
+@pytest.mark.usefixtures("quick_frames")
+def test_a_journal_finds_the_sensor_of_its_run_and_refuses_another_truth(sensor_file, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    words = ["explore", "--sensor", sensor_file, "--out", out, "--max-readings", 1, "--quiet"]
+    assert run(*words, "--truth", "600,260,90") == 0
+    assert run(*words, "--truth", "400,260,90", "--resume") == 2
+    assert "hidden.x_mm 600.0 there, 400.0 here" in capsys.readouterr().err
+    journal, seen = out / "journal.jsonl", []
+    monkeypatch.setattr("probewise.cli.diagnose.journal_recording", lambda path, sensor: seen.append(sensor) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run("diagnose", journal, "--out", tmp_path / "d")
+    assert seen[0].names == read_sensor(sensor_file).names
+
+    text = sensor_file.read_text()
+    sensor_file.write_text(text.replace('"source"', '"source" ').replace("0.6", "0.7"))
+    assert run("diagnose", journal, "--out", tmp_path / "d") == 2
+    assert "is another by now; allowed: --sensor S.json" in capsys.readouterr().err
+    sensor_file.unlink()
+    assert run("diagnose", journal, "--out", tmp_path / "d") == 2
+    assert "is not there any more; allowed: --sensor S.json" in capsys.readouterr().err
+    (out / "sensor.json").write_text(text)  # a copy beside the journal does too
+    with pytest.raises(ZeroDivisionError):
+        run("diagnose", journal, "--out", tmp_path / "d")

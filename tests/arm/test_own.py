@@ -102,6 +102,11 @@ def test_what_an_instrument_does_not_say_is_taken_for_the_usual():
     assert (arm.turns, arm.lifts) == (False, False)
 
 
+def test_where_it_cannot_go_it_need_not_say_how_long_it_takes():
+    own = Own(reachable=lambda places: [True, False], travel_s=lambda start, places: [1.0, math.nan])
+    assert entered(own).travel_s(Pose(0.0, 0.0), PLACES)[0] == 1.0
+
+
 def test_one_value_stands_for_all_places():
     own = Own(reachable=lambda places: True, travel_s=lambda start, places: 2, orientation_rad=0.25)
     arm = entered(own)
@@ -292,7 +297,7 @@ def test_where_it_knows_that_it_read_is_written_in_the_plans_frame():
 @pytest.mark.parametrize(
     ("own", "changes", "error", "message"),
     [
-        (Own(reachable=lambda p: p[:, 0] < 105), {}, ReachError, r"row 3 of the plan, and 1 more, is \(110.0, 50.0\)"),
+        (Own(reachable=lambda p: p[:, 0] < 105), {}, ReachError, r"the place of row 3 of the plan \(mm\) is \(110"),
         (Own(), {"covariates": {"led": [1, 1, 0, 0]}}, ParameterError, "the plan's led is 0.0; allowed: 1"),
         (Own(), {"height_mm": 14, "covariates": {"height_mm": [14, 10, 10, 10]}}, ParameterError, "height_mm is 10.0"),
     ],

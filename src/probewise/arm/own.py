@@ -161,9 +161,11 @@ class OwnInstrument:
             away = np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm)
             return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
         with self._telling("travel_s"):
-            seconds = _finite("travel_s", own(start, places_mm), len(places_mm), "seconds, finite, 0 or more")
-            if (seconds < 0).any():
-                raise ParameterError("what travel_s returned", float(seconds.min()), "seconds, finite, 0 or more")
+            allowed = "seconds, finite, 0 or more; nan out of reach"
+            seconds = _numbers("travel_s", own(start, places_mm), len(places_mm), allowed)
+            wrong = ~((seconds >= 0) & (seconds < math.inf))
+            if wrong.any() and (wrong[self.reachable(places_mm)].any() or (seconds[wrong] < math.inf).any()):
+                raise ParameterError("what travel_s returned", float(seconds[wrong][0]), allowed)
             return seconds
 
     def measure(self, pose: Pose) -> Reading:
@@ -284,11 +286,18 @@ def _per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
     return array
 
 
-def _finite(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+def _numbers(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
     array = _per_place(name, found, n_places, allowed)
-    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+    if array.dtype.kind not in "biuf":
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
     return np.asarray(array, dtype=np.float64)
+
+
+def _finite(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+    array = _numbers(name, found, n_places, allowed)
+    if not np.isfinite(array).all():
+        raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
+    return array
 
 
 def _briefly(error: BaseException) -> str:

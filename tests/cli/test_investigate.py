@@ -85,3 +85,59 @@ def test_an_aliased_effect_is_settled_by_the_readings_that_are_asked_for(tmp_pat
     assert run("investigate", *options, "--out", cut, "--resume") == 0
     for name in ("diagnosis.json", "recording.csv", "sensor.json", "rounds/2.csv"):
         assert (cut / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+OWN = """
+import math
+
+def connect():
+    return Edge()
+
+class Edge:
+    turns = True
+
+    def measure(self, pose):
+        across = pose.x_mm * math.cos(0.0) / 6.0
+        return round(10.0 + 25.0 * (1.0 + math.tanh(across)) + 0.4 * math.sin(37.0 * pose.x_mm + 11.0 * pose.y_mm), 3)
+
+    def close(self):
+        with open(CLOSED, "w") as file:
+            file.write("closed")
+"""
+
+
+def test_an_instrument_of_ones_own_is_investigated_and_closed(few, tmp_path):
+    file, closed, out = tmp_path / "edge.py", tmp_path / "closed.txt", tmp_path / "out"
+    file.write_text(OWN.replace("CLOSED", repr(str(closed))))
+    one = tmp_path / "one.csv"
+    plan = paper_plan()
+    write_plan(plan.take(plan.scan < 1), one)
+    options = ("--arm", file, "--plan", one, "--rounds", 1, "--no-hands", "--quiet")
+    assert run("investigate", *options, "--out", out) == 0
+    assert closed.read_text() == "closed"
+    assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
+    assert "the world concealed" not in (out / "report.html").read_text()
+
+
+def test_what_hands_would_have_to_do_is_refused_before_anything_moves(tmp_path, capsys):
+    file, out = tmp_path / "edge.py", tmp_path / "out"
+    file.write_text("def connect():\n    raise RuntimeError('it moved')\n")
+    assert run("investigate", "--arm", file, "--plan", "paper", "--no-hands", "--out", out) == 2
+    assert "a plan over one pattern; paper has more" in capsys.readouterr().err
+    assert run("investigate", "--arm", file, "--plan", "paper", "--truth", "lag:1", "--out", out) == 2
+    assert "--truth" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_the_emulated_arm_is_investigated_with_nobody_there(tmp_path):
+    out = tmp_path / "out"
+    assert run("investigate", "--arm", "emulator", "--plan", "paper", "--rounds", 1, "--quiet", "--out", out) == 0
+    assert len(read_recording(out / "recording.csv")) == len(paper_plan())
+    assert json.loads((out / "diagnosis.json").read_text())["verdict"] in (
+        "clean",
+        "named",
+        "unknown",
+        "cannot_tell",
+        "noise",
+    )

@@ -75,15 +75,21 @@ def test_whatever_byte_the_writer_is_killed_at_no_whole_reading_is_lost(tmp_path
         assert kept == 2 or journal.entries[2].belief is None
 
 
-def test_resuming_cuts_a_torn_line_off_and_goes_on_behind_it(tmp_path):
+def test_resuming_goes_on_behind_the_last_reading_which_stays_in_the_file(tmp_path):
+    """Cut anywhere in the last line: a reading that is there is never taken out again, not even for a moment."""
     path = tmp_path / "journal.jsonl"
     write(path, 3)
     whole = path.read_bytes()
-    path.write_bytes(whole[:-20])
-    with JournalWriter.resume(read_journal(path)) as writer:
-        writer.reading(3, reading(3))
-        writer.belief(belief(3))
-    assert path.read_bytes() == whole
+    last = whole.rindex(b"\n", 0, -1) + 1
+    reading_done = whole.index(b', "belief": ', last)
+    for n_bytes in range(last, len(whole)):
+        path.write_bytes(whole[:n_bytes])
+        with JournalWriter.resume(read_journal(path)) as writer:
+            assert path.read_bytes() == whole[: reading_done if n_bytes >= reading_done else last]
+            if n_bytes < reading_done:
+                writer.reading(3, reading(3))
+            writer.belief(belief(3))
+        assert path.read_bytes() == whole
 
 
 def test_a_missing_reading_is_null_and_comes_back_as_nan(tmp_path):

@@ -55,7 +55,7 @@ def test_two_investigations_do_not_mix(tmp_path):
     begin = partial(RoundsFolder, tmp_path / "rounds")
     with pytest.raises(FileError, match="without --resume a new one begins"):
         begin({"seed": 1}, resume=True)
-    begin({"seed": 1}, resume=False)
+    begin({"seed": 1}, resume=False).record(1, few_rows(), "", take=TAKE)
     with pytest.raises(FileError, match="--resume to go on"):
         begin({"seed": 1}, resume=False)
     with pytest.raises(FileError, match="seed 1"):

@@ -32,6 +32,7 @@ from probewise.cli._common import (
     seed_number,
 )
 from probewise.cli._output import check_out_file
+from probewise.cli._plans import commanded, read_by_lego, read_by_own
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
@@ -268,11 +269,12 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     own = _is_own(arguments)
     asked = paper_plan() if named else read_plan(arguments.plan)
     if own:
-        plan = _as_said(asked, arguments)
+        plan = read_by_own(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     elif arguments.sensor is not None:
         plan = _simulated_sensor(asked, arguments.sensor)
     else:
-        plan = _as_read(asked, geometry, arguments)
+        _refuse(arguments, "the LEGO arm: it is known", "unit", "range", "step")
+        plan = read_by_lego(asked, geometry)
     width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
     taken = _taken_before(out, plan, resume=arguments.resume, dry=arguments.dry_run)
@@ -298,66 +300,13 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
         say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 
 
-def _as_said(plan: Plan, arguments: argparse.Namespace) -> Plan:
-    """Take the plan for what an instrument of one's own reads: as its JSON says, or the options."""
-    import dataclasses
-
-    said: dict[str, object] = {} if arguments.unit is None else {"unit": arguments.unit}
-    if arguments.unit is not None:  # what was declared was of another unit
-        said |= {"min": None, "max": None, "step": None, "sensor": ""}
-    if arguments.range is not None:
-        said |= dict(zip(("min", "max"), _numbers("--range", arguments.range, 2), strict=True))
-    if arguments.step is not None:
-        (said["step"],) = _numbers("--step", arguments.step, 1)
-    return _commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
-
-
-def _commanded(plan: Plan) -> Plan:
-    """Keep of a plan's covariates those that can be commanded: others were read when it was carried out before."""
-    import dataclasses
-
-    commanded = {*plan.instrumentation.controls, "led", "height_mm"}
-    kept = {name: values for name, values in plan.covariates.items() if name in commanded}
-    return dataclasses.replace(plan, covariates=kept)
-
-
-def _numbers(option: str, text: str, n: int) -> list[float]:
-    try:
-        numbers = [float(cell) for cell in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise ParameterError(option, text, "LOW,HIGH such as 0,1023" if n == 2 else "a number such as 1")
-    return numbers
-
-
-def _as_read(plan: Plan, geometry: Geometry, arguments: argparse.Namespace) -> Plan:
-    """Take the plan for what the LEGO arm reads: percent, at its height."""
-    import dataclasses
-
-    for option in ("unit", "range", "step"):
-        if getattr(arguments, option) is not None:
-            raise ParameterError(f"--{option}", getattr(arguments, option), "none with the LEGO arm: it is known")
-    step = 1.0 if geometry.whole_percent else None
-    instrumentation = dataclasses.replace(
-        plan.instrumentation,
-        unit="LEGO",
-        min=0.0,
-        max=100.0,
-        step=step,
-        sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
-        height_mm=geometry.read_height_mm,
-    )
-    return _commanded(dataclasses.replace(plan, instrumentation=instrumentation))
-
-
 def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
     """Take the plan for what the sensor of a simulated arm reads."""
     import dataclasses
 
     from probewise.calibration import read_sensor
 
-    return _commanded(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
+    return commanded(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
 
 
 def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:

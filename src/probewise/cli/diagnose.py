@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["VERB", "generators", "write_results"]
 
-_OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
+OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
-        with staged(out, inputs=_to_be_kept(arguments, out), outdated=_OF_ONE_RUN) as stage:
+        with staged(out, inputs=_to_be_kept(arguments, out), outdated=OF_ONE_RUN) as stage:
             write_results(diagnosis, drawn, stage.folder, rng=files_rng)
             page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
             write_text_atomically(stage / "report.html", page)

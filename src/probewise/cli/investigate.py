@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
+from probewise.cli._arm import ARMS, ArmName, add_geometry, asker, geometry_of, parse_arm, parse_place
+from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
 from probewise.cli._output import check_out_directory, staged
+from probewise.cli._plans import plan_named, read_by_lego, read_by_own
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from probewise.arm import Reading
+    from probewise.investigation import RoundsFolder, Take
     from probewise.recordings import Plan
     from probewise.world import World
 
@@ -29,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--arm",
         default="simulated",
         metavar="ARM",
-        help="where the readings come from: simulated (the default)",
+        help=f"where the readings come from: {ARMS} (default simulated)",
     )
     parser.add_argument(
         "--plan",
@@ -37,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PLAN.csv",
         help=f"what is recorded first: a plan or recording, its JSON beside it; or {' or '.join(PLANS)}, which ship",
     )
+    parser.add_argument(
+        "--origin-mm",
+        metavar="X,Y",
+        help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)",
+    )
+    add_geometry(parser)
     add_out_directory(parser)
     parser.add_argument(
         "--sensor", type=a_path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
@@ -85,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
-    from probewise.cli.diagnose import write_results
+    from probewise.cli.diagnose import OF_ONE_RUN, write_results
     from probewise.diagnosis import join
     from probewise.investigation import Budget, Investigation, RoundsFolder, SimulatedRecorder, investigate
     from probewise.recordings import Recording, fingerprint, write_recording, write_text_atomically
@@ -93,12 +105,14 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report import investigation as report
 
     out = check_out_directory(arguments.out)
-    if arguments.arm != "simulated":
-        raise ParameterError("--arm", arguments.arm, "simulated")
-    plan = _plan(arguments.plan)
+    chosen = parse_arm(arguments.arm)
+    if arguments.truth is not None and chosen.kind != "simulated":
+        raise ParameterError("--truth", arguments.truth, f"none with {arguments.arm}: it is for the simulated arm")
+    plan = _plan(arguments, chosen)
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
     truth_seed, noise_seed, rounds_seed, files_seed = np.random.SeedSequence(arguments.seed).spawn(4)
-    world = _world(arguments.truth, np.random.default_rng(truth_seed))
+    noise = int(noise_seed.generate_state(1)[0])
+    world = _world(arguments.truth, np.random.default_rng(truth_seed)) if chosen.kind == "simulated" else None
     settings = {
         "arm": arguments.arm,
         "plan": fingerprint(Recording(plan, np.zeros(len(plan)))),
@@ -108,14 +122,19 @@ def run(arguments: argparse.Namespace) -> int:
         "seed": str(arguments.seed),
     }
     folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
-    take = SimulatedRecorder(world, int(noise_seed.generate_state(1)[0]))
 
     def kept() -> str:
         return keeps(folder.path, folder.n_readings, "reading", arguments, "--resume")
 
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     rounds = []
-    with saying_what_is_kept(kept), progress_shown(quiet=arguments.quiet) as progress:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(saying_what_is_kept(kept))
+        if world is None:
+            take = stack.enter_context(_recorder(arguments, chosen, folder, seed=noise))
+        else:
+            take = SimulatedRecorder(world, noise)
+        progress = stack.enter_context(progress_shown(quiet=arguments.quiet))
         for each in investigate(
             partial(folder.record, take=take, progress=progress),
             plan,
@@ -130,16 +149,17 @@ def run(arguments: argparse.Namespace) -> int:
     found = Investigation(tuple(rounds))
     diagnosis = found.last.diagnosis
     drawing = progress_shown(quiet=arguments.quiet)
-    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out, outdated=OF_ONE_RUN) as stage:
         progress("drawing the report")
         drawn = of_a_diagnosis.figures(diagnosis)
         write_results(diagnosis, drawn, stage.folder, rng=np.random.default_rng(files_seed))
         write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
-        concealed = tuple(effect.name for effect in world.concealed)
+        concealed = None if world is None else tuple(effect.name for effect in world.concealed)
         page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
         write_text_atomically(stage / "report.html", page)
     say(found.summary(), quiet=arguments.quiet)
-    say(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
+    if concealed is not None:
+        say(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
 
@@ -155,11 +175,46 @@ def _minutes(text: str) -> float:
     return value
 
 
-def _plan(text: str) -> Plan:
-    from probewise.recordings import paper_plan, read_plan, two_way_plan
+def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
+    """Read the first plan, as the arm that was chosen will carry it out."""
+    plan = plan_named(arguments.plan)
+    if chosen.kind == "simulated":
+        return plan
+    if arguments.no_hands and len(set(plan.pattern.tolist())) > 1:
+        raise ParameterError("--no-hands", True, f"a plan over one pattern; {arguments.plan} has more, laid by hand")
+    return read_by_own(plan) if chosen.kind == "file" else read_by_lego(plan, geometry_of(arguments))
 
-    shipped = {"paper": paper_plan, "two_way": two_way_plan}
-    return shipped[text]() if text in shipped else read_plan(text)
+
+@contextlib.contextmanager
+def _recorder(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int) -> Iterator[Take]:
+    """Open an arm and let it carry out plans, with the hands of a person or, emulated, of the bench."""
+    from probewise.arm import Request, carry_out
+    from probewise.cli._bench import open_arm
+
+    geometry = geometry_of(arguments)
+    width, height = (0.0, 0.0) if chosen.kind == "file" else geometry.field_mm
+    origin = (width / 2, height / 2)
+    if arguments.origin_mm is not None:
+        origin = parse_place("--origin-mm", arguments.origin_mm)
+    opened, bench = open_arm(
+        chosen, geometry, arguments.geometry, seed=seed, start_s=folder.ended_s, n_taken=folder.n_readings
+    )
+    with opened as arm:
+        by_hand, laid = asker(arm), list[str]()
+
+        def take(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
+            def ask(request: Request) -> None:
+                if bench is not None:
+                    bench.lay(plan.patterns, origin, request)
+                elif not arguments.no_hands:
+                    by_hand(request)
+                elif request.pattern is None or laid:
+                    raise CommandError(f"with --no-hands nobody can {request}; leave it out, or take another plan")
+                laid.extend([] if request.pattern is None else [request.pattern])
+
+            return carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
+
+        yield take
 
 
 def _world(truth: str | None, rng: np.random.Generator) -> World:

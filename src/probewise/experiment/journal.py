@@ -79,8 +79,8 @@ class Entry:
 class Journal:
     """Hold what a journal file says: its settings, its measurements, notes on what was dropped.
 
-    `n_bytes` is the length of the file up to the last whole line, `n_torn` of what follows, which is rewritten on
-    resuming.
+    `n_bytes` is the length of what counts, up to the last whole line or the reading of a torn one; `n_torn` that of
+    what follows, which is cut off on resuming.
     """
 
     path: str
@@ -173,14 +173,18 @@ def read_journal(path: str | Path) -> Journal:
                 path, f"index {shown(entry.index)}", f"{row - 1}: one line a measurement, in order", row=row
             )
     notes: list[str] = []
+    n_torn = 0
     if tail:
-        saved = _salvaged(path, tail, len(entries) + 1)
+        head = _first_part(tail)
+        saved = _salvaged(path, head, len(entries) + 1)
         if saved is None:
+            head = b""
             notes.append(f"the last line of {path} was torn while it was written and is dropped")
         else:
             entries.append(saved)
             notes.append(f"the last line of {path} was torn after its reading; the reading is kept")
-    return Journal(str(path), settings, tuple(entries), tuple(notes), len(raw) - len(tail), len(tail))
+        n_torn = len(tail) - len(head)
+    return Journal(str(path), settings, tuple(entries), tuple(notes), len(raw) - n_torn, n_torn)
 
 
 def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
@@ -190,11 +194,16 @@ def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
     return value
 
 
-def _salvaged(path: str | Path, tail: bytes, index: int) -> Entry | None:
-    """Recover the reading from a line without its end, or None where the reading itself is torn."""
-    head, mark = tail.split(BELIEF.encode())[0], BELIEF.encode()
+def _first_part(tail: bytes) -> bytes:
+    """Cut a line without its end off behind its reading, before what was believed after it."""
+    mark = BELIEF.encode()
+    head = tail.split(mark)[0]
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
-    head = head[: len(head) - torn]
+    return head[: len(head) - torn]
+
+
+def _salvaged(path: str | Path, head: bytes, index: int) -> Entry | None:
+    """Recover the reading from the first part of a line, or None where the reading itself is torn."""
     # The covariates come last and are an object: only a whole first part closes with one more brace.
     try:
         entry = _entry(path, _parse(path, head + b"}", index + 1), index + 1)
@@ -316,7 +325,9 @@ class JournalWriter:
 
     @classmethod
     def resume(cls, journal: Journal) -> JournalWriter:
-        """Go on behind the last whole line of a journal; a torn line is cut off.
+        """Go on behind the last whole line of a journal, or behind the reading of a torn one; what is torn is cut off.
+
+        A reading that the last line holds stays in the file: what was believed after it is written behind it.
 
         Raises
         ------

@@ -283,7 +283,7 @@ def _steps(
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
             _require_readable(experiment, reading)  # before it is written, lest a resume fail on it again
-            if writer is not None and (entry is None or entry.belief is None):
+            if writer is not None and entry is None:
                 writer.reading(number, reading)
             state, info = step(
                 state,

@@ -43,7 +43,7 @@ class RoundsFolder:
     Parameters
     ----------
     path
-        The folder; made where it is missing.
+        The folder; made with the first round where it is missing.
     settings
         What decides the investigation, as JSON.
     resume
@@ -65,14 +65,17 @@ class RoundsFolder:
             _require_same(file, wanted)
         elif file.exists():
             raise FileError(file, "an investigation stands there", "--resume to go on with it, or another --out")
-        else:
-            path.mkdir(parents=True, exist_ok=True)
-            write_text_atomically(file, json.dumps(wanted, indent=1, allow_nan=False) + "\n")
+        self._settings = wanted
 
     def record(self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent) -> Recording:
         """Carry out a round, or what is left of it, and keep its readings."""
         planned, readings_file = self.path / f"{number}_plan.csv", self.path / f"{number}.csv"
         if not planned.exists():
+            self.path.mkdir(parents=True, exist_ok=True)
+            if not (self.path / _SETTINGS).exists():
+                write_text_atomically(
+                    self.path / _SETTINGS, json.dumps(self._settings, indent=1, allow_nan=False) + "\n"
+                )
             write_plan(plan, planned)
         plan = read_plan(planned)
         readings = list(_taken(readings_file))
@@ -90,7 +93,15 @@ class RoundsFolder:
     @property
     def n_readings(self) -> int:
         """How many readings it holds."""
-        return sum(len(read_recording(file)) for file in self.path.glob("[0-9]*.csv") if file.stem.isdigit())
+        return sum(len(recording) for recording in self._recordings())
+
+    @property
+    def ended_s(self) -> float:
+        """When the last of them was taken; 0 where there is none."""
+        return max((float(recording.plan.time_s.max()) for recording in self._recordings()), default=0.0)
+
+    def _recordings(self) -> Iterator[Recording]:
+        return (read_recording(file) for file in self.path.glob("[0-9]*.csv") if file.stem.isdigit())
 
 
 def _require_same(file: Path, wanted: Mapping[str, Any]) -> None:

@@ -1,0 +1,65 @@
+"""A plan as an arm will read it: unit, range and step of its readings, and what of it can be commanded."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+from probewise.errors import ParameterError
+
+if TYPE_CHECKING:
+    from probewise.arm import Geometry
+    from probewise.recordings import Plan
+
+__all__ = ["commanded", "plan_named", "read_by_lego", "read_by_own"]
+
+
+def plan_named(text: str) -> Plan:
+    """Read a plan from its file, or take one that ships: paper, two_way."""
+    from probewise.recordings import paper_plan, read_plan, two_way_plan
+
+    shipped = {"paper": paper_plan, "two_way": two_way_plan}
+    return shipped[text]() if text in shipped else read_plan(text)
+
+
+def read_by_own(plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None) -> Plan:
+    """Take the plan for what an instrument of one's own reads: as its JSON says, or the options do."""
+    said: dict[str, object] = {} if unit is None else {"unit": unit}
+    if unit is not None:  # what was declared was of another unit
+        said |= {"min": None, "max": None, "step": None, "sensor": ""}
+    if range_ is not None:
+        said |= dict(zip(("min", "max"), _numbers("--range", range_, 2), strict=True))
+    if step is not None:
+        (said["step"],) = _numbers("--step", step, 1)
+    return commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
+
+
+def read_by_lego(plan: Plan, geometry: Geometry) -> Plan:
+    """Take the plan for what the LEGO arm reads: percent, at its height."""
+    instrumentation = dataclasses.replace(
+        plan.instrumentation,
+        unit="LEGO",
+        min=0.0,
+        max=100.0,
+        step=1.0 if geometry.whole_percent else None,
+        sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
+        height_mm=geometry.read_height_mm,
+    )
+    return commanded(dataclasses.replace(plan, instrumentation=instrumentation))
+
+
+def commanded(plan: Plan) -> Plan:
+    """Keep of a plan's covariates those that can be commanded: others were read when it was carried out before."""
+    can = {*plan.instrumentation.controls, "led", "height_mm"}
+    return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
+
+
+def _numbers(option: str, text: str, n: int) -> list[float]:
+    try:
+        numbers = [float(cell) for cell in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        raise ParameterError(option, text, "LOW,HIGH such as 0,1023" if n == 2 else "a number such as 1")
+    return numbers

@@ -85,8 +85,8 @@ def test_bits_agree_with_the_entropy_of_the_posterior_samples(found):
 def test_the_summary_gives_bits_and_the_papers_count(found):
     result, _ = found
     text = result.summary()
-    assert f"{25 / len(result.steps):.2f} a reading" in text
-    assert f"{result.last.bits / len(result.steps):.2f} a reading" in text
+    assert f"{25 / len(result.steps):.2f} per reading" in text
+    assert f"{result.last.bits / len(result.steps):.2f} per reading" in text
     assert "radius_mm" in text
     assert result.steps[0].summary().startswith("reading 1: ")
 

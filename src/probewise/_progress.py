@@ -85,7 +85,7 @@ def of_nested(progress: Progress) -> Callable[[int | str, State], None]:
 
     def tell(what: int | str, state: State) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
-        to_come = state.log_z_remaining - state.log_z
+        to_come = state.log_ratio_remaining
         progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")
 
     return tell

@@ -270,10 +270,13 @@ class Empty:
         return np.zeros(len(theta))
 
 
-def require_prior(name: str, prior: object) -> None:
-    """Raise ParameterError unless `prior` has named parameters and a unit cube; a marginal has neither."""
+def require_prior(name: str, prior: object, *more: str) -> None:
+    """Raise ParameterError unless `prior` has named parameters, a unit cube and the methods `more`."""
     allowed = "a prior of named parameters, such as Product({'x_mm': Uniform(0.0, 1.0)})"
     require_like(name, prior, ("names", "from_unit_cube"), allowed)
+    missing = [method for method in more if not hasattr(prior, method)]
+    if missing:
+        raise ParameterError(name, prior, f"a prior with {' and '.join(missing)}; see probewise.priors.Prior")
 
 
 def _columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:

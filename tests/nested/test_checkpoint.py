@@ -459,9 +459,9 @@ def test_another_version_of_the_format_is_named(path: Path) -> None:
         quiet(slope(), n_live=30, progress=stopper(3), checkpoint=path)
     with np.load(path) as file:
         arrays = dict(file)
-    arrays["head"] = np.array(str(arrays["head"]).replace("nested-checkpoint/2", "nested-checkpoint/0"))
+    arrays["head"] = np.array(str(arrays["head"]).replace("nested-checkpoint/3", "nested-checkpoint/0"))
     np.savez(path, **arrays)
-    with pytest.raises(FileError, match=r"format 'nested-checkpoint/0'; allowed: 'nested-checkpoint/2'"):
+    with pytest.raises(FileError, match=r"format 'nested-checkpoint/0'; allowed: 'nested-checkpoint/3'"):
         quiet(slope(), n_live=30, checkpoint=path)
 
 

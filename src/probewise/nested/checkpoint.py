@@ -25,7 +25,7 @@ from probewise.recordings.atomic import write_bytes_atomically
 
 __all__ = ["Dead", "Keeper", "Live", "Origin", "Run", "settings_of"]
 
-_FORMAT = "nested-checkpoint/2"
+_FORMAT = "nested-checkpoint/3"
 _ROUNDING = 1e-6
 _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 
@@ -86,7 +86,8 @@ class Dead:
 class Run:
     """Hold everything that the rest of a run depends on.
 
-    `log_start`, `log_start_error`: log of the prior's possible share. `n_stuck`: chains that could
+    `log_start`, `log_start_error`: log of the prior's possible share. `best`: greatest log likelihood of the live
+    points; `log_z_over_best`: log of the evidence of the dead points, less that. `n_stuck`: chains that could
     not leave their start; `last_cost`: evaluations of the last round; `ended`: why it is over.
     """
 
@@ -96,7 +97,8 @@ class Run:
     log_start: float
     log_start_error: float
     notes: tuple[str, ...]
-    log_z: float = -np.inf
+    best: float = -np.inf
+    log_z_over_best: float = -np.inf
     n_stuck: int = 0
     last_cost: int = 0
     n_calls: int = 0
@@ -270,7 +272,17 @@ class Keeper:
             )
 
 
-_PLAIN = ("log_start", "log_start_error", "notes", "log_z", "n_stuck", "last_cost", "n_calls", "ended")
+_PLAIN = (
+    "log_start",
+    "log_start_error",
+    "notes",
+    "best",
+    "log_z_over_best",
+    "n_stuck",
+    "last_cost",
+    "n_calls",
+    "ended",
+)
 _ORIGIN = ("log_birth", "birth_label", "ident", "parent")
 _RECORD = ("n_at_death", "rank", "n_ranked")
 

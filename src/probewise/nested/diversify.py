@@ -11,6 +11,7 @@ from probewise._arrays import FloatArray, floats
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evaluate import Evaluator, Samplable
+from probewise.priors import require_prior
 
 __all__ = ["DiversifyTally", "diversify"]
 
@@ -69,6 +70,7 @@ def diversify(
     require_rng(rng)
     start = np.array(floats(theta, "theta"))
     evaluate = Evaluator(problem)
+    require_prior("problem.prior", problem.prior, "log_prob")
     if start.ndim != 2 or start.shape[1] != len(evaluate.names) or len(start) == 0:
         raise ShapeError(f"theta has shape {start.shape}; allowed: (n_samples, {len(evaluate.names)})")
     if n_steps < 0:

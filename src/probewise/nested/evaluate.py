@@ -179,19 +179,32 @@ class Evaluator:
 
     def _answers(self, parts: list[FloatArray]) -> Iterator[object]:
         """Ask for every part, all at once where there is more than one; give the answers in order."""
+        # Copies: a likelihood that writes into its argument must not change the samples.
         if self.executor is not None and len(parts) > 1:
-            yield from self.executor.map(self.problem.log_likelihood, parts)
+            yield from self.executor.map(self.problem.log_likelihood, [part.copy() for part in parts])
         else:
             for part in parts:
-                yield self.problem.log_likelihood(part)
+                yield self.problem.log_likelihood(part.copy())
 
     def _numbers(self, answer: object, theta: FloatArray) -> FloatArray:
+        if isinstance(answer, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(answer).sum())):
+            raise NotConvergedError(
+                f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: "
+                f"plain numbers; return answer.filled(-np.inf) if masked means impossible; {self._first(theta)}"
+            )
+        if np.asarray(answer).dtype.kind == "c":
+            raise NotConvergedError(
+                "the likelihood returned complex numbers; allowed: real ones; return their real part if that is "
+                f"meant; {self._first(theta)}"
+            )
         try:
             values = np.asarray(answer, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise NotConvergedError(
                 f"the likelihood returned what are no numbers ({error}); {self._first(theta)}"
             ) from error
+        if values.shape == () and len(theta) == 1:
+            return values.reshape(1)  # many functions drop the axis of a batch of one, scipy.stats among them
         if values.shape != (len(theta),):
             raise NotConvergedError(
                 f"the likelihood returned shape {values.shape}; "
@@ -225,9 +238,9 @@ class Evaluator:
     def _fails(self, theta: FloatArray) -> bool:
         try:
             if self.executor is None:
-                self.problem.log_likelihood(theta)
+                self.problem.log_likelihood(theta.copy())
             else:
-                self.executor.submit(self.problem.log_likelihood, theta).result()
+                self.executor.submit(self.problem.log_likelihood, theta.copy()).result()
         except Exception:
             return True
         return False

@@ -64,6 +64,9 @@ def integrate(
     """
     log_x = log_volumes(n_at_death, log_start)
     log_shell = _log_shells(np.concatenate([[log_start], log_x]))
+    # Relative to the best: volumes would be lost in the rounding of a log likelihood such as -1e100.
+    best = float(log_likelihood.max())
+    log_likelihood = log_likelihood - best
     log_mass = log_shell + log_likelihood
     log_z = float(logsumexp(log_mass))
     log_weight = log_mass - log_z
@@ -79,7 +82,7 @@ def integrate(
         edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
         simulated[first : first + n] = logsumexp(_log_shells(edges) + log_likelihood, axis=1)
     spread = float(np.std(simulated, ddof=1))
-    return Evidence(log_z, spread, log_start_error, information, log_weight, float(1.0 / (weight @ weight)))
+    return Evidence(best + log_z, spread, log_start_error, information, log_weight, float(1.0 / (weight @ weight)))
 
 
 def _log_shells(log_edges: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.nested.diversify import DiversifyTally
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.moves import SliceMove, Tally
+from probewise.priors import require_prior
 
 __all__ = ["KernelMove", "Kernels", "diversify_by_kernels"]
 
@@ -209,6 +210,7 @@ def diversify_by_kernels(
     """
     start = np.array(theta, dtype=np.float64)
     evaluate = Evaluator(problem)
+    require_prior("problem.prior", problem.prior, "log_prob")
     if (
         start.ndim != 2
         or start.shape[1] != len(evaluate.names)

@@ -105,7 +105,9 @@ class Repartitioned:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log of the likelihood and of what makes up for the prior, (n, n_params) -> (n,)."""
-        return np.asarray(self.problem.log_likelihood(theta) + self.prior.made_up(theta))
+        # First what needs theta as it is: a likelihood may write into its argument.
+        made_up = self.prior.made_up(theta)
+        return np.asarray(self.problem.log_likelihood(theta) + made_up)
 
 
 def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.4) -> Repartitioned:

@@ -279,15 +279,18 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
         live, moving if chains else PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng
     )
     edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
-    log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + gone.points.log_likelihood
-    before = float(logsumexp(np.concatenate([[now.log_z], log_mass[:-1]])))
-    log_z = float(np.logaddexp(before, log_mass[-1]))
+    # Relative to the best likelihood: volumes would be lost in the rounding of a log likelihood such as -1e100.
     best = float(fresh.points.log_likelihood.max())
+    log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + (gone.points.log_likelihood - best)
+    so_far = now.log_z_over_best + (now.best - best) if now.dead else -math.inf
+    before = float(logsumexp(np.concatenate([[so_far], log_mass[:-1]])))
+    log_z = float(np.logaddexp(before, log_mass[-1]))
     state = State(
         n_dead=(len(now.dead) + 1) * n_replaced,
         n_calls=evaluate.n_calls,
-        log_z=log_z,
+        log_z=best + log_z,
         log_z_remaining=best + fresh.log_volume,
+        log_ratio_remaining=fresh.log_volume - log_z,
         last_change=log_z - before,
         log_volume=fresh.log_volume,
         best_log_likelihood=best,
@@ -297,7 +300,8 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
         live=fresh,
         dead=(*now.dead, gone),
         moving=moving.adapted(tally) if chains else moving,
-        log_z=log_z,
+        best=best,
+        log_z_over_best=log_z,
         n_stuck=now.n_stuck + (tally.n_stuck if chains else 0),
         last_cost=tally.n_evaluated,
         n_calls=evaluate.n_calls,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
-from probewise.priors import Coordinates, Prior
+from probewise.priors import Coordinates, Prior, require_prior
 
 __all__ = ["Space", "space_of", "unbounded"]
 
@@ -137,5 +137,14 @@ def space_of(prior: Prior) -> Space:
 
 
 def unbounded(prior: Prior) -> Space:
-    """Choose coordinates without walls, for densities that know none: the prior's own, else normal scores."""
-    return _Own(prior, prior.coordinates) if isinstance(prior, _HasCoordinates) else _Normal(prior)
+    """Choose coordinates without walls, for densities that know none: the prior's own, else normal scores.
+
+    Raises
+    ------
+    ParameterError
+        If the prior has neither coordinates of its own nor `to_unit_cube`.
+    """
+    if isinstance(prior, _HasCoordinates):
+        return _Own(prior, prior.coordinates)
+    require_prior("problem.prior", prior, "to_unit_cube")
+    return _Normal(prior)

@@ -17,14 +17,16 @@ class State:
     """Show how far a run has come; handed to `progress` and to the stop rule after every round.
 
     `log_z` counts the dead points alone; `log_z_remaining` is the most that the live points can
-    add, the best likelihood times the volume left; `last_change` is what the last dead point
-    added to `log_z`; `log_volume` the log share of the prior still alive.
+    add, the best likelihood times the volume left, and `log_ratio_remaining` the log of its ratio to what
+    `log_z` counts; `last_change` is what the last dead point added to `log_z`; `log_volume` the log share
+    of the prior still alive.
     """
 
     n_dead: int
     n_calls: int
     log_z: float
     log_z_remaining: float
+    log_ratio_remaining: float
     last_change: float
     log_volume: float
     best_log_likelihood: float
@@ -45,7 +47,7 @@ class RemainingEvidence:
 
     def __call__(self, state: State) -> str | None:
         """Give the reason, or None."""
-        excess = state.log_z_remaining - state.log_z
+        excess = state.log_ratio_remaining
         gain = math.log1p(math.exp(excess)) if excess < 700 else excess
         return f"live points can raise log Z by less than {self.dlogz:g}" if gain < self.dlogz else None
 

@@ -226,7 +226,7 @@ def _by_nested_sampling(
 
 def _told(progress: Progress) -> Callable[[nested.State], None]:
     def tell(state: nested.State) -> None:
-        to_come = state.log_z_remaining - state.log_z
+        to_come = state.log_ratio_remaining
         progress(
             "nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come"
         )

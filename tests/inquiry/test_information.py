@@ -7,7 +7,7 @@ import pytest
 
 from probewise.errors import ParameterError
 from probewise.inquiry import bits_gained, gaussian_entropy, neighbour_entropy, prior_entropy
-from probewise.nested.sampler import run
+from probewise.nested.run import run
 from probewise.priors import Normal, Product, Uniform
 
 

@@ -108,6 +108,7 @@ def quiet(problem: object, seed: int = SEED, **options: object) -> NestedResult:
     """Run with the seed and without the warnings, which the result holds too."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)
+        options = {"max_cost": 1.0, **options}  # evaluations are counted: those of the search alone
         return run(problem, rng=np.random.default_rng(seed), **options)  # type: ignore[arg-type]
 
 
@@ -533,7 +534,7 @@ def test_a_disk_that_fills_up_costs_the_checkpoint_only(path: Path, monkeypatch:
 def test_ctrl_c_gives_what_there_is_and_says_so() -> None:
     problem = Counted(problems.plateau(), calls_of(problems.plateau, n_live=40) - 2, interrupt)
     with pytest.warns(DoubtfulResultWarning, match=r"interrupted; log Z lacks"):
-        result = run(problem, rng=np.random.default_rng(SEED), n_live=40)
+        result = run(problem, rng=np.random.default_rng(SEED), n_live=40, max_cost=1.0)
     assert result.stop_reason == "interrupted"
     assert "doubtful: interrupted" in result.summary()
     assert result.n_dead >= 60

@@ -7,7 +7,7 @@ from scipy.stats import kstest, multivariate_normal
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Bound, Evaluator
 from probewise.nested.kernels import KernelMove, Kernels, diversify_by_kernels
-from probewise.nested.sampler import run
+from probewise.nested.run import run
 from probewise.priors import Product, Uniform
 
 

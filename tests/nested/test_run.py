@@ -201,7 +201,7 @@ def test_zero_likelihood_is_allowed_and_counted(rng: np.random.Generator) -> Non
     def function(theta: np.ndarray) -> np.ndarray:
         return np.where(theta[:, 0] < 0.05, 0.0, -np.inf)
 
-    result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100)
+    result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100, max_cost=1.0)
     assert abs(result.log_z - math.log(0.05)) < N_ERRORS * result.log_z_error
     assert (result.theta[:, 0] < 0.05).all()
 
@@ -211,7 +211,7 @@ def test_rare_possible_hypotheses_are_doubtful_but_used(rng: np.random.Generator
         return np.where(theta[:, 0] < 0.002, 0.0, -np.inf)
 
     with pytest.warns(DoubtfulResultWarning, match="hypotheses drawn from the prior are possible"):
-        result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100)
+        result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100, max_cost=1.0)
     assert abs(result.log_z - math.log(0.002)) < N_ERRORS * result.log_z_error
     assert "doubtful" in result.summary()
 
@@ -258,7 +258,7 @@ def test_the_call_limit_gives_a_doubtful_result(rng: np.random.Generator) -> Non
 
 def test_progress_is_told_every_round(rng: np.random.Generator) -> None:
     states: list[State] = []
-    result = run(problems.plateau(), rng=rng, n_live=40, progress=states.append)
+    result = run(problems.plateau(), rng=rng, n_live=40, progress=states.append, max_cost=1.0)
     assert states[-1].n_calls == result.n_calls
     assert all(a.log_volume > b.log_volume for a, b in itertools.pairwise(states))
     assert all(a.log_z <= b.log_z for a, b in itertools.pairwise(states))

@@ -60,6 +60,7 @@ def synthetic(n_params, n=600, n_live=50):
         n_calls=n,
         n_live=n_live,
         stop_reason="made up",
+        complete=True,
         insertion_rank=np.arange(n) % n_live,
         insertion_n_ranked=np.full(n, n_live - 1),
         insertion_p_value=0.5,

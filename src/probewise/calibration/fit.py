@@ -250,7 +250,7 @@ def _fit_order(
     belief = prior(recording, n_gaussians)
     problem = problem_for(recording, belief, data_sets=data_sets)
     told = None if progress is None else _told(progress, n_gaussians)
-    result = run(problem, rng=rng, n_live=n_live, progress=told, return_interrupted=False)
+    result = run(problem, rng=rng, n_live=n_live, progress=told, max_cost=1.0, return_interrupted=False)
     refined = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
     if refined.sound and apart > _DISAGREE:

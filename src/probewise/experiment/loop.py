@@ -36,8 +36,8 @@ from probewise.inference.problem import SensorProblem
 from probewise.inquiry import bits_gained, prior_entropy
 from probewise.nested.kernels import KernelMove
 from probewise.nested.result import NestedResult
+from probewise.nested.run import run as run_nested
 from probewise.nested.sampler import LIVE_PER_PARAM
-from probewise.nested.sampler import run as run_nested
 from probewise.nested.stop import RemainingEvidence
 
 __all__ = ["begin", "explore", "from_scratch", "run", "step"]
@@ -160,6 +160,7 @@ def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.
         n_live=max(experiment.n_live, LIVE_PER_PARAM * len(experiment.names)),
         move=KernelMove(),
         stop=RemainingEvidence(DLOGZ),
+        max_cost=1.0,  # the robot waits
         return_interrupted=False,
     )
 

@@ -13,14 +13,16 @@ from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.repartition import Repartitioned, repartitioned
-from probewise.nested.result import Agreement, NestedResult
-from probewise.nested.sampler import LIVE_PER_PARAM, least_live, run, step
+from probewise.nested.result import Agreement, Check, NestedResult
+from probewise.nested.run import run
+from probewise.nested.sampler import LIVE_PER_PARAM, least_live, step
 from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, StopRule
 
 __all__ = [
     "LIVE_PER_PARAM",
     "Agreement",
     "Bound",
+    "Check",
     "DiversifyTally",
     "Evaluator",
     "EvidenceChange",

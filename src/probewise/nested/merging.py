@@ -99,6 +99,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         n_calls=sum(r.n_calls for r in parts),
         n_live=sum(r.n_live for r in parts),
         stop_reason=f"merged {len(parts)} runs: " + "; ".join(dict.fromkeys(r.stop_reason for r in parts)),
+        complete=all(r.complete for r in parts),
         insertion_rank=np.concatenate([r.insertion_rank for r in parts]),
         insertion_n_ranked=np.concatenate([r.insertion_n_ranked for r in parts]),
         insertion_p_value=p_value,

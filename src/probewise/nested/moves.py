@@ -122,7 +122,7 @@ class SliceMove:
     Parameters
     ----------
     steps_per_param
-        Steps of a chain for each parameter, hops besides; six in all at least.
+        Steps of a chain for each parameter, hops besides.
     width
         Bracket width in units of the live points' sd along the line.
     axes
@@ -133,6 +133,8 @@ class SliceMove:
         Hops of each chain, where there are clusters.
     target
         Candidates a step should need on average; the width is tuned to it.
+    fewest_steps
+        Steps of a chain at least, however few the parameters.
     """
 
     steps_per_param: float = 1.0
@@ -141,6 +143,7 @@ class SliceMove:
     differences: float = 0.1
     hops: int = 3
     target: float = 2.5
+    fewest_steps: int = _FEWEST_STEPS
 
     def __post_init__(self) -> None:
         if not self.steps_per_param > 0:
@@ -149,6 +152,8 @@ class SliceMove:
             raise ParameterError("(axes, differences)", (self.axes, self.differences), "0 or more, together at most 1")
         if self.hops < 0:
             raise ParameterError("hops", self.hops, "0 or more")
+        if self.fewest_steps < 1:
+            raise ParameterError("fewest_steps", self.fewest_steps, "1 or more")
 
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
@@ -158,7 +163,7 @@ class SliceMove:
         space = evaluate.space
         walls = _walls(space)
         clusters = find_clusters(live)
-        n_lines = max(_FEWEST_STEPS, math.ceil(self.steps_per_param * n_params))
+        n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
         kind = self._kinds(n_chains, n_steps, n_hops, rng)
@@ -266,6 +271,10 @@ class SliceMove:
         kind = np.where(lot < self.axes, _AXIS, np.where(lot < self.axes + self.differences, _DIFFERENCE, _FRAME))
         kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
         return kind
+
+    def longer(self) -> SliceMove:
+        """Return the move with twice as many steps a chain."""
+        return replace(self, steps_per_param=2.0 * self.steps_per_param, fewest_steps=2 * self.fewest_steps)
 
     def adapted(self, tally: Tally) -> SliceMove:
         """Widen or narrow the bracket towards `target` candidates a step."""

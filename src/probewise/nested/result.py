@@ -25,9 +25,9 @@ from probewise.nested.evidence import log_volumes
 from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.atomic import write_bytes_atomically
 
-__all__ = ["Agreement", "NestedResult", "versions"]
+__all__ = ["Agreement", "Check", "NestedResult", "few_possible", "versions"]
 
-_FORMAT = "nested-result/3"
+_FORMAT = "nested-result/4"
 _PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
 _COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
 _ARRAYS = ("theta", *_PER_POINT, *_COUNTS)
@@ -73,6 +73,43 @@ class Agreement:
         return float(np.std(self.log_z, ddof=1))
 
 
+@dataclass(frozen=True)
+class Check:
+    """Say what a second route to the evidence found; see `probewise.nested.check`.
+
+    Attributes
+    ----------
+    route
+        Which way was taken, in words.
+    log_z, log_z_error
+        Natural log of the evidence by that route, and its standard error.
+    distance
+        The run's log Z less this one, in units of both errors.
+    n_calls
+        Likelihood evaluations that the route took.
+    """
+
+    route: str
+    log_z: float
+    log_z_error: float
+    distance: float
+    n_calls: int
+
+
+def few_possible(log_start: float, log_start_error: float, n_live: int) -> str | None:
+    """Say so where fewer possible hypotheses than live points were drawn from the prior; None where enough were.
+
+    A share s of the prior, counted by m hypotheses, has the relative error sqrt((1 - s) / m).
+    """
+    if log_start_error <= 0:
+        return None
+    share = math.exp(log_start)
+    found = round((1.0 - share) / log_start_error**2)
+    if found >= n_live:
+        return None
+    return f"only {found} of {round(found / share)} hypotheses drawn from the prior are possible"
+
+
 @dataclass(frozen=True, eq=False)
 class NestedResult(ShowsItself):
     """Hold the evidence, the weighted samples and the record of how they came about.
@@ -104,9 +141,11 @@ class NestedResult(ShowsItself):
     n_eff
         Kish's effective number of samples.
     n_calls, n_live
-        Likelihood evaluations and live points.
+        Likelihood evaluations, those of the check included, and live points.
     stop_reason
         Why the run ended.
+    complete
+        Whether its stop rule ended it, rather than a limit, an interruption or a failure.
     insertion_rank, insertion_n_ranked
         Rank of each new point among those alive, 0 to m, and m, both (n_inserted,).
     insertion_p_value
@@ -119,6 +158,8 @@ class NestedResult(ShowsItself):
         Why the result should not be trusted blindly; empty for a sound run.
     agreement
         How far the runs agree of which this result was merged; None for a single run.
+    check
+        What a second route to the evidence found; None where none was taken.
     """
 
     names: tuple[str, ...]
@@ -140,6 +181,7 @@ class NestedResult(ShowsItself):
     n_calls: int
     n_live: int
     stop_reason: str
+    complete: bool
     insertion_rank: IntArray
     insertion_n_ranked: IntArray
     insertion_p_value: float
@@ -147,6 +189,7 @@ class NestedResult(ShowsItself):
     versions: Mapping[str, str]
     warnings: tuple[str, ...]
     agreement: Agreement | None = None
+    check: Check | None = None
 
     def __post_init__(self) -> None:
         theta = frozen(self.theta)
@@ -278,6 +321,11 @@ class NestedResult(ShowsItself):
         if self.agreement is not None:
             p = self.agreement.p_value
             lines.append(f"runs         {self.agreement.n_runs}, ln Z agree with p = {p:.2g}")
+        if self.check is not None:
+            lines.append(
+                f"check        log Z {self.check.log_z:.2f} ± {self.check.log_z_error:.2f} by {self.check.route}, "
+                f"{self.check.distance:+.1f} errors from this run, {self.check.n_calls} evaluations"
+            )
         if self.log_start < 0:
             share = math.exp(self.log_start)
             lines.append(f"possible     {share:.3g} ± {share * self.log_start_error:.1g} of the prior")
@@ -309,6 +357,7 @@ class NestedResult(ShowsItself):
         path = require_path("path", path)
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
+        head["check"] = None if self.check is None else asdict(self.check)
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         buffer = io.BytesIO()
         np.savez_compressed(
@@ -346,6 +395,7 @@ class NestedResult(ShowsItself):
             odd = ", ".join(sorted(set(head) ^ wanted))
             raise FileError(path, f"fields {odd} missing or unknown", "the fields that NestedResult.save writes")
         head["names"], head["warnings"] = tuple(head["names"]), tuple(head["warnings"])
+        head["check"] = None if head["check"] is None else Check(**head["check"])
         runs = head["agreement"]
         if runs is not None:
             head["agreement"] = Agreement(

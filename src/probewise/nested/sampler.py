@@ -6,7 +6,6 @@ import contextlib
 import json
 import math
 import os
-import warnings
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -24,16 +23,16 @@ from probewise._kinds import (
     require_rng,
     require_whole,
 )
-from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.families import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult, versions
+from probewise.nested.result import NestedResult, few_possible, versions
 from probewise.nested.stop import RemainingEvidence, State, StopRule
 
-__all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "run", "step"]
+__all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "search", "step"]
 
 LIVE_PER_PARAM = 2
 """Live points for each parameter, at least."""
@@ -87,11 +86,11 @@ def step(
     return Live(points, Origin.join(known, fresh), log_volume), dead, tally
 
 
-def run(
+def search(
     problem: Samplable,
     *,
     rng: np.random.Generator,
-    n_live: int = 300,
+    n_live: int,
     stop: StopRule | None = None,
     move: Move | None = None,
     n_replaced: int | None = None,
@@ -103,59 +102,9 @@ def run(
     n_workers: int | None = None,
     return_interrupted: bool = True,
 ) -> NestedResult:
-    """Compute the evidence of a problem and draw from its posterior (paper, section on SSF estimation).
+    """Search the prior once, from its whole volume to the peaks, without asking whether the result is right.
 
-    Parameters
-    ----------
-    problem
-        Prior and likelihood; the likelihood is asked in batches.
-    rng
-        Source of randomness; its state is stored in the result.
-    n_live
-        Live points: the error of log Z falls as its root, the cost rises in proportion.
-    stop
-        When to stop; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
-    move
-        How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior
-        is alive, points are drawn from the prior itself.
-    n_replaced
-        Points replaced in one round; default half of `n_live`. The volume lost is counted exactly
-        whatever it is; with half, batches are large, 28 % fewer points are drawn than one by one
-        and the variance of log Z is 44 % greater.
-    progress
-        Called with a `State` after every round.
-    max_calls
-        Likelihood evaluations after which the run ends early with what it has.
-    checkpoint
-        File that the run is saved to as it goes, whole or not at all, in a folder that is made if missing. Where it
-        exists already the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill;
-        `rng` must be as it was at the run's start, made anew from its seed. `max_calls` may be another.
-    checkpoint_every_s
-        Seconds between savings, at least; ten times as long as a saving takes if that is more. 0: after every round.
-    executor
-        Where the likelihood is evaluated, for one that is slow; by default here. Each batch is
-        dealt out in `n_workers` parts. The result is the same to the last bit if the likelihood of
-        a hypothesis is, whatever others are in the batch (matrix products in NumPy need not be).
-    n_workers
-        Parts of a batch; default the number of processors.
-    return_interrupted
-        Whether Ctrl-C returns the result so far, doubtful and saying so; else it raises `KeyboardInterrupt`.
-
-    Returns
-    -------
-    NestedResult
-        With a warning, stored in it too, where it should not be trusted blindly.
-
-    Raises
-    ------
-    ParameterError
-        If an option is out of range.
-    NotConvergedError
-        If the likelihood fails (`partial` holds the result so far, if there is one), or every
-        hypothesis drawn from the prior is impossible.
-    FileError
-        If the checkpoint is damaged, or of a run with another problem, other settings or another seed, or
-        cannot be written: before anything is evaluated. Where a later saving fails, the run goes on and warns.
+    `probewise.nested.run` has the parameters, what is raised, and the check; here a doubt is only stored in the result.
     """
     require_rng(rng)
     _require_options(stop, move, progress, checkpoint, checkpoint_every_s, executor, return_interrupted)
@@ -236,8 +185,6 @@ def run(
         # `progress` or `stop` raised, or somebody's signal handler did.
         save()
         raise
-    for note in result.warnings:
-        warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
     return result
 
 
@@ -339,17 +286,15 @@ def _first(evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, 
             "these readings (all have zero likelihood): the hypothesis space excludes what was measured; "
             "widen the priors, or question the readings or the noise level"
         )
-    notes: tuple[str, ...] = ()
     log_volume, error = math.log(found / drawn), math.sqrt((1.0 - found / drawn) / found)
     if found < n_live:
-        notes = (f"only {found} of {drawn} hypotheses drawn from the prior are possible",)
         bound = Bound(-math.inf, 1.0)
         start = points.take(rng.integers(found, size=n_live - found))
         cloud = points.u if found > n_params else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
         more, _ = move.draw(start, bound, cloud, evaluate, rng)
         points = Points.join(points, more)
     live = Live(points, Origin.of_prior(n_live), log_volume)
-    return Run(live, (), move, log_volume, error, notes, n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
+    return Run(live, (), move, log_volume, error, (), n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
 
 
 def _result(
@@ -358,6 +303,9 @@ def _result(
     """Let the live points die where they are and sum up."""
     live, dead, notes = now.live, now.dead, now.notes
     n_dead = sum(len(d.points) for d in dead)
+    few = few_possible(now.log_start, now.log_start_error, n_live)
+    if few is not None:
+        notes = (*notes, few)
     if now.n_stuck > _STUCK_SHARE * n_dead:
         notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
     order = live.points.order()
@@ -404,6 +352,7 @@ def _result(
         n_calls=evaluate.n_calls,
         n_live=n_live,
         stop_reason=reason,
+        complete=now.ended is not None,
         insertion_rank=rank,
         insertion_n_ranked=n_ranked,
         insertion_p_value=p_value,
@@ -438,6 +387,7 @@ def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> Ne
         n_eff=1.0,
         n_calls=1,
         n_live=n_live,
+        complete=True,
         stop_reason="no free parameters: the likelihood is the evidence",
         insertion_rank=np.empty(0, dtype=np.int64),
         insertion_n_ranked=np.empty(0, dtype=np.int64),

@@ -141,6 +141,7 @@ def _weigh(
         rng=rng,
         n_live=n_live,
         progress=lambda state: rounds(weighing.label, state),
+        max_cost=1.0,  # each run here is checked by the next
         return_interrupted=False,
     )
     with warnings.catch_warnings():

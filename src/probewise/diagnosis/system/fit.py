@@ -210,7 +210,7 @@ def _by_nested_sampling(
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against it is told
         found = nested.run(
             problem, rng=rng, n_live=n_live, max_calls=_most_calls(prepared), progress=_told(progress),
-            return_interrupted=False,
+            max_cost=1.0, return_interrupted=False,
         )  # fmt: skip
     if found.warnings:
         return samples, replace(otherwise, reason=f"nested sampling: {found.warnings[0]}")

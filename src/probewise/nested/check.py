@@ -1,0 +1,212 @@
+"""Ask a run's evidence again by a second route, and spend more where the two disagree.
+
+A run can be wrong without a trace: chains that are too short bias every shell a little and always in the same
+direction, so that log Z drifts with every nat and neither the insertion ranks nor the scatter between seeds tell.
+The second route, with chains twice as long, has few nats to shrink by: a run from a prior near the posterior that the
+first has found (`repartition`). Where the posterior fills so much of the prior that nothing is gained by that, a small
+run of the same problem stands in. How far chains jump, in units of the live points' own spread, is no such test: it is
+least where many modes or a thin shell keep chains in their place, and there the evidence is right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError, ParameterError
+from probewise.nested.evaluate import Samplable
+from probewise.nested.moves import Move, SliceMove
+from probewise.nested.repartition import Repartitioned, repartitioned
+from probewise.nested.result import Check, NestedResult, few_possible
+
+__all__ = ["Search", "checked"]
+
+# Apart by this many errors, the second route is asked again and more sharply; after that, the routes disagree.
+_APART = 2.0
+_DISAGREE = 2.5
+_MOST_MEMORY = 10.0
+_N_SAMPLES = 2000
+# A prior near the posterior is no gain where the way from it is nearly as long.
+_GAIN = 0.8
+_SHARE = 0.1  # of the first run's live points and nats, for a second route, whose chains are twice as long
+_LEAST_LIVE = 40
+
+
+class Search(Protocol):
+    """Run a problem once, without asking whether it is right; raises NotConvergedError as `run` does."""
+
+    def __call__(
+        self, problem: Samplable, *, n_live: int, move: Move, max_calls: int | None, rng: np.random.Generator
+    ) -> NestedResult:
+        """Run it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Route:
+    """A second way to the evidence: a problem of the same evidence, how many live points, and which chains."""
+
+    problem: Samplable
+    n_live: int
+    move: Move
+    name: str
+
+
+def checked(
+    first: NestedResult,
+    problem: Samplable,
+    move: Move,
+    search: Search,
+    *,
+    max_cost: float,
+    max_calls: int | None,
+    least_live: int,
+    rng: np.random.Generator,
+) -> NestedResult:
+    """Check a run, and repeat it with longer chains where the second route disagrees.
+
+    Parameters
+    ----------
+    first
+        The run, ended by its stop rule.
+    problem, move
+        What it ran on, and how it moved.
+    search
+        Runs a problem once.
+    max_cost
+        Evaluations in all, in units of the first run's.
+    max_calls
+        Evaluations in all, or None.
+    least_live
+        Fewest live points that a run of the problem accepts.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    NestedResult
+        The first run, or one with longer chains if only that agrees with the second route. Its `check` says what the
+        second route found; a warning says so where the two disagree in the end.
+    """
+    budget = max_cost * first.n_calls
+    if max_calls is not None:
+        budget = min(budget, max_calls)
+    spent = first.n_calls
+
+    def ask(route: _Route) -> NestedResult | None:
+        """Run a route; None where that would cost too much."""
+        nonlocal spent
+        left = int(budget - spent)
+        if left < 2 * route.n_live:
+            return None
+        try:
+            found = search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=rng)
+        except NotConvergedError as error:
+            # A route of its own may ask where the run never was; what it met there is told.
+            raise _FailedError(str(error)) from error
+        spent += found.n_calls
+        return found if found.complete else None
+
+    now, answers = first, list[NestedResult]()
+    try:
+        route = _second_route(now, problem, move, least_live, rng)
+        answers = [] if (found := ask(route)) is None else [found]
+        if not answers:
+            return replace(first, n_calls=spent)
+        sharper = replace(route, n_live=max(route.n_live, now.n_live))
+        if _suspicious(now, answers, _APART) and (found := ask(sharper)) is not None:
+            answers = [found] if _doubtful(answers[0]) else [*answers, found]
+        if _suspicious(now, answers, _DISAGREE):
+            again = ask(_Route(problem, now.n_live, _longer(move), "the run again"))
+            if again is not None and not again.warnings and not _suspicious(again, answers, _DISAGREE):
+                now = again
+    except _FailedError as error:
+        note = f"the second pass, which checks the evidence, failed: {error}"
+        return replace(now, n_calls=spent, warnings=(*now.warnings, note))
+    return _told(now, route.name, answers, spent)
+
+
+class _FailedError(Exception):
+    """A second route met what no run can use."""
+
+
+def _second_route(
+    first: NestedResult, problem: Samplable, move: Move, least_live: int, rng: np.random.Generator
+) -> _Route:
+    near = _near(first, problem, rng)
+    if near is not None:
+        theta = first.theta[first.log_weight > -math.inf]
+        weight = np.exp(first.log_weight[first.log_weight > -math.inf])
+        log_likelihood = first.log_likelihood[first.log_weight > -math.inf]
+        nats = float(weight @ (log_likelihood + near.prior.made_up(theta))) - first.log_z
+        if nats < _GAIN * first.information:
+            wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
+            n_live = int(min(max(wanted, least_live, _LEAST_LIVE), max(first.n_live // 2, least_live)))
+            return _Route(near, n_live, _longer(move), "a second pass from near the posterior")
+    n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
+    return _Route(problem, n_live, _longer(move), "a second run with longer chains")
+
+
+def _near(first: NestedResult, problem: Samplable, rng: np.random.Generator) -> Repartitioned | None:
+    """State the problem near what was found; None where the prior or the samples do not allow it."""
+    if not hasattr(problem.prior, "log_prob"):
+        return None
+    try:
+        near = repartitioned(problem, first.samples(_N_SAMPLES, rng=rng))
+        whole = bool(np.isfinite(near.prior.root).all() and np.isfinite(near.prior.inverse_root).all())
+    except (ParameterError, np.linalg.LinAlgError):
+        return None
+    return near if whole else None
+
+
+def _longer(move: Move) -> Move:
+    """Chains twice as long; slice chains where the move is one of another kind."""
+    return move.longer() if isinstance(move, SliceMove) else SliceMove().longer()
+
+
+def _doubtful(answer: NestedResult) -> bool:
+    return bool(answer.warnings) or answer.memory > _MOST_MEMORY
+
+
+def _together(answers: list[NestedResult]) -> tuple[float, float]:
+    """Log Z and its error from all answers of the second route, by their errors."""
+    weight = np.array([1.0 / max(answer.log_z_error, 1e-12) ** 2 for answer in answers])
+    log_z: FloatArray = np.array([answer.log_z for answer in answers])
+    return float(weight @ log_z / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def _distance(run: NestedResult, answers: list[NestedResult]) -> float:
+    """Difference of the two routes in units of their errors."""
+    log_z, error = _together(answers)
+    return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
+
+
+def _suspicious(run: NestedResult, answers: list[NestedResult], most: float) -> bool:
+    return abs(_distance(run, answers)) > most or _doubtful(answers[-1])
+
+
+def _told(now: NestedResult, name: str, answers: list[NestedResult], spent: int) -> NestedResult:
+    """Store what the check found, and the doubt where the routes disagree."""
+    log_z, error = _together(answers)
+    distance = _distance(now, answers)
+    check = Check(name, log_z, error, distance, sum(answer.n_calls for answer in answers))
+    warnings = now.warnings
+    if abs(distance) > _DISAGREE:
+        warnings = (
+            *warnings,
+            f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, this run {now.log_z:.2f} ± {now.log_z_error:.2f}: "
+            f"{abs(distance):.1f} errors apart; chains are too short or a part of the posterior was lost; "
+            "use a greater steps_per_param, more n_live, or a greater max_cost",
+        )
+    elif _doubtful(answers[-1]):
+        why = answers[-1].warnings[0] if answers[-1].warnings else f"its memory is {answers[-1].memory:.1f}"
+        warnings = (*warnings, f"{name}, which checks the evidence, is in doubt itself: {why}")
+    else:
+        # How few hypotheses the volume was counted by no longer matters where another route has counted it.
+        counted = few_possible(now.log_start, now.log_start_error, now.n_live)
+        warnings = tuple(note for note in warnings if note != counted)
+    return replace(now, n_calls=spent, check=check, warnings=warnings)

@@ -1,0 +1,145 @@
+"""The second route to the evidence: it agrees with a right run, and speaks up against a wrong one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nested_sampling import hard, problems
+from scipy.special import logsumexp
+
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.nested import NestedResult, SliceMove, run
+from probewise.nested.check import checked
+from probewise.nested.sampler import search
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20261123)
+
+
+def quiet(problem: object, **options: object) -> NestedResult:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)
+        return run(problem, **{"rng": rng(), "n_live": 100, **options})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", [*hard.IN_TWO])
+def test_a_hard_evidence_agrees_with_a_fine_grid(name: str) -> None:
+    """Midpoint rule on 700 x 700 cells of the unit square, for each family in two dimensions."""
+    known = hard.IN_TWO[name]()
+    side = (np.arange(700) + 0.5) / 700
+    u = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    height = known.log_likelihood(known.prior.from_unit_cube(u))
+    # Two dimensions leave a kink where the slab lies across the square's corner; in eight the density is smooth.
+    assert float(logsumexp(height)) - math.log(len(u)) == pytest.approx(known.log_z, abs=0.012)
+
+
+def test_the_hierarchical_evidence_is_that_of_draws_from_the_population() -> None:
+    """Averaging the likelihood of readings over group means drawn from their population, for fixed mu and tau."""
+    known = hard.hierarchical(3)
+    draw = np.random.default_rng(3)
+    n = 400_000
+    mu, log_tau = draw.uniform(-6, 6, n), draw.uniform(-5, 1.5, n)
+    z = mu[:, None] + np.exp(log_tau)[:, None] * draw.standard_normal((n, 3))
+    theta = np.column_stack([mu, log_tau, z])
+    off = (z - mu[:, None]) * np.exp(-log_tau)[:, None]
+    population = (-0.5 * off**2 - log_tau[:, None] - 0.5 * math.log(2 * math.pi)).sum(axis=1)
+    log_weight = known.log_likelihood(theta) - population
+    log_z = float(logsumexp(log_weight)) - math.log(n) - 3 * math.log(40.0)
+    n_eff = math.exp(2 * logsumexp(log_weight) - logsumexp(2 * log_weight))
+    assert log_z == pytest.approx(known.log_z, abs=3.9 / math.sqrt(n_eff) + 1e-3)
+
+
+def test_a_right_run_is_confirmed_for_a_fraction_of_its_cost() -> None:
+    known = problems.problem("Gaussian 4-D")
+    alone = quiet(known, n_live=200, max_cost=1.0)
+    result = quiet(known, n_live=200)
+    assert alone.check is None
+    assert result.log_z == alone.log_z
+    assert np.array_equal(result.theta, alone.theta)
+    assert not result.warnings
+    assert result.check is not None
+    assert abs(result.check.distance) < 2.5
+    assert abs(result.check.log_z - known.log_z) < 3.9 * result.check.log_z_error
+    assert result.n_calls == alone.n_calls + result.check.n_calls
+    assert result.check.n_calls < 0.4 * alone.n_calls
+    assert "check        log Z" in result.summary()
+
+
+def misled(max_cost: float) -> tuple[NestedResult, NestedResult]:
+    """A sound run whose evidence was shifted by eight errors, and what the check makes of it."""
+    known = problems.problem("Gaussian 4-D")
+    sound = quiet(known, max_cost=1.0)
+    wrong = dataclasses.replace(sound, log_z=sound.log_z + 8 * sound.log_z_error)
+    result = checked(
+        wrong,
+        known,
+        SliceMove(),
+        search,
+        max_cost=max_cost,
+        max_calls=None,
+        least_live=10,
+        rng=np.random.default_rng(5),
+    )
+    return sound, result
+
+
+def test_a_wrong_evidence_is_doubted_where_nothing_is_left_to_spend() -> None:
+    sound, result = misled(1.6)
+    assert result.log_z == pytest.approx(sound.log_z + 8 * sound.log_z_error)
+    assert result.check is not None
+    assert result.check.distance > 2.5
+    assert "errors apart" in result.warnings[-1]
+    assert result.n_calls <= 1.6 * sound.n_calls
+
+
+def test_a_wrong_evidence_is_cured_by_longer_chains() -> None:
+    sound, result = misled(5.0)
+    assert not result.warnings
+    assert abs(result.log_z - sound.log_z) < 5 * sound.log_z_error
+    assert result.n_calls <= 5 * sound.n_calls
+
+
+@pytest.mark.slow
+def test_many_scales_with_chains_too_short_are_never_wrong_without_a_word() -> None:
+    """In twelve dimensions log Z of the search alone is too high by many errors."""
+    known = hard.many_dimensions(12)
+    wrong = quiet(known, n_live=40, move=SliceMove(steps_per_param=0.3, fewest_steps=3), max_cost=1.0)
+    result = quiet(known, n_live=40, move=SliceMove(steps_per_param=0.3, fewest_steps=3), max_cost=2.0)
+    assert abs(wrong.log_z - known.log_z) > 3 * wrong.log_z_error
+    assert any("errors apart" in note for note in result.warnings)
+
+
+def test_a_volume_that_few_hypotheses_were_counted_by_is_confirmed_or_doubted() -> None:
+    def function(theta: np.ndarray) -> np.ndarray:
+        return np.where(theta[:, 0] < 0.002, 0.0, -np.inf)
+
+    known = problems.Known(problems.box(2, 0, 1), function, math.log(0.002))
+    result = quiet(known)
+    assert abs(result.log_z - known.log_z) < 3 * result.log_z_error or result.warnings
+
+
+def test_the_check_keeps_to_max_calls() -> None:
+    known = problems.problem("Gaussian 4-D")
+    alone = quiet(known, max_cost=1.0)
+    result = quiet(known, max_calls=alone.n_calls + 400)
+    assert result.n_calls <= alone.n_calls + 400
+    assert result.check is None
+
+
+def test_a_checked_run_is_repeated_by_its_seed_and_saved_whole(tmp_path: Path) -> None:
+    first = quiet(problems.plateau(), checkpoint=tmp_path / "run.npz")
+    again = quiet(problems.plateau(), checkpoint=tmp_path / "run.npz")  # the search is done, the check comes again
+    assert first.check == again.check
+    first.save(tmp_path / "result.npz")
+    assert NestedResult.load(tmp_path / "result.npz").check == first.check
+
+
+def test_a_cost_below_the_search_itself_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"max_cost is 0\.5; allowed: 1 \(no check\) or more"):
+        quiet(problems.plateau(), max_cost=0.5)

@@ -177,7 +177,10 @@ MISTAKES = {
     "a number as likelihood": (lambda: Experiment(CIRCLE, MODEL, 0.7, 0.7), "likelihood is 0.7; allowed: a likelihood"),
     "swapped experiment": (lambda: Experiment(MODEL, CIRCLE, GaussianKnown(1), 0.7), "shape is .*; allowed: a shape"),
     # nested sampling
-    "a function as problem": (lambda: run(lambda theta: 0.0, rng=RNG), "allowed: a value with a prior and a log_likel"),
+    "a function as problem": (
+        lambda: run(lambda theta: 0.0, rng=RNG),
+        "allowed: a problem with a prior and a log_likel",
+    ),
     "a class as problem": (lambda: run(Bell, rng=RNG), r"this is the class, a value of it is Bell\("),
     "a dict as prior": (lambda: run(NoPrior(), rng=RNG), "problem.prior is .*; allowed: a prior of named parameters"),
     "a scalar likelihood": (

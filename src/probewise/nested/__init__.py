@@ -12,6 +12,7 @@ from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
+from probewise.nested.pose import Posed, pose
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
@@ -30,6 +31,7 @@ __all__ = [
     "Move",
     "NestedResult",
     "Points",
+    "Posed",
     "PriorRejection",
     "RemainingEvidence",
     "Repartitioned",
@@ -47,6 +49,7 @@ __all__ = [
     "least_live",
     "merge",
     "pareto_k",
+    "pose",
     "refine",
     "repartitioned",
     "run",

@@ -125,7 +125,7 @@ class Evaluator:
         require_like("problem", self.problem, ("prior", "log_likelihood"), allowed)
         require_prior("problem.prior", self.problem.prior)
         self.names = self.problem.prior.names
-        self.space = space_of(self.problem.prior)
+        self.space = space_of(self.problem.prior, getattr(self.problem, "periodic", ()))
 
     def from_prior(self, n: int, rng: np.random.Generator) -> Points:
         """Draw from the prior and evaluate."""

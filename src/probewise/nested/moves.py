@@ -162,6 +162,10 @@ class SliceMove:
         n_chains, n_params = start.u.shape
         space = evaluate.space
         walls = _walls(space)
+        around = _Circles.cut_where_empty(space.periodic, live)
+        if around is not None:
+            live = around.wrapped(live)
+            start = replace(start, u=around.wrapped(start.u))
         clusters = find_clusters(live)
         n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
@@ -211,6 +215,8 @@ class SliceMove:
             chain = rows.repeat(n_ahead)
             ahead = now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * line.take(rows, axis=0)[:, None, :]
             candidate = ahead.reshape(-1, n_params)
+            if around is not None:
+                candidate = around.wrapped(candidate)
             if walls is not None:
                 np.clip(candidate, *walls, out=candidate)
             least = level[chain]
@@ -229,9 +235,12 @@ class SliceMove:
                     who = chain[first]
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
                     candidate[first], log_growth = view.hop(who, now.u[who], home[who], goal[first])
+                    if around is not None:
+                        # Beyond the cut the way back would begin elsewhere.
+                        ok[first] &= (around.wrapped(candidate[first]) == candidate[first]).all(axis=1)
                     least[first] -= log_growth
                     if walls is not None:
-                        ok[first] = ((candidate[first] >= walls[0]) & (candidate[first] <= walls[1])).all(axis=1)
+                        ok[first] &= ((candidate[first] >= walls[0]) & (candidate[first] <= walls[1])).all(axis=1)
                 place = clusters.assign(candidate)
                 ok &= (kinds == _DIFFERENCE) | (place == goal)
             asked = ok.nonzero()[0]
@@ -263,6 +272,8 @@ class SliceMove:
                 active = active[step[active] < n_steps]
             if more.size:
                 begin(more)
+        if around is not None:
+            now = replace(now, u=around.home(now.u))
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def _kinds(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
@@ -382,12 +393,49 @@ class _View:
         return moved, self.log_det[there] - self.log_det[here]
 
 
+@dataclass(frozen=True, eq=False)
+class _Circles:
+    """Coordinates that go round, each written down from a cut of its own on, so that no peak lies across the end.
+
+    Chains stay on the circle: a candidate is wrapped before anything is asked of it, so that metric and clusters of
+    the way back are those of the way there.
+    """
+
+    columns: IntArray
+    cut: FloatArray
+
+    @classmethod
+    def cut_where_empty(cls, periodic: tuple[int, ...], live: FloatArray) -> _Circles | None:
+        """Cut each circle in the middle of the widest gap between live points, (n_live, n_params)."""
+        if not periodic:
+            return None
+        columns = np.array(periodic)
+        place = np.sort(live[:, columns] % 1.0, axis=0)
+        gap = np.diff(place, axis=0, append=place[:1] + 1.0)
+        widest = np.argmax(gap, axis=0)
+        each = np.arange(len(columns))
+        return cls(columns, (place[widest, each] + 0.5 * gap[widest, each]) % 1.0)
+
+    def wrapped(self, u: FloatArray) -> FloatArray:
+        """Write places down from the cut on."""
+        u = u.copy()
+        u[:, self.columns] = self.cut + (u[:, self.columns] - self.cut) % 1.0
+        return u
+
+    def home(self, u: FloatArray) -> FloatArray:
+        """Write places down from 0 on."""
+        u = u.copy()
+        u[:, self.columns] %= 1.0
+        return u
+
+
 Walls: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 def _walls(space: Space) -> Walls | None:
-    """Least and greatest value of each coordinate; None where nothing bounds any."""
-    low, high = space.low, space.high
+    """Least and greatest value of each coordinate; None where nothing bounds any. A circle has no walls."""
+    low, high = space.low.copy(), space.high.copy()
+    low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
     return (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
 
 

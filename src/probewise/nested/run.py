@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import checked
 from probewise.nested.evaluate import Samplable
 from probewise.nested.moves import Move, SliceMove
+from probewise.nested.pose import AnyPrior, pose
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, search
 from probewise.nested.stop import State, StopRule
@@ -24,8 +26,13 @@ __all__ = ["run"]
 
 
 def run(
-    problem: Samplable,
+    problem: Samplable | Callable[..., Any],
+    prior: AnyPrior | None = None,
     *,
+    names: Sequence[str] | None = None,
+    vectorized: bool = False,
+    pass_dict: bool = False,
+    periodic: Sequence[str] = (),
     rng: np.random.Generator,
     n_live: int = 300,
     stop: StopRule | None = None,
@@ -45,7 +52,11 @@ def run(
     Parameters
     ----------
     problem
-        Prior and likelihood; the likelihood is asked in batches.
+        Prior and likelihood in one, whose likelihood is asked in batches; or a log likelihood, a function of one point.
+    prior
+        The prior of a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
+    names, vectorized, pass_dict, periodic
+        How the functions are called; see `pose`. Not for a problem in one.
     rng
         Source of randomness; its state is stored in the result.
     n_live
@@ -99,6 +110,7 @@ def run(
         cannot be written: before anything is evaluated. Where a later saving fails, the run goes on and warns.
     """
     require_rng(rng)
+    posed = _posed(problem, prior, names, vectorized, pass_dict, periodic)
     if not require_number("max_cost", max_cost) >= 1:
         raise ParameterError("max_cost", max_cost, "1 (no check) or more")
     moving: Move = SliceMove() if move is None else move
@@ -106,7 +118,7 @@ def run(
         search, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
     )
     result = once(
-        problem,
+        posed,
         rng=rng,
         n_live=n_live,
         stop=stop,
@@ -122,7 +134,7 @@ def run(
         try:
             result = checked(
                 result,
-                problem,
+                posed,
                 moving,
                 partial(once, return_interrupted=False),
                 max_cost=max_cost,
@@ -138,3 +150,35 @@ def run(
     for note in result.warnings:
         warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
     return result
+
+
+def _posed(
+    problem: object,
+    prior: AnyPrior | None,
+    names: Sequence[str] | None,
+    vectorized: bool,
+    pass_dict: bool,
+    periodic: Sequence[str],
+) -> Samplable:
+    """Take a problem in one, or make one of a function and its prior."""
+    if hasattr(problem, "log_likelihood") or isinstance(problem, type):
+        if prior is not None or names is not None or vectorized or pass_dict or periodic:
+            raise ParameterError(
+                "prior, names, vectorized, pass_dict, periodic",
+                "given beside a problem that has its own",
+                "these beside a log likelihood, a function; or nested.run(problem, rng=rng)",
+            )
+        return cast(Samplable, problem)
+    if prior is None:
+        allowed = "a problem with a prior and a log_likelihood(theta), such as inference.SensorProblem; or a function"
+        raise ParameterError(
+            "problem", problem, f"{allowed} with its prior: nested.run(log_likelihood, prior, rng=rng)"
+        )
+    return pose(
+        cast("Callable[..., Any]", problem),
+        prior,
+        names=names,
+        vectorized=vectorized,
+        pass_dict=pass_dict,
+        periodic=periodic,
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -9,6 +10,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
 from probewise.priors import Coordinates, Prior, require_prior
 
 __all__ = ["Space", "space_of", "unbounded"]
@@ -18,6 +20,11 @@ _EDGE = 1e-15
 
 class Space(Protocol):
     """Where chains step; the prior has a density there."""
+
+    @property
+    def periodic(self) -> tuple[int, ...]:
+        """Columns of the coordinates that go round, with period one from 0 on."""
+        ...
 
     @property
     def low(self) -> FloatArray:
@@ -44,9 +51,10 @@ class Space(Protocol):
 
 @dataclass(frozen=True)
 class _Cube:
-    """The unit cube, where every prior is even."""
+    """The unit cube, where every prior is even; `periodic` columns go round, so that any number is a place there."""
 
     prior: Prior
+    periodic: tuple[int, ...] = ()
 
     @property
     def low(self) -> FloatArray:
@@ -60,6 +68,9 @@ class _Cube:
         return self.prior.to_unit_cube(theta)
 
     def leave(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.periodic:
+            u = u.copy()
+            u[:, self.periodic] %= 1.0
         return self.prior.from_unit_cube(u), np.zeros(len(u))
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -71,6 +82,10 @@ class _Normal:
     """The unit cube drawn out: every coordinate has a standard normal prior, and no walls."""
 
     prior: Prior
+
+    @property
+    def periodic(self) -> tuple[int, ...]:
+        return ()
 
     @property
     def low(self) -> FloatArray:
@@ -97,6 +112,10 @@ class _Own:
 
     prior: Prior
     coordinates: Coordinates
+
+    @property
+    def periodic(self) -> tuple[int, ...]:
+        return ()
 
     @property
     def low(self) -> FloatArray:
@@ -131,9 +150,21 @@ class _Draws(Protocol):
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
 
 
-def space_of(prior: Prior) -> Space:
-    """Choose where chains step: the prior's own coordinates if it has any, else the unit cube."""
-    return _Own(prior, prior.coordinates) if isinstance(prior, _HasCoordinates) else _Cube(prior)
+def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
+    """Choose where chains step: the prior's own coordinates if it has any, else the unit cube.
+
+    Raises
+    ------
+    ParameterError
+        If parameters are `periodic` that the prior does not have, or that it has in coordinates of its own.
+    """
+    own = isinstance(prior, _HasCoordinates)
+    if periodic and (own or not set(periodic) <= set(prior.names)):
+        allowed = "none: the prior has coordinates of its own" if own else f"names among {prior.names}"
+        raise ParameterError("periodic", tuple(periodic), allowed)
+    if isinstance(prior, _HasCoordinates):
+        return _Own(prior, prior.coordinates)
+    return _Cube(prior, tuple(prior.names.index(name) for name in periodic))
 
 
 def unbounded(prior: Prior) -> Space:

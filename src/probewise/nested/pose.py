@@ -1,0 +1,197 @@
+"""Pose a problem from plain functions: a log likelihood of one point or of many, and a prior in any usual form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise._kinds import require_callable
+from probewise.errors import ParameterError
+from probewise.priors import Marginal, Prior, Product
+
+__all__ = ["AnyPrior", "Posed", "pose"]
+
+AnyPrior: TypeAlias = "Prior | Mapping[str, Any] | Sequence[Any] | Callable[[FloatArray], Any]"
+
+_ALLOWED_PRIOR = (
+    "a prior such as Product({'x': Uniform(0.0, 1.0)}), a dict or list of distributions (probewise.priors or frozen "
+    "scipy.stats ones), or a function from the unit cube to parameters together with names=[...]"
+)
+
+
+@dataclass(frozen=True)
+class _Scipy:
+    """A frozen continuous distribution of scipy.stats as a marginal."""
+
+    distribution: Any
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        quantile = getattr(self.distribution, "ppf", None) or self.distribution.icdf
+        return np.asarray(quantile(u), dtype=np.float64)
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        return np.asarray(self.distribution.cdf(value), dtype=np.float64)
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        return np.asarray(self.distribution.logpdf(value), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Transform:
+    """A prior that is known as a function from the unit cube alone: it has no density and no way back."""
+
+    names: tuple[str, ...]
+    function: Callable[[FloatArray], Any]
+    vectorized: bool
+
+    def __post_init__(self) -> None:
+        shape = self.from_unit_cube(np.full((2, len(self.names)), 0.5)).shape
+        if shape != (2, len(self.names)):
+            asked = "two points (2, n_params)" if self.vectorized else "one point (n_params,)"
+            got = shape if self.vectorized else shape[1:]
+            raise ParameterError("prior", f"a function that makes {asked} into shape {got}", f"the {len(self.names)} "
+                                 f"parameters that names lists, {', '.join(self.names)}")  # fmt: skip
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        if self.vectorized:
+            return np.asarray(self.function(u.copy()), dtype=np.float64)
+        # Many transforms write into their argument and give it back.
+        return np.array([np.array(self.function(row.copy()), dtype=np.float64) for row in u]).reshape(len(u), -1)
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A problem of plain functions, which every function of `probewise.nested` takes; made by `pose`.
+
+    Attributes
+    ----------
+    function
+        The log likelihood as it was given.
+    prior
+        The prior, with names.
+    vectorized, pass_dict
+        How the function is called; see `pose`.
+    periodic
+        Parameters whose greatest value is next to their least.
+    """
+
+    function: Callable[..., Any]
+    prior: Prior
+    vectorized: bool = False
+    pass_dict: bool = False
+    periodic: tuple[str, ...] = field(default=())
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log likelihood of a batch, (n_samples, n_params) -> (n_samples,)."""
+        if self.vectorized:
+            given = dict(zip(self.prior.names, theta.T, strict=True)) if self.pass_dict else theta
+            return self.function(given)  # type: ignore[no-any-return]
+        return np.array([self._one(row) for row in theta])
+
+    def _one(self, row: FloatArray) -> Any:
+        if self.pass_dict:
+            answer = self.function(dict(zip(self.prior.names, row.tolist(), strict=True)))
+        else:
+            answer = self.function(row)
+        if np.size(answer) != 1:
+            raise ValueError(
+                f"the likelihood of one point has shape {np.shape(answer)}; allowed: one number; a function of many "
+                "points at once needs vectorized=True"
+            )
+        return np.asarray(answer).reshape(())[()] if not np.ma.isMaskedArray(answer) else np.nan
+
+
+def pose(
+    log_likelihood: Callable[..., Any],
+    prior: AnyPrior,
+    *,
+    names: Sequence[str] | None = None,
+    vectorized: bool = False,
+    pass_dict: bool = False,
+    periodic: Sequence[str] = (),
+) -> Posed:
+    """Make a problem of a log likelihood and a prior.
+
+    Parameters
+    ----------
+    log_likelihood
+        Natural log of the likelihood of one point, (n_params,) -> a number; -inf where it is impossible.
+    prior
+        A prior with names (`probewise.priors`); a dict of distributions by name; a list of distributions; or a function
+        that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
+        `probewise.priors` or frozen continuous ones of scipy.stats.
+    names
+        Names of the parameters, in order: for a function, where they are needed, or a list, where they are p0, p1, ...
+        by default.
+    vectorized
+        Whether the functions take many points at once, (n_samples, n_params), and answer for each. Much faster, where
+        NumPy does the work.
+    pass_dict
+        Whether the likelihood is given a dict of parameters by name rather than an array.
+    periodic
+        Names of parameters whose range is a circle: chains step over its ends.
+
+    Returns
+    -------
+    Posed
+        What `run`, `refine`, `repartitioned`, `update` and `diversify` take. A prior that is known as a function of the
+        unit cube alone serves `run`; the others need its density or its inverse, and say so.
+
+    Raises
+    ------
+    ParameterError
+        If something is of the wrong kind, or names and prior do not fit.
+    """
+    require_callable("log_likelihood", log_likelihood, "a function of a point, such as lambda x: -0.5 * (x**2).sum()")
+    named = _named(prior, names, vectorized)
+    unknown = [name for name in periodic if name not in named.names]
+    if isinstance(periodic, str) or unknown:
+        raise ParameterError("periodic", periodic, f"names among {named.names}")
+    return Posed(log_likelihood, named, vectorized, pass_dict, tuple(periodic))
+
+
+def _named(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
+    """Take a prior in any of its forms."""
+    if isinstance(names, str):
+        raise ParameterError("names", names, "a list of names: names=['x', 'y']")
+    given = None if names is None else tuple(str(name) for name in names)
+    if isinstance(prior, type):
+        raise ParameterError("prior", prior, _ALLOWED_PRIOR)
+    if isinstance(prior, Mapping):
+        made: Prior = Product({str(name): _marginal(f"prior[{name!r}]", one) for name, one in prior.items()})
+    elif isinstance(prior, Prior) or (hasattr(prior, "names") and hasattr(prior, "from_unit_cube")):
+        made = prior  # type: ignore[assignment]
+    elif isinstance(prior, Sequence) and not isinstance(prior, str | bytes):
+        own = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
+        if len(own) != len(prior):
+            raise ParameterError("names", names, f"{len(prior)} names, one for each distribution")
+        made = Product({n: _marginal(f"prior[{i}]", one) for i, (n, one) in enumerate(zip(own, prior, strict=True))})
+        if len(made.names) != len(prior):
+            raise ParameterError("names", names, "each name once")
+    elif callable(prior) and not hasattr(prior, "logpdf"):
+        if given is None:
+            allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"
+            raise ParameterError("names", None, allowed)
+        return _Transform(given, prior, vectorized)  # type: ignore[return-value]
+    else:
+        raise ParameterError("prior", prior, _ALLOWED_PRIOR)
+    if given is not None and given != made.names:
+        raise ParameterError("names", names, f"those of the prior, {made.names}, or none")
+    return made
+
+
+def _marginal(name: str, one: Any) -> Marginal:
+    if all(hasattr(one, method) for method in ("from_unit", "to_unit", "log_prob")):
+        return one  # type: ignore[no-any-return]
+    quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
+    if quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type):
+        if hasattr(one, "freeze"):
+            raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")
+        return _Scipy(one)
+    raise ParameterError(
+        name, one, "Uniform(low, high), LogUniform(low, high), Normal(mean, sd), or a frozen continuous scipy.stats one"
+    )

@@ -139,7 +139,7 @@ def test_chains_step_over_the_end_of_a_circle_and_stay_even() -> None:
         (one_point, 3.0, {}, "prior is 3.0; allowed: a prior such as"),
         (one_point, to_square, {}, r"names is None; allowed: .*names=\['x', 'y'\]"),
         (one_point, to_square, {"names": "xy"}, "allowed: a list of names"),
-        (one_point, lambda u: u[:1], {"names": ["x", "y"]}, "prior is a function that makes one point"),
+        (one_point, lambda u: u[:1], {"names": ["x", "y"]}, "prior is 'a function that makes one point"),
         (one_point, [stats.norm(0, 1)], {"names": ["x", "y"]}, "allowed: 1 names"),
         (one_point, SQUARE, {"names": ["y", "x"]}, "those of the prior"),
         (one_point, {"x": stats.norm}, {}, "a frozen distribution"),

@@ -53,8 +53,8 @@ class _Transform:
         if shape != (2, len(self.names)):
             asked = "two points (2, n_params)" if self.vectorized else "one point (n_params,)"
             got = shape if self.vectorized else shape[1:]
-            raise ParameterError("prior", f"a function that makes {asked} into shape {got}", f"the {len(self.names)} "
-                                 f"parameters that names lists, {', '.join(self.names)}")  # fmt: skip
+            wanted = f"the {len(self.names)} parameters of names, {', '.join(self.names)}"
+            raise ParameterError("prior", f"a function that makes {asked} into shape {got}", wanted)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         if self.vectorized:

@@ -13,7 +13,7 @@ from nested_sampling import hard, problems
 from scipy.special import logsumexp
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested import NestedResult, SliceMove, run
+from probewise.nested import Check, NestedResult, SliceMove, merge, refine, run
 from probewise.nested.check import checked
 from probewise.nested.sampler import search
 
@@ -143,3 +143,43 @@ def test_a_checked_run_is_repeated_by_its_seed_and_saved_whole(tmp_path: Path) -
 def test_a_cost_below_the_search_itself_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"max_cost is 0\.5; allowed: 1 \(no check\) or more"):
         quiet(problems.plateau(), max_cost=0.5)
+
+
+def test_a_bias_that_all_runs_share_is_found_when_they_are_merged() -> None:
+    """Each of eight runs is off by 1.5 errors, which its own check lets pass; together they are off by four."""
+    known = problems.problem("Gaussian 4-D")
+    runs = []
+    for part in rng().spawn(8):
+        sound = run(known, rng=part, n_live=40, max_cost=1.0)
+        at = known.log_z + 1.5 * sound.log_z_error
+        check = Check("a second pass", known.log_z, sound.log_z_error / 2, 1.3, 100)
+        shift = at - sound.log_z  # every likelihood a little too great: so is the evidence
+        runs.append(
+            dataclasses.replace(
+                sound,
+                log_z=at,
+                log_likelihood=sound.log_likelihood + shift,
+                log_birth=sound.log_birth + shift,
+                check=check,
+            )
+        )
+    with pytest.warns(DoubtfulResultWarning, match="does not average out"):
+        merged = merge(runs, rng=rng())
+    assert merged.check is not None
+    assert merged.check.log_z == pytest.approx(known.log_z)
+    assert merged.check.distance > 2.5
+    without = merge([dataclasses.replace(r, check=None) for r in runs], rng=rng())
+    assert without.check is None
+    assert not without.warnings
+
+
+def test_a_refinement_inherits_what_speaks_against_its_run() -> None:
+    known = problems.problem("Gaussian 2-D")
+    sound = quiet(known)
+    assert refine(sound, known, rng=rng(), n_draws=1000).sound
+    doubted = dataclasses.replace(sound, warnings=("chains are too short",))
+    assert refine(doubted, known, rng=rng(), n_draws=1000).doubts == ("chains are too short",)
+    apart = dataclasses.replace(sound, log_z=sound.log_z + 6 * sound.log_z_error)
+    found = refine(apart, known, rng=rng(), n_draws=1000)
+    assert not found.sound
+    assert found.doubts[0].startswith("the run gives log Z = ")

@@ -253,7 +253,7 @@ def _fit_order(
     result = run(problem, rng=rng, n_live=n_live, progress=told, max_cost=1.0, return_interrupted=False)
     refined = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
-    if refined.sound and apart > _DISAGREE:
+    if apart > _DISAGREE and set(refined.doubts) <= set(refined.inherited):
         notes = (
             *notes,
             f"two routes to the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "

@@ -11,6 +11,7 @@ least where many modes or a thin shell keep chains in their place, and there the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -23,11 +24,13 @@ from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Check, NestedResult, few_possible
 
-__all__ = ["Search", "checked"]
+__all__ = ["DISAGREE", "Search", "checked", "weighted_mean"]
 
-# Apart by this many errors, the second route is asked again and more sharply; after that, the routes disagree.
+DISAGREE = 2.5
+"""Errors that the two routes may lie apart by before they are said to disagree."""
+
+# Apart by this many errors, the second route is asked again and more sharply.
 _APART = 2.0
-_DISAGREE = 2.5
 _MOST_MEMORY = 10.0
 _N_SAMPLES = 2000
 # A prior near the posterior is no gain where the way from it is nearly as long.
@@ -120,9 +123,9 @@ def checked(
         sharper = replace(route, n_live=max(route.n_live, now.n_live))
         if _suspicious(now, answers, _APART) and (found := ask(sharper)) is not None:
             answers = [found] if _doubtful(answers[0]) else [*answers, found]
-        if _suspicious(now, answers, _DISAGREE):
+        if _suspicious(now, answers, DISAGREE):
             again = ask(_Route(problem, now.n_live, _longer(move), "the run again"))
-            if again is not None and not again.warnings and not _suspicious(again, answers, _DISAGREE):
+            if again is not None and not again.warnings and not _suspicious(again, answers, DISAGREE):
                 now = again
     except _FailedError as error:
         note = f"the second pass, which checks the evidence, failed: {error}"
@@ -172,11 +175,14 @@ def _doubtful(answer: NestedResult) -> bool:
     return bool(answer.warnings) or answer.memory > _MOST_MEMORY
 
 
+def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
+    """Average independent estimates of log Z by their errors; also the error of the mean."""
+    weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
+    return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
+
+
 def _together(answers: list[NestedResult]) -> tuple[float, float]:
-    """Log Z and its error from all answers of the second route, by their errors."""
-    weight = np.array([1.0 / max(answer.log_z_error, 1e-12) ** 2 for answer in answers])
-    log_z: FloatArray = np.array([answer.log_z for answer in answers])
-    return float(weight @ log_z / weight.sum()), float(weight.sum() ** -0.5)
+    return weighted_mean([a.log_z for a in answers], [a.log_z_error for a in answers])
 
 
 def _distance(run: NestedResult, answers: list[NestedResult]) -> float:
@@ -195,7 +201,7 @@ def _told(now: NestedResult, name: str, answers: list[NestedResult], spent: int)
     distance = _distance(now, answers)
     check = Check(name, log_z, error, distance, sum(answer.n_calls for answer in answers))
     warnings = now.warnings
-    if abs(distance) > _DISAGREE:
+    if abs(distance) > DISAGREE:
         warnings = (
             *warnings,
             f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, this run {now.log_z:.2f} ± {now.log_z_error:.2f}: "

@@ -39,6 +39,8 @@ _MOST_LOST = 0.2
 _HELD_BACK = 1 / 3
 _MOST_HELD = 1000
 _BRIDGE_STEPS = 20
+# Draws this many errors from the run that they refine disagree with it.
+_APART = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,8 @@ class Weighted(ShowsItself):
         samples lack it.
     lost
         Share of the posterior that may be lost without a trace, see `refine`; the error counts it.
+    inherited
+        Doubts that come with the run that was refined, and that it disagrees.
     """
 
     names: tuple[str, ...]
@@ -82,6 +86,7 @@ class Weighted(ShowsItself):
     run: NestedResult | None = field(default=None)
     missed: float = 0.0
     lost: float = 0.0
+    inherited: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("theta", "log_likelihood", "log_weight"):
@@ -106,7 +111,7 @@ class Weighted(ShowsItself):
                 f"{100 * self.lost:.0f} % of the posterior may be lost: too few live points for its parts",
             ),
         )
-        return tuple(words for so, words in told if so)
+        return (*(words for so, words in told if so), *self.inherited)
 
     @property
     def weight(self) -> FloatArray:
@@ -221,7 +226,23 @@ def refine(
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if told.n_eff > 2 * len(evaluate.names):
             known.append(_to_fit(told.theta, told.log_weight, space, rng))
-    return _with_lost(_weigh(best, 0.0, held, space, evaluate, n_draws, rng), lines, space, rng)
+    found = _with_lost(_weigh(best, 0.0, held, space, evaluate, n_draws, rng), lines, space, rng)
+    return replace(found, inherited=_inherited(found, result))
+
+
+def _inherited(found: Weighted, result: Posterior) -> tuple[str, ...]:
+    """Give the doubts of what was refined; and one where it lies further off than the errors allow."""
+    if isinstance(result, Weighted):
+        return result.doubts
+    routes = [("the run", result.log_z, result.log_z_error)]
+    if result.check is not None:
+        routes.append((result.check.route, result.check.log_z, result.check.log_z_error))
+    apart = tuple(
+        f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, the draws {found.log_z:.2f} ± {found.log_z_error:.2f}"
+        for name, log_z, error in routes
+        if not abs(log_z - found.log_z) <= _APART * math.hypot(error, found.log_z_error)
+    )
+    return (*result.warnings, *apart)
 
 
 def update(

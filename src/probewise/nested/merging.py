@@ -12,8 +12,9 @@ from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.nested.check import DISAGREE, weighted_mean
 from probewise.nested.evidence import integrate
-from probewise.nested.result import Agreement, NestedResult, versions
+from probewise.nested.result import Agreement, Check, NestedResult, versions
 
 __all__ = ["agreement_of", "alive_at_death", "merge"]
 
@@ -41,8 +42,10 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     Returns
     -------
     NestedResult
-        With `agreement`: where the runs' evidences lie further apart than their errors allow
-        (p < 0.001) a warning says so and the error is no less than their scatter.
+        With `agreement`, and with `check` where every run has one: what all second routes say together. Where the runs'
+        evidences lie further apart than their errors allow (p < 0.001) a warning says so and the error is no less than
+        their scatter. Where the second routes together disagree with the runs together, as they do where all runs share
+        a bias, a warning says so too.
 
     Raises
     ------
@@ -65,6 +68,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     log_start, log_start_error = _possible_share(parts)
     evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
     agreement = agreement_of(parts)
+    check = _joined_checks(parts, evidence.log_z, evidence.error(remembered))
     p_value = _combined([r.insertion_p_value for r in parts])
     doubts, error = [], evidence.error(remembered)
     if agreement.p_value < _DISAGREE:
@@ -76,6 +80,12 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         error = max(error, agreement.scatter)
     if p_value < _DOUBTFUL_P_VALUE:
         doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
+    if check is not None and abs(check.distance) > DISAGREE:
+        doubts.append(
+            f"{check.route} gives log Z = {check.log_z:.2f} ± {check.log_z_error:.2f}, the runs together "
+            f"{evidence.log_z:.2f} ± {error:.2f}: {abs(check.distance):.1f} errors apart; what biases every run alike "
+            "does not average out; use longer chains"
+        )
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     said = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
@@ -107,6 +117,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         versions=versions(),
         warnings=(*doubts, *said),
         agreement=agreement,
+        check=check,
     )
 
 
@@ -150,6 +161,17 @@ def alive_at_death(
     out = np.empty(2 * n, dtype=np.int64)
     out[order] = alive
     return out[:n]
+
+
+def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
+    """Average what the runs' second routes found, by their errors; None where a run has none."""
+    checks = [r.check for r in parts if r.check is not None]
+    if len(checks) < len(parts):
+        return None
+    mean, mean_error = weighted_mean([c.log_z for c in checks], [c.log_z_error for c in checks])
+    route = checks[0].route if len({c.route for c in checks}) == 1 else "the runs' second routes"
+    distance = (log_z - mean) / max(math.hypot(error, mean_error), 1e-12)
+    return Check(route, mean, mean_error, distance, sum(c.n_calls for c in checks))
 
 
 def _joined_parents(parts: Sequence[NestedResult], order: IntArray) -> IntArray:

@@ -57,8 +57,9 @@ def measure(name: str, n_seeds: int, n_live: int) -> dict[str, Any]:
     first, second = [], []
     for seed in range(n_seeds):
         rng = np.random.default_rng([seed, 24])
-        first.append(run(known, rng=rng, n_live=n_live))
-        second.append(run(repartitioned(known, first[-1].samples(2000, rng=rng)), rng=rng, n_live=n_live))
+        first.append(run(known, rng=rng, n_live=n_live, max_cost=1.0))
+        nearer = repartitioned(known, first[-1].samples(2000, rng=rng))
+        second.append(run(nearer, rng=rng, n_live=n_live, max_cost=1.0))
     return {"problem": name, "first": _summary(known, first), "again": _summary(known, second)}
 
 

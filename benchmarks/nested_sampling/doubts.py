@@ -55,6 +55,7 @@ def one(name: str, seed: int, n_live: int, max_cost: float) -> dict[str, Any]:
         "log_z_error": result.log_z_error,
         "z": (result.log_z - posed.log_z) / math.hypot(result.log_z_error, posed.log_z_error),
         "checked": None if result.check is None else [result.check.log_z, result.check.log_z_error],
+        "n_check": 0 if result.check is None else result.check.n_calls,
         "memory": result.memory,
         "information": result.information,
         "insertion_p_value": result.insertion_p_value,

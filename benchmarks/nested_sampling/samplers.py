@@ -107,7 +107,7 @@ def ours_result(
     # A doubtful run is counted, not shouted about.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        return run(problem, rng=np.random.default_rng(seed), n_live=n_live, move=move)
+        return run(problem, rng=np.random.default_rng(seed), n_live=n_live, move=move, max_cost=1.0)
 
 
 def ours(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:

@@ -93,7 +93,7 @@ def _memory(problem: Counted, n_dead: int, n_live: int) -> dict[str, Any]:
         return f"{n_dead} iterations" if state.n_dead >= n_dead else None
 
     tracemalloc.start()
-    result = run(problem, rng=np.random.default_rng(0), n_live=n_live, stop=stop)
+    result = run(problem, rng=np.random.default_rng(0), n_live=n_live, stop=stop, max_cost=1.0)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     stored = _stored_bytes(result)

@@ -146,9 +146,10 @@ def _second_route(
         weight = np.exp(first.log_weight[first.log_weight > -math.inf])
         log_likelihood = first.log_likelihood[first.log_weight > -math.inf]
         nats = float(weight @ (log_likelihood + near.prior.made_up(theta))) - first.log_z
-        if nats < _GAIN * first.information:
+        if 0 < nats < _GAIN * first.information:
             wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
-            n_live = int(min(max(wanted, least_live, _LEAST_LIVE), max(first.n_live // 2, least_live)))
+            enough = 2.0 * first.n_live * nats / first.information  # for an error below the run's own
+            n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
             return _Route(near, n_live, _longer(move), "a second pass from near the posterior")
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
     return _Route(problem, n_live, _longer(move), "a second run with longer chains")

@@ -146,7 +146,8 @@ def _second_route(
         weight = np.exp(first.log_weight[first.log_weight > -math.inf])
         log_likelihood = first.log_likelihood[first.log_weight > -math.inf]
         nats = float(weight @ (log_likelihood + near.prior.made_up(theta))) - first.log_z
-        if 0 < nats < _GAIN * first.information:
+        # A log Z that is far too great makes them look few, or less than none.
+        if first.information > 0 and nats < _GAIN * first.information:
             wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
             enough = 2.0 * first.n_live * nats / first.information  # for an error below the run's own
             n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))

@@ -76,7 +76,7 @@ def run(
         Likelihood evaluations after which the run ends early with what it has.
     max_cost
         Evaluations in all, in units of those of the search itself; 1: no check. What exceeds 1 goes into a second
-        route to the evidence, mostly a sixth of the search, and where the two disagree into a sharper second
+        route to the evidence, about a fifth of the search, and where the two disagree into a sharper second
         route and a search with chains twice as long. What cannot be cured so is told as a warning.
     checkpoint
         File that the search is saved to as it goes, whole or not at all, in a folder that is made if missing. Where it

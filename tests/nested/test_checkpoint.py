@@ -466,7 +466,7 @@ def test_another_version_of_the_format_is_named(path: Path) -> None:
         quiet(slope(), n_live=30, checkpoint=path)
 
 
-@pytest.mark.parametrize("where", ["missing/run.npz", "file/run.npz", "folder"])
+@pytest.mark.parametrize("where", ["file/run.npz", "folder"])
 def test_a_place_that_cannot_be_written_to_is_found_out_first(where: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
@@ -474,6 +474,13 @@ def test_a_place_that_cannot_be_written_to_is_found_out_first(where: str, tmp_pa
     with pytest.raises(FileError, match="existing, writable folder"):
         quiet(problem, n_live=30, checkpoint=tmp_path / where)
     assert problem.n_calls == 0
+
+
+def test_a_missing_folder_is_made_for_the_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "missing" / "run.npz"
+    whole = quiet(slope(), n_live=30, checkpoint=path)
+    assert path.exists()
+    assert_same(quiet(slope(), n_live=30, checkpoint=path), whole)
 
 
 def test_options_of_a_checkpoint_are_checked_first(path: Path) -> None:

@@ -240,7 +240,7 @@ def test_a_problem_that_cannot_be_sent_is_told_how_to(processes: Executor) -> No
 
 
 def test_n_workers_is_checked() -> None:
-    with pytest.raises(ParameterError, match="n_workers is 0; allowed: 1 or more"):
+    with pytest.raises(ParameterError, match="n_workers is 0; allowed: a whole number, 1 or more"):
         run(problems.plateau(), rng=rng(), n_live=50, executor=AtOnce(), n_workers=0)
 
 

@@ -22,7 +22,7 @@ from probewise.effects.known import Known
 from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.moves import in_scans, sign_of_move
-from probewise.effects.noise import CorrelatedNoise, DriftingNoise, SignalDependentNoise
+from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
 from probewise.effects.noise_law import NoiseRows, draw_readings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
@@ -157,6 +157,7 @@ __all__ = [
     "MissingTooth",
     "NamedEffect",
     "NoiseEffect",
+    "NoisePerRun",
     "NoiseRows",
     "Nonlinearity",
     "OffsetDrift",
@@ -166,6 +167,7 @@ __all__ = [
     "PositionScale",
     "PredictiveMixture",
     "Quantisation",
+    "RandomWalk",
     "Reflection",
     "Saturation",
     "ScanAngleError",

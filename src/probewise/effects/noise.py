@@ -10,12 +10,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import LogHeavyTailed
+from probewise.effects.noise_law import NoiseRows
 from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["CorrelatedNoise", "DriftingNoise", "SignalDependentNoise"]
+__all__ = ["CorrelatedNoise", "DriftingNoise", "NoisePerRun", "RandomWalk", "SignalDependentNoise"]
 
 
 @dataclass(frozen=True)
@@ -123,3 +125,150 @@ class DriftingNoise(NoiseEffect):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how the noise has changed."""
         return f"the noise is {give_or_take(mean[0], sd[0])} times as loud at the end as at the start"
+
+
+@dataclass(frozen=True)
+class RandomWalk(NoiseEffect):
+    """An offset that walks: from each row to the next, over runs too, it gains a normal step.
+
+    `n_before` rows were walked before those of a table that is to be predicted: those that taught the model.
+    """
+
+    n_before: int = 0
+    least: float = 5e-3
+    most: float = 3.0
+
+    name: ClassVar[str] = "random_walk"
+    stage: ClassVar[Stage] = Stage.NOISE
+    units: ClassVar[tuple[str, ...]] = ("noise sd",)
+    covariates: ClassVar[tuple[str, ...]] = ("time", "row", "run")
+    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    n_nodes: ClassVar[int] = 16
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Need no scale: the step is in units of the noise."""
+        return cls()
+
+    @cached_property
+    def prior(self) -> Product:
+        """Sd of a step in sds of the noise, over its orders of magnitude."""
+        return Product({"sd_per_row": LogUniform(self.least, self.most)})
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Set the step; the sd of one reading about the walk stays."""
+        return replace(value, walk=theta[:, :1], walked=self.n_before + 1.0 + np.arange(len(plan)))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say how far it walks."""
+        return f"the offset walks at random, by {give_or_take(mean[0], sd[0])} noise sds from each row to the next"
+
+
+_SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # sds of the logarithm of a run's sd that are believed alike
+_NEWTON_STEPS = 40
+
+
+@dataclass(frozen=True)
+class NoisePerRun(NoiseEffect):
+    """Noise of another sd in each run: sd x value of the run; the logarithms of the values scatter normally about 0.
+
+    Parameters
+    ----------
+    runs
+        Names of the runs.
+    n_rows
+        Readings of each that taught its value; () where that is not asked.
+    """
+
+    runs: tuple[str, ...] = ()
+    n_rows: tuple[int, ...] = ()
+
+    name: ClassVar[str] = "noise_per_run"
+    stage: ClassVar[Stage] = Stage.NOISE
+    covariates: ClassVar[tuple[str, ...]] = ("run",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Take the runs of a recording; None where there is but one."""
+        plan = extent.plan
+        names = tuple(plan.scan_names)
+        return cls(names, tuple(np.bincount(plan.scan, minlength=len(names)).tolist())) if len(names) > 1 else None
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Pure numbers."""
+        return ("1",) * len(self.runs)
+
+    @property
+    def amplitudes(self) -> tuple[int, ...]:
+        """None: at 1 they do nothing."""
+        return ()
+
+    @property
+    def nothing(self) -> dict[int, float]:
+        """All runs alike."""
+        return dict.fromkeys(range(len(self.runs)), 1.0)
+
+    @cached_property
+    def prior(self) -> Product:
+        """The value of each run by itself."""
+        return Product({f"values[{run}]": LogHeavyTailed(0.3) for run in self.runs})
+
+    def bank(self) -> FloatArray:
+        """All runs alike: what differs is found about a fit."""
+        return np.ones((1, 1, len(self.runs)))
+
+    def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
+        """Give for each scatter of the runs the most probable values, and what Laplace makes of those about them."""
+        n_runs = len(self.runs)
+        counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
+        squares = np.bincount(rows.run, residuals**2, minlength=n_runs)
+        if n_runs < 2 or not (squares > 0).any():
+            return np.zeros((0, n_runs)), np.zeros(0)
+        values, log_weights = [], []
+        for spread in _SPREADS:
+            logs = _most_likely_logs(counts, squares, spread)
+            curvature = 2 * counts + spread**-2
+            # The overall sd is integrated elsewhere, at these values: what that misses is that it moves with them.
+            beside = float(np.sum(2 * counts * spread**-2 / curvature)) / float(2 * counts.sum())
+            log_prior = -0.5 * float(np.sum((logs / spread) ** 2)) - n_runs * np.log(spread)
+            log_weights.append(log_prior - 0.5 * float(np.log(curvature).sum() + np.log(beside)))
+            values.append(np.exp(logs))
+        return np.array(values), np.array(log_weights) - np.log(len(_SPREADS))
+
+    def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
+        """Draw each run's value as exactly as its readings tell it."""
+        widths = 1 / np.sqrt(2 * np.maximum(np.array(self.n_rows or (1,) * len(self.runs)), 1))
+        return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
+
+    def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
+        """Scale the noise of each reading by its run; a run of no known value stays as it is."""
+        known = {name: k for k, name in enumerate(self.runs)}
+        at = np.array([known.get(name, len(self.runs)) for name in plan.scan_names])
+        values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
+        return replace(value, sd=value.sd * values[:, at[plan.scan]])
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say which runs are the calmest and the loudest."""
+        low, high = int(np.argmin(mean)), int(np.argmax(mean))
+        return (
+            f"the noise differs from run to run: {give_or_take(mean[high], sd[high])} times its typical sd in run "
+            f"{self.runs[high]}, {give_or_take(mean[low], sd[low])} times in run {self.runs[low]}"
+        )
+
+
+def _most_likely_logs(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
+    """Find the logarithms of the runs' sds, the overall sd at its best: (n_runs,) of readings and sums of squares."""
+    logs = np.zeros(len(counts))
+    for _ in range(_NEWTON_STEPS):
+        weighed = squares * np.exp(-2 * logs)
+        share = weighed * counts.sum() / weighed.sum()  # sums of squares in units of the best overall variance
+        slope = share - counts - logs / spread**2
+        curvature = 2 * share + spread**-2
+        # The overall sd moves along: the Hessian less a product of rank one, inverted by Sherman and Morrison.
+        along, turned = 2 * share / curvature, slope / curvature
+        step = turned - along * float(np.sum(2 * share * turned)) / (-float(2 * share.sum()) + float(2 * share @ along))
+        logs = logs + np.clip(step, -1.0, 1.0)
+        if np.abs(step).max() < 1e-9:
+            break
+    return np.asarray(logs)

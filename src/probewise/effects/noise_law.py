@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,10 +17,14 @@ _NARROW = 1e-3  # of the noise sd: how exactly a lost reading holds its value wh
 
 @dataclass(frozen=True, eq=False)
 class NoiseRows:
-    """What the nodes of an effect on the noise ask of a fit: `predicted` readings (n_points,), and the noise `sd`."""
+    """What the nodes of an effect on the noise ask of a fit, all (n_points,) but the noise `sd`.
+
+    `predicted` readings, and the `run` (number of the scan) of each.
+    """
 
     predicted: FloatArray
     sd: float
+    run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) -> FloatArray:
@@ -35,6 +39,7 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
     predicted
         Noise-free readings, (n_samples, n_points).
     """
+    level = _with_walk(level)
     of_kept = _log_rounded(readings, predicted, level.sd, level.step)
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
         if np.any(level.wide_share):
@@ -48,8 +53,16 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
 
 def variance(level: NoiseLevel) -> FloatArray:
     """Compute the variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
+    level = _with_walk(level)
     wide = 1 + level.wide_share * (level.wide_times**2 - 1)
     return np.asarray(level.sd**2 * wide + level.step**2 / 12)
+
+
+def _with_walk(level: NoiseLevel) -> NoiseLevel:
+    """Take what a random walk may have gained by each row, seen by itself, into the sd."""
+    if not np.any(level.walk):
+        return level
+    return replace(level, sd=level.sd * np.sqrt(1 + level.walk**2 * level.walked), walk=np.zeros((1, 1)))
 
 
 def _log_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
@@ -62,7 +75,7 @@ def _log_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: F
 
 
 def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw readings, (n_samples, n_points): noise with its memory, wide ones, lost ones, then rounding.
+    """Draw readings, (n_samples, n_points): noise with its memory and its walk, wide ones, lost ones, then rounding.
 
     Parameters
     ----------
@@ -82,6 +95,8 @@ def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, r
             noise[:, k] = level.rho[:, 0] * noise[:, k - 1] + fresh * noise[:, k]
     noise = noise * np.where(rng.random(predicted.shape) < level.wide_share, level.wide_times, 1.0)
     readings = predicted + level.sd * noise
+    if np.any(level.walk):
+        readings = readings + level.sd * level.walk * np.cumsum(rng.standard_normal(predicted.shape), axis=1)
     readings = np.where(rng.random(predicted.shape) < level.lost_share, level.lost_value, readings)
     step = np.where(level.step > 0, level.step, 1.0)
     return np.where(level.step > 0, step * np.round(readings / step), readings)

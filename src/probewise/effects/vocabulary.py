@@ -153,6 +153,15 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
         """
         return self.bank()[:, 0, :]
 
+    def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
+        """Lay out nodes about a fit with the log of the prior that each stands for, (n_nodes, n_params), (n_nodes,)."""
+        nodes = self.nodes(residuals, rows)
+        return nodes, np.full(len(nodes), -np.log(max(len(nodes), 1)))
+
+    def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
+        """Draw parameters about nodes drawn, (n_samples, n_params) both; None where nodes lie as close as need be."""
+        return None
+
 
 def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:
     """Write mean ± sd with as many digits as the sd deserves."""

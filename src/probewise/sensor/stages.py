@@ -113,7 +113,8 @@ class View:
 class NoiseLevel:
     """Noise of one reading: `sd` broadcasts to (n_samples, n_points); the rest are (n_samples, 1).
 
-    `rho` is AR(1) within a scan. With the share `wide_share` a reading's noise is `wide_times` as wide;
+    `rho` is AR(1) within a scan. A random walk of the offset gains `walk` sds from row to row, and has taken `walked`
+    (n_points,) steps by each row. With the share `wide_share` a reading's noise is `wide_times` as wide;
     with the share `lost_share` a reading is lost to `lost_value`; what is left is rounded to `step`,
     0 for none. `seen` (n_samples, n_points) is the white fraction that was seen, for what goes with it.
     """
@@ -126,6 +127,8 @@ class NoiseLevel:
     lost_share: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     lost_value: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     step: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    walk: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+    walked: FloatArray = field(default_factory=lambda: np.zeros(1))
 
 
 V = TypeVar("V")

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.effects import EFFECTS, NamedEffect, PredictiveMixture
+from probewise.effects import EFFECTS, NamedEffect, NoisePerRun, PredictiveMixture, RandomWalk
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
@@ -23,7 +23,7 @@ from probewise.systems.fitted import FittedSystem
 from probewise.systems.forms.again import forms_again, own_of_runs
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable
+from probewise.systems.table import RunRecording, RunTable, relative_sd_of
 
 __all__ = ["SystemPrediction", "as_recording", "predict_system", "write_system_prediction"]
 
@@ -77,7 +77,17 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
         raise ParameterError(
             f"reading {simulator.reading!r}", found, "a number in each row, or nothing where it is missing"
         )
-    return RunRecording(cast(Plan, own), np.array(readings), simulator.source)
+    sd = simulator.noise.sd
+    recording = RunRecording(
+        cast(Plan, own), np.array(readings), simulator.source, sd_column=sd if isinstance(sd, str) else ""
+    )
+    if recording.sd_column in table.covariates:
+        values = table.covariates[recording.sd_column]
+        wrong = np.flatnonzero(recording.usable & ~(np.isfinite(values) & (values > 0)))
+        if wrong.size:
+            found = f"{values[wrong[0]]:g} in row {wrong[0] + 2}"
+            raise ParameterError(f'noise["sd"], column {sd!r}', found, "greater than 0 wherever there is a reading")
+    return recording
 
 
 def _is_float(text: str) -> bool:
@@ -188,9 +198,17 @@ def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any
         forms = forms_again(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
     out = []
     for name in fitted.effects:
-        if name not in forms and name not in EFFECTS:
+        if name in forms:
+            out.append(forms[name])
+        elif name == RandomWalk.name:
+            out.append(RandomWalk(n_before=0 if fitted.known is None else len(fitted.known.table)))
+        elif name == NoisePerRun.name:
+            seen = () if fitted.known is None else fitted.known.table.scan_names
+            out.append(NoisePerRun(tuple(dict.fromkeys((*seen, *table.scan_names)))))
+        elif name in EFFECTS:
+            out.append(EFFECTS[name]())
+        else:
             raise ParameterError("effects", name, "an effect that this version can bind again; diagnose anew with it")
-        out.append(forms[name] if name in forms else EFFECTS[name]())
     return cast(list[NamedEffect[Any]], out)
 
 
@@ -213,7 +231,9 @@ def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
         else:
             effect = next(own for own in fitted.effects if own_of_runs(own) and name.startswith(f"{own}."))
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
-            out[:, k] = _of_another_run(known, rng=rng)
+            positive = effect == NoisePerRun.name  # what scatters evenly is then the logarithm
+            drawn = _of_another_run(np.log(known) if positive else known, rng=rng)
+            out[:, k] = np.exp(drawn) if positive else drawn
     return out
 
 
@@ -234,6 +254,11 @@ def _noise_level(
     """Noise of each reading: its sd, then the effects on it."""
     low, high = fitted.level
     seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
+    declared = fitted.simulator.noise.sd
+    if isinstance(declared, str) and fitted.known is not None:
+        values = fitted.known.table.covariates[declared]
+        typical = float(np.median(values[np.isfinite(values) & (values > 0)]))
+        sd = sd * relative_sd_of(table, declared, typical)
     level = NoiseLevel(sd, np.zeros((1, 1)), seen=seen)
     end = chain.system.n_params
     for effect in cast(Sequence[AnyEffect], chain.effects):

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.table import csv_text, number_text, read_table
 
-__all__ = ["RunRecording", "RunTable", "read_run_table", "write_run_table"]
+__all__ = ["RunRecording", "RunTable", "read_run_table", "relative_sd_of", "write_run_table"]
 
 _ONE_RUN = "all"
 
@@ -127,12 +127,32 @@ class RunTable:
 class RunRecording(Recording):
     """A table and its readings, in the place of a plan and its readings: it offers what the diagnosis asks of both."""
 
+    sd_column: str = ""
+    """Column that says how exact each reading is; "": all are alike."""
+
     least_share_of_span: ClassVar[float] = 1e-12
     """Of the span of the readings: what arithmetic leaves of it; a good instrument's noise may be a millionth."""
 
     def _require_plan(self) -> None:
         if not isinstance(self.plan, RunTable):
             raise ParameterError("plan", self.plan, "a RunTable")
+
+    @property
+    def relative_sd(self) -> FloatArray:
+        """Declared sd of each reading relative to the median, (n_points,); 1 where none is declared."""
+        if not self.sd_column:
+            return np.ones(len(self.plan))
+        table = cast(RunTable, self.plan)
+        return relative_sd_of(table, self.sd_column)
+
+
+def relative_sd_of(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
+    """Scale a column of sds by the typical one, its median by default, (n_points,); 1 where there is none."""
+    values = table.covariates.get(column, np.full(len(table), np.nan))
+    there = np.isfinite(values) & (values > 0)
+    if not there.any():
+        return np.ones(len(table))
+    return np.where(there, values, 1.0) / np.where(there, np.median(values[there]) if typical is None else typical, 1.0)
 
 
 def _column(name: str, values: Any) -> NDArray[Any]:

@@ -40,7 +40,7 @@ class Bank:
     columns: FloatArray
     widths: IntArray
     labels: tuple[str, ...]
-    _whitened: dict[tuple[bytes, bytes, bytes], _Whitened] = field(default_factory=dict, repr=False)
+    _whitened: dict[tuple[bytes, ...], _Whitened] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> Bank:

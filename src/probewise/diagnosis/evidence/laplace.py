@@ -58,10 +58,10 @@ class NoiseEvidence:
         """Posterior weight of each node."""
         return np.exp(self.log_z_nodes - logsumexp(self.log_z_nodes))
 
-    def likely_nodes(self, name: str) -> tuple[FloatArray, float]:
+    def likely_nodes(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Give up to four nodes of one effect that hold most, (n_nodes, n_params), and the log weight of each."""
         best = np.argsort(-self.weights)[:4]
-        each = float(self.nodes.log_weights[0]) - math.log(float(self.weights[best].sum()))
+        each = self.nodes.log_weights[best] - math.log(float(self.weights[best].sum()))
         return self.nodes.settings[best][:, self.noise.columns_of(name)], each
 
     @property
@@ -91,7 +91,7 @@ def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
         out[nodes] = _of_normal_laws(found, [every.laws[node] for node in nodes], joined)
-    tailed: dict[tuple[tuple[bytes, bytes, bytes], bool], list[int]] = {}  # by whitening, flat tops apart
+    tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # by whitening, flat tops apart
     for node in sorted({*range(len(out))} - {*normal}):
         law = every.laws[node]
         tailed.setdefault((law.linear, law.flat > 0), []).append(node)
@@ -114,8 +114,11 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
 def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Weigh a fit under laws without a tail, (n_laws,); `joined` are slopes and residual, (n_points, n_params + 1)."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
-    turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
-    if any(law.carry.any() for law in laws):
+    if any(law.walk.size for law in laws):
+        turned = np.stack([law(joined) for law in laws])
+    else:
+        turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
+    if any(law.carry.any() for law in laws) and not any(law.walk.size for law in laws):
         carry = np.stack([law.carry for law in laws])[:, 1:, None]
         turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
     gram = turned.transpose(0, 2, 1) @ turned

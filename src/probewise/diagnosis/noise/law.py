@@ -12,13 +12,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.linalg import cholesky_banded, solve_banded
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.flat import Flat
 from probewise.recordings.plan import Recording
 
-__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white"]
+__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white", "white_of"]
 
 _EM_STEPS = 12
 _LEAST = 1e-150  # of a scale: readings that are all as predicted are no error
@@ -59,6 +60,9 @@ class NoiseLaw:
         What rounding adds, where there is no tail: a uniform part, so many sigma either way; sigma is then known.
     least
         Least sd that a reading has, given those before it; where sigma is known it plays no part.
+    walk
+        What a random walk of the offset gains in variance from the row before to each, over runs too, relative to the
+        overall variance, (n_points,); empty where there is none. Readings that walk carry nothing else.
     """
 
     sd: FloatArray
@@ -70,6 +74,7 @@ class NoiseLaw:
     flat: float = 0.0
     sigma: float = 1.0
     least: float = 0.0
+    walk: FloatArray = field(default_factory=lambda: np.zeros(0))
     kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
     def __post_init__(self) -> None:
@@ -81,9 +86,9 @@ class NoiseLaw:
         return len(self.sd) - int(self.lost.sum())
 
     @property
-    def linear(self) -> tuple[bytes, bytes, bytes]:
+    def linear(self) -> tuple[bytes, ...]:
         """What the whitening depends on: laws of one whitening differ in their tails alone."""
-        return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes()
+        return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes(), self.walk.tobytes()
 
     def alike(self, other: NoiseLaw) -> bool:
         """Tell whether another law is as good as the same."""
@@ -92,6 +97,8 @@ class NoiseLaw:
             and np.array_equal(self.lost, other.lost)
             and np.allclose(self.sd, other.sd, rtol=0.03)
             and np.allclose(self.carry, other.carry, atol=0.03)
+            and self.walk.shape == other.walk.shape
+            and np.allclose(self.walk, other.walk, rtol=0.06)
         )
 
     @property
@@ -101,12 +108,16 @@ class NoiseLaw:
 
     def take(self, rows: BoolArray) -> NoiseLaw:
         """Keep the law of some readings, whole scans of them."""
-        return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows])
+        walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
+        return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows], walk=walk)
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns, shape (n_points,) or (n_points, n_columns); 0 for readings that are lost."""
         flat = columns.ndim == 1
         y = columns[:, None] if flat else columns
+        if self.walk.size:
+            y = self._without_walk(y)
+            return y[:, 0] if flat else y
         y = y * (self.kept / self.sd)[:, None]
         if np.any(self.carry):
             carry = self.carry[1:, None]
@@ -118,9 +129,31 @@ class NoiseLaw:
             y = innovation
         return y[:, 0] if flat else y
 
+    def _without_walk(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns (n_points, n_columns): differences of neighbours correlate with the next alone."""
+        out = np.zeros(columns.shape)
+        kept = ~self.lost
+        steps = np.diff(columns[kept], axis=0, prepend=0.0)
+        out[kept] = solve_banded((1, 0), self._walk_root, steps, check_finite=False)
+        return out
+
+    @cached_property
+    def _walk_root(self) -> FloatArray:
+        """Cholesky root of the covariance of neighbours' differences, its two bands, (2, n_kept)."""
+        kept = ~self.lost
+        variance = self.sd[kept] ** 2
+        gained = np.diff(np.cumsum(self.walk)[kept], prepend=0.0)
+        bands = np.zeros((2, len(variance)))
+        bands[0] = gained + variance
+        bands[0, 1:] += variance[:-1]
+        bands[1, :-1] = -variance[:-1]
+        return np.asarray(cholesky_banded(bands, lower=True))
+
     def log_det(self) -> float:
         """Return half the log determinant of the relative covariance."""
         kept = ~self.lost
+        if self.walk.size:
+            return float(np.log(self._walk_root[0]).sum())
         return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
 
     @cached_property
@@ -136,7 +169,11 @@ class NoiseLaw:
     @cached_property
     def _narrowest(self) -> float:
         """Least sd of a reading given those before it, in units of sigma; 1 where all are lost."""
-        return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost])) if self.n_points else 1.0
+        if not self.n_points:
+            return 1.0
+        if self.walk.size:
+            return float(self._walk_root[0].min())
+        return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost]))
 
     def at_least(self, sigma: float) -> NoiseLaw:
         """Bound sigma from below."""
@@ -290,6 +327,11 @@ def _information(share: float, times: float) -> float:
 def white(n_points: int, *, least: float = 0.0) -> NoiseLaw:
     """Leave readings as they are."""
     return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_), least=least)
+
+
+def white_of(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
+    """Give the usable readings of a recording independent noise, of the relative sds that it declares."""
+    return replace(white(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
 
 
 def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:

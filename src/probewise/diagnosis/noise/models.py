@@ -58,7 +58,7 @@ class NoiseModel:
 
     effects: tuple[NoiseEffect, ...]
     recording: Recording
-    likely: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    likely: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     rounding: float = 0.0
     least_sd: float = 0.0
 
@@ -77,54 +77,53 @@ class NoiseModel:
             at += n_params
         raise KeyError(name)
 
-    def every_third(self) -> dict[str, tuple[FloatArray, float]]:
+    def every_third(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Thin out the nodes of each effect that has more than twelve to a third, for `likely`."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]
             if len(nodes) > _MANY and nodes.shape[1] == 1:
-                out[effect.name] = nodes[1::3], -math.log(len(nodes[1::3]))
+                out[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
         return out
 
     def laws(self, predicted: FloatArray) -> NoiseNodes:
         """Lay out every combination of the effects' nodes about predictions of the usable rows, (n_usable,)."""
-        residuals = self._readings - predicted
+        residuals = (self._readings - predicted) / self._relative_sd
         # Rounded readings can all be as predicted; what rounding alone leaves is not far.
         sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._lattice / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
-        rows = NoiseRows(predicted, sd)
+        rows = NoiseRows(predicted, sd, self.recording.plan.scan[self.recording.usable])
         banks = [self._nodes(effect, residuals / sd, rows) for effect in self.effects]
-        settings, log_weight = np.zeros((1, 0)), 0.0
+        settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for bank, log_each in banks:
             settings = np.concatenate(
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
-            log_weight += log_each
+            log_weights = (log_weights[:, None] + log_each).ravel()
         level = self._level(settings, seen)
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law(level, k, far) for k in range(len(settings)))
         if self.rounding:
             # Sigma is integrated out by nodes, over its logarithm, as it is elsewhere in closed form.
             (law,) = laws
-            halves, log_weights = _beside_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
+            halves, beside = _beside_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
-            return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, log_weights)
-        return NoiseNodes(settings, laws, np.full(len(laws), log_weight))
+            return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
+        return NoiseNodes(settings, laws, log_weights)
 
-    def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, float]:
+    def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
         """Give the nodes of one effect and the log prior weight of each."""
         if effect.name in self.likely:
             return self.likely[effect.name]
-        nodes = effect.nodes(residuals, rows)
-        return nodes, -math.log(max(len(nodes), 1))
+        return effect.weighed_nodes(residuals, rows)
 
     def _level(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
         """Apply the effects with all settings at once, to the usable rows."""
         plan, usable = self.recording.plan, self.recording.usable
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
-        level = NoiseLevel(sd=np.ones((1, len(plan))), rho=np.zeros((1, 1)), seen=everywhere)
+        level = NoiseLevel(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
         at = 0
         for effect in self.effects:
             n_params = len(effect.prior.names)
@@ -144,6 +143,7 @@ class NoiseModel:
         carry = np.where(self._steps > 0, at(level.rho) ** np.maximum(self._steps, 1), 0.0)
         carry[lost] = 0.0
         carry[1:][lost[:-1]] = 0.0
+        walk = at(level.walk) ** 2 * self._rows_on if np.any(level.walk) else np.zeros(0)
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._cell, 1.0)
@@ -151,7 +151,7 @@ class NoiseModel:
             log_extra = n_lost * math.log(lost_share / self._cell)
             log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
-        return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd)
+        return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd, walk=walk)
 
     @cached_property
     def _readings(self) -> FloatArray:
@@ -160,6 +160,15 @@ class NoiseModel:
     @cached_property
     def _steps(self) -> IntArray:
         return steps_within_scans(self.recording)
+
+    @cached_property
+    def _rows_on(self) -> FloatArray:
+        """Rows from the usable one before, over runs too; the first from the table's start."""
+        return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
+
+    @cached_property
+    def _relative_sd(self) -> FloatArray:
+        return self.recording.relative_sd[self.recording.usable]
 
     @cached_property
     def _cell(self) -> float:

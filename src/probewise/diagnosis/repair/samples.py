@@ -223,6 +223,9 @@ def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatA
 def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:
     """Draw one effect's parameters about the nodes drawn, as far as half way to the next: (n_samples, n_params)."""
     settings = noise.nodes.settings[:, noise.noise.columns_of(effect.name)]
+    own = effect.draws_about(settings[nodes], rng=rng)
+    if own is not None:
+        return own
     values, units = settings[nodes], effect.prior.to_unit_cube(settings)
     gaps = np.array([np.diff(np.unique(np.round(column, 9))).min(initial=1.0) for column in units.T])
     spread = np.array([len(np.unique(column)) > 1 for column in settings.T])

@@ -16,12 +16,14 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.constants import NOISE_PAIR_WITHIN
-from probewise.effects import NoiseEffect, Quantisation, lattice_step
+from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, RandomWalk, lattice_step
 from probewise.recordings.plan import Recording
 
 __all__ = ["Noises"]
 
 Names = tuple[str, ...]
+
+_TWO_MEMORIES = {CorrelatedNoise.name, RandomWalk.name}  # one law of the noise carries one of them
 
 
 @dataclass(eq=False)
@@ -50,9 +52,9 @@ class Noises:
         single = [tuple(sorted({*names, *self.certain})) for names in subsets(others, 1)]
         self.models = {names: self._model(names) for names in single}
 
-    def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, float]] | None = None) -> NoiseModel:
+    def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None) -> NoiseModel:
         # What is certain is not asked again about each fit, whose own residual may be larger.
-        known = {name: (np.array([[self._step]]), 0.0) for name in self.certain}
+        known = {name: (np.array([[self._step]]), np.zeros(1)) for name in self.certain}
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
         return NoiseModel(effects, self.recording, {**known, **(likely or {})}, rounding, self.least_sd)
@@ -85,7 +87,7 @@ class Noises:
         best = max(e.log_z + self.log_prior(names) for names, e in evidence.items())
         for other in single:
             both = tuple(sorted({*first, *other}))
-            if other == first:
+            if other == first or set(both) >= _TWO_MEMORIES:
                 continue
             model = self._model(both, likely | self.models[other].every_third())
             value = weigh(found, model).log_z

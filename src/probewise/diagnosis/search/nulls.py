@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.fitting.ssf_forms import Start
-from probewise.diagnosis.noise.law import NoiseLaw, white
+from probewise.diagnosis.noise.law import NoiseLaw, white_of
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.constants import STEERING
 from probewise.diagnosis.search.state import SearchState
@@ -21,7 +21,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     """
     noises, refits, null = state.noises, state.refits, prepared.null
     recording = prepared.recording
-    plan, law = recording.plan, white(len(prepared.usable), least=noises.least_sd)
+    plan, law = recording.plan, white_of(recording, least=noises.least_sd)
 
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 

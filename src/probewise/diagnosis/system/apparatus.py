@@ -22,8 +22,10 @@ from probewise.effects import (
     Dropouts,
     Extent,
     NamedEffect,
+    NoisePerRun,
     Outliers,
     Quantisation,
+    RandomWalk,
     SignalDependentNoise,
 )
 from probewise.recordings.plan import Plan, Recording
@@ -36,6 +38,8 @@ __all__ = ["ON_NOISE", "PersonsSystem"]
 ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     SignalDependentNoise,
     CorrelatedNoise,
+    RandomWalk,
+    NoisePerRun,
     Outliers,
     Dropouts,
     Quantisation,

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.engine import Thorough, diagnose_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_of
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import PersonsSystem
@@ -154,7 +154,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
     _require_rising_time(table)
     whole = as_recording(simulator, table)
-    own, readings = whole.plan, whole.readings
+    readings = whole.readings
     usable = np.flatnonzero(whole.usable)
     if len(usable) <= _MOST_COMPARED:
         return whole
@@ -162,7 +162,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     kept = np.full(len(readings), np.nan)
     chosen = usable[np.arange(len(usable)) % every < stretch]
     kept[chosen] = readings[chosen]
-    return RunRecording(own, kept, simulator.source)
+    return replace(whole, readings=kept)
 
 
 def _require_rising_time(table: RunTable) -> None:
@@ -187,7 +187,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     neighbouring readings show.
     """
     table = cast(RunTable, recording.plan)
-    law = white(int(recording.usable.sum()))
+    law = white_of(recording)
     found = min((fit(Model(system, (), recording.plan), recording, z, law) for z in system.starts), key=_height)
     sd = _sd(system.simulator, table, recording, found)
     for _ in range(4):

@@ -26,7 +26,7 @@ from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.fitted import fitted_system
+from probewise.diagnosis.system.fitted import bound_about, fitted_system
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
@@ -153,8 +153,9 @@ def fit_simulator(
         samples, evidence = _by_nested_sampling(prepared, null, noise, samples, evidence, rng=rng, progress=progress)
     recording, system = prepared.recording, cast(PersonsSystem, prepared.apparatus).system
     predicted = samples.chain.predict(samples.theta, recording.plan)
-    sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2))
-    fitted = fitted_system(system, samples, recording, predicted.mean(axis=0))
+    sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
+    known = bound_about(cast(PersonsSystem, prepared.apparatus).about, samples)
+    fitted = fitted_system(system, samples, recording, predicted.mean(axis=0), known=known)
     return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
 
 

@@ -13,9 +13,10 @@ from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, System, write_run_table
+from probewise.systems.forms import About
 from probewise.systems.forms.again import Recorded, recorded
 
-__all__ = ["calibrated_of", "fitted_system", "repaired_of"]
+__all__ = ["bound_about", "calibrated_of", "fitted_system", "repaired_of"]
 
 
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
@@ -40,8 +41,13 @@ def _fitted(diagnosis: Diagnosis, model: ModelSamples) -> FittedSystem:
         raise TypeError("a light sensor's models are written as sensor.json; a simulator's alone as system/1")
     before = diagnosis.repair.before.readings
     return fitted_system(
-        apparatus.system, model, diagnosis.recording, before, known=recorded(apparatus.about) if model.effects else None
+        apparatus.system, model, diagnosis.recording, before, known=bound_about(apparatus.about, model)
     )
+
+
+def bound_about(about: About, model: ModelSamples) -> Recorded | None:
+    """Give what a model needs of the recording: what its effects were bound about, and how exact readings were."""
+    return recorded(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
 
 
 def fitted_system(

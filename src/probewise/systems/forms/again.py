@@ -21,7 +21,7 @@ from probewise.systems.table import RunTable
 
 __all__ = ["Recorded", "forms_again", "own_of_runs", "recorded"]
 
-_OWN_OF_RUNS = ("offset_per_run", "gain_per_run", "differs")
+_OWN_OF_RUNS = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,9 @@ class HeldOut:
 def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOut:
     """Refit both models without one part at a time and compare how they predict it, reading by reading.
 
-    Each reading counts by itself, as the law of the noise has it. Parts of fewer than eight readings stay in.
+    Each reading counts by itself, as the law of the noise has it; where the part has parameters of its own, of which
+    the others tell nothing, its readings count one after the other, each predicted with the help of those before it.
+    Parts of fewer than eight readings stay in.
     """
     plan, usable = recording.plan, recording.usable
     parts, names = held_out
@@ -100,18 +102,48 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     rest, own = law.take(~out), law.take(out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     asked = np.flatnonzero(rows & recording.usable)
-    predicted, slopes = (part[asked] for part in found.model.jacobian(without.z))
     turned = rest(without.slopes)
+    of_its_own = ~np.any(turned, axis=0) & np.any(found.slopes[out], axis=0)
+    # What the part alone tells is linearised where all readings together have it: its prior may be wide.
+    about = np.where(of_its_own, found.z, without.z)
+    predicted, slopes = (part[asked] for part in found.model.jacobian(about))
     free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
     sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_points / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
-    spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     miss = recording.readings[asked] - predicted
+    if of_its_own.any():
+        return _one_after_another(own, miss, slopes, without.z - about, np.linalg.inv(curvature), sigma_2)
+    spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     narrow, wide = (
         _log_normal(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
         for times, share in ((law.widening, 1 - law.share), (law.times, law.share))
     )
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
+
+
+def _one_after_another(
+    law: NoiseLaw, miss: FloatArray, slopes: FloatArray, mean: FloatArray, covariance: FloatArray, sigma_2: float
+) -> FloatArray:
+    """Log density of each reading given those before it, (n,): `mean` and `covariance` of the coordinates are updated.
+
+    Whitened readings are independent, given the coordinates; a constant of the whitening, the same for every model of
+    the mean, is left out.
+    """
+    innovations, turned = law(miss), law(slopes)
+    mean, covariance, out = mean.copy(), covariance.copy(), np.zeros(len(miss))
+    noise_2 = sigma_2 * (law.widening**2 if law.flat else 1.0)
+    for k in np.flatnonzero(law.kept):
+        row = turned[k]
+        gain = covariance @ row
+        left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
+        parts = np.array([noise_2 + spread, noise_2 * law.times**2 + spread])
+        shares = np.array([1 - law.share, law.share])
+        density = _log_normal(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
+        out[k] = np.logaddexp(*density)
+        variance = float(np.exp(density - out[k]) @ parts)  # as wide as this reading most probably is
+        mean += gain * left / variance
+        covariance -= np.outer(gain, gain) / variance
+    return out
 
 
 def _log_normal(miss: FloatArray, variance: FloatArray) -> FloatArray:

@@ -236,6 +236,8 @@ def _recorded(
     """Add noise, round as printed, and choose what the owner knows of it."""
     kind = drawn.kind
     name = OTHER_NOISE[before % len(OTHER_NOISE)] if stratum.other_noise else "white"
+    if name == "noise_per_run" and kind.run is None:
+        name = "correlated_noise"  # the table names no runs
     noise = noise_of(name, 12.0, noise_free[drawn.kept], drawn.seen, kind.sd, rng=rng)
     readings = noise.draw(noise_free, drawn.rows, rng)
     knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))

@@ -6,7 +6,7 @@ falls between two rows, that way is gone again, one sample and one run at a time
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -28,6 +28,7 @@ _LOOKS = np.array([0.25, 0.5, 0.75, 1.0])  # of the way between two rows: has so
 _REST = 1e-9  # of a state that friction acts on: below it is at rest
 _MOST_CALLS = 600  # of a law between two rows: twelve are a step
 _MOST_EVENTS = 200  # between two rows
+_CLOSE = 1e-7  # of the way between two rows
 
 
 def travel(
@@ -198,7 +199,7 @@ class _Trip:
 
         edges, begun = self.breaks(k), s
         again = np.zeros(s.shape[1:], dtype=bool)
-        for low, high in pairwise(edges):
+        for low, high in _apart(edges):
             # A hair inside: what jumps at an end belongs to the other side of it.
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
@@ -293,7 +294,7 @@ class _Trip:
             return {name: float(np.ravel(v)[0]) for name, v in found.items()}
 
         edges = self.breaks(k)
-        for low, high in pairwise(edges):
+        for low, high in _apart(edges):
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):
                 rates = free(share, s)
@@ -332,6 +333,11 @@ class _Trip:
             else:
                 raise NotConvergedError(f"the law of the {self.kind.name} sticks and slips without end")
         return s
+
+
+def _apart(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
+    """Pair neighbours, but for those so close that nothing happens between them."""
+    return ((low, high) for low, high in pairwise(edges) if high - low > _CLOSE)
 
 
 def _mode(form: Form, size: Any, value: Any, rate: Any) -> Any:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError
 from probewise.world.systems.kind import Kind
 from probewise.world.systems.rows import SystemRows
 
@@ -69,4 +70,6 @@ class Scene:
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw a number whose logarithm is uniform."""
+    if not 0 < low < high:
+        raise NotConvergedError(f"nothing lies between {low:g} and {high:g}: too few rows")
     return math.exp(rng.uniform(math.log(low), math.log(high)))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from probewise.effects import AGAIN
 from probewise.systems.forms.about import About
+from probewise.systems.forms.extras import forms_of_extras
 from probewise.systems.forms.form import Form
 from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
 from probewise.systems.forms.parameters import forms_on_parameters
@@ -17,6 +18,7 @@ __all__ = ["About", "Form", "driving_columns", "forms_of"]
 
 def forms_of(about: About) -> dict[str, Form]:
     """Bind every form that this table could show, by name."""
-    found = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
+    named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
+    found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
     return {form.name: form for form in [*found, *waves]}

@@ -78,7 +78,7 @@ FILTER = Kind(
     text="""# Two RC stages behind each other, with a buffer between them.
 reading, unit = "out_v", "V"
 time, run = "t_s", "burst"
-parameters = {"gain": ("normal", 1.0, 0.1), "tau1_s": ("log", 0.0005, 0.1), "tau2_s": ("log", 0.0005, 0.1)}
+parameters = {"gain": ("normal", 1.0, 0.1), "tau1_s": ("log", 0.0005, 0.008), "tau2_s": ("log", 0.008, 0.1)}
 {noise}
 states = {"first": 0.0, "second": 0.0}
 
@@ -91,8 +91,9 @@ def observe(s, p, u):
 """,
     priors={
         "gain": Prior("normal", 1.0, 0.1),
-        "tau1_s": Prior("log", 0.0005, 0.1),
-        "tau2_s": Prior("log", 0.0005, 0.1),
+        # Swapped, the two stages do the same: their owner knows which is the fast one.
+        "tau1_s": Prior("log", 0.0005, 0.008),
+        "tau2_s": Prior("log", 0.008, 0.1),
     },
     draw=lambda rng: {
         "gain": float(rng.normal(1.0, 0.03)),

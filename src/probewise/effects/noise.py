@@ -157,7 +157,9 @@ class RandomWalk(NoiseEffect):
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
         """Set the step; the sd of one reading about the walk stays."""
-        return replace(value, walk=theta[:, :1], walked=self.n_before + 1.0 + np.arange(len(plan)))
+        return replace(
+            value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
+        )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far it walks."""
@@ -222,7 +224,7 @@ class NoisePerRun(NoiseEffect):
         """Give for each scatter of the runs the most probable values, and what Laplace makes of those about them."""
         n_runs = len(self.runs)
         counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
-        squares = np.bincount(rows.run, residuals**2, minlength=n_runs)
+        squares: FloatArray = np.bincount(rows.run, residuals**2, minlength=n_runs).astype(np.float64)
         if n_runs < 2 or not (squares > 0).any():
             return np.zeros((0, n_runs)), np.zeros(0)
         values, log_weights = [], []

@@ -112,7 +112,9 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
     miss = recording.readings[asked] - predicted
     if of_its_own.any():
-        return _one_after_another(own, miss, slopes, without.z - about, np.linalg.inv(curvature), sigma_2)
+        return _one_after_another(
+            own, miss, slopes, without.z - about, np.asarray(np.linalg.inv(curvature), dtype=np.float64), sigma_2
+        )
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     narrow, wide = (
         _log_normal(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))

@@ -151,7 +151,9 @@ class NoiseModel:
             log_extra = n_lost * math.log(lost_share / self._cell)
             log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
-        return NoiseLaw(sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd, walk=walk)
+        return NoiseLaw(
+            sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd, walk=walk
+        )
 
     @cached_property
     def _readings(self) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -81,9 +80,10 @@ class Refits:
         weights = templates.weights(scores)
         # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
         plain = self._plainly(parent, problem)
-        likeliest = (int(np.argmax(templates.weights(scores_about(about)))) for about in plain)
+        seen = [(problem, scores), *((about, scores_about(about)) for about in plain)]
+        likeliest = (int(np.argmax(templates.weights(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_worth_trying(templates, weights), *likeliest]))
-        refitted = [self._of_variant(parent, effect, templates, scores, k, [problem, *plain]) for k in tried]
+        refitted = [self._of_variant(parent, effect, templates, k, seen) for k in tried]
         # What refits have shown of variants counts for more than what screening promised.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
@@ -106,16 +106,16 @@ class Refits:
         parent: WeighedFit,
         effect: NamedEffect[Any],
         templates: EffectTemplates,
-        scores: FloatArray,
         variant: int,
-        problems: Sequence[Linearised],
+        seen: Sequence[tuple[Linearised, FloatArray]],
     ) -> WeighedFit:
-        """Refit with one variant of one more effect, from the best entries of its bank."""
+        """Refit with one variant of one more effect, from the entries of its bank that score best under each law."""
         own = np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
-        ranked = own[np.argsort(-scores[own])]
+        ranked = [(about, scores, own[np.argsort(-scores[own])]) for about, scores in seen]
+        chosen = [(about, at) for about, scores, best in ranked for at in best[: 2 if scores[best[0]] > 5 else 1]]
         starts = []
-        for about, at in itertools.product(problems, ranked[: 2 if scores[ranked[0]] > 5 else 1]):
+        for about, at in chosen:
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
             setting = effect.start(templates.settings[at], amount)
@@ -124,7 +124,7 @@ class Refits:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # A null with several basins: with the effect the best may be another one than without.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        return self.weighed(model, np.stack(starts), problems[0].law)
+        return self.weighed(model, np.stack(starts), seen[0][0].law)
 
     def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
         """Lay a fit out under the plainest law of the noise, where that is another one."""

@@ -7,6 +7,7 @@ Laplace weighs.
 
 from __future__ import annotations
 
+import math
 from typing import cast
 
 import numpy as np
@@ -133,4 +134,5 @@ def _unknown(state: SearchState, prepared: Prepared) -> Unknown:
         tuple(covariates),
         state.noises,
         lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
+        lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
     )

@@ -18,6 +18,7 @@ from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.refits import Refits, is_significant
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import NamedEffect
+from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
 __all__ = ["SearchState", "rivals_of"]
@@ -120,8 +121,14 @@ class SearchState:
         The best candidate of that kind, an earlier one perhaps; None where there is none.
         """
         against = 0.0 if parent.names else self.complexity_penalty(parent.degrees_of_freedom)
-        candidate, scores = self.refits.extended(parent, self.effects[added], against)
         self.extended.add((parent, added))
+        try:
+            candidate, scores = self.refits.extended(parent, self.effects[added], against)
+        except NotConvergedError:  # from every start its model runs away
+            names = tuple(sorted((*parent.names, added)))
+            self.about_parts |= {(names, noise): e.log_z - against for noise, e in parent.evidence.items()}
+            self.undetected.add(names)
+            return None
         known = self.candidates.get((candidate.n_gaussians, candidate.names), candidate)
         if is_significant(candidate, parent):
             return self.keep(max(known, candidate, key=lambda c: c.log_z))

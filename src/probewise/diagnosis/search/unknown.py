@@ -37,12 +37,15 @@ class Unknown:
         The noise models.
     complexity_penalty
         The nats against it beside an SSF worth so many Gaussians.
+    n_choices
+        Log of how many more combinations there are of as many names as these than of one.
     """
 
     bases: Bank
     covariates: tuple[Covariate, ...]
     noises: Noises
     complexity_penalty: Callable[[int], float]
+    n_choices: Callable[[Names], float]
     log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
     """Log evidence by (order, mean, noise)."""
     shares: dict[str, float] = field(default_factory=dict)
@@ -69,22 +72,28 @@ class Unknown:
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
     def prune(self, candidates: Collection[WeighedFit]) -> None:
-        """Leave it out by itself where one name explains as much, and leaves nothing for it to explain.
+        """Leave it out by itself where a name, or two, explain as much, and leave nothing for it to explain.
 
-        A basis of many columns, what differs from scan to scan say, holds the traces of named effects too.
+        A basis of many columns, what differs from scan to scan say, holds the traces of named effects too. Two names
+        are chosen from many more combinations than one is: they have to explain as much more as that makes by chance.
         """
         alone = max((self._beside(c) for c in candidates if not c.names), default=-np.inf)
-        believed = {c: self._believed(c) for c in candidates if len(c.names) == 1 and not out_of_vocabulary(c.names)}
+        believed = {
+            c: self._believed(c) for c in candidates if 1 <= len(c.names) <= 2 and not out_of_vocabulary(c.names)
+        }
         for candidate in sorted(believed, key=lambda c: -believed[c]):
             if believed[candidate] < alone - ALIASED_NATS:
                 break
             if self._beside(candidate) == -np.inf:
                 self.weigh([candidate])
-            if self._beside(candidate) - believed[candidate] < ALIASED_NATS:
+            if self._beside(candidate) - self._evidence(candidate) < ALIASED_NATS:
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1]}
                 break
 
     def _believed(self, candidate: WeighedFit) -> float:
+        return self._evidence(candidate) - self.n_choices(candidate.names)
+
+    def _evidence(self, candidate: WeighedFit) -> float:
         return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
 
     def _beside(self, candidate: WeighedFit) -> float:

@@ -285,22 +285,33 @@ def _ceiling(about: About) -> Iterator[Form]:
     readings = about.table.columns[about.system.simulator.reading]
     least, most = (float(end(readings[np.isfinite(readings)])) for end in (np.min, np.max))
 
-    def capped(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return np.minimum(value, theta[:, :1])
+    # Readings that are cut off end where they are: what ends in their upper half is a ceiling, in the lower a floor.
+    middle = 0.5 * (least + most)
 
-    top, span = max(high, most), max(high, most) - min(low, least)
-    levels = top - span * np.geomspace(0.005, 0.9, 16)
+    def cut(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        level = theta[:, :1]
+        return np.where(level > middle, np.minimum(value, level), np.maximum(value, level))
+
+    top, bottom = max(high, most), min(low, least)
+    span = top - bottom
+    depths = np.geomspace(0.005, 0.9, 16)
+    ceilings, floors = top - span * depths, bottom + span * depths
+    levels = np.concatenate([ceilings[ceilings > middle], floors[floors < middle]])
+    if not levels.size:
+        return
     unit, reading = about.unit, about.system.simulator.reading
     yield Form(
         "saturation",
         Stage.SATURATION,
-        {"level": Uniform(float(levels[-1]), float(top + 0.02 * span))},
+        {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
         (unit,),
         ("level",),
-        capped,
+        cut,
         levels[:, None, None],
         (),
-        lambda mean, sd: f"{reading} stops at {with_unit(mean[0], sd[0], unit)}",
+        lambda mean, sd: (
+            f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than {with_unit(mean[0], sd[0], unit)}"
+        ),
         absent={0: float(top + 1e3 * span)},
     )
 

@@ -62,6 +62,10 @@ class Apparatus(Protocol):
         """Name the effects that a person added: named to be tried, however far they lead from the null."""
         ...
 
+    def refits_are_over(self) -> bool:
+        """Tell whether no further combination can be refitted, since predictions are dear and enough were made."""
+        ...
+
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Give the prior odds of these effects, of something unknown, and of their absence."""
         ...

@@ -18,6 +18,9 @@ from probewise.systems.simulator import Simulate
 
 __all__ = ["Caller", "CountedCalls", "Tally"]
 
+MOST_CALLS = 20_000
+"""Of a `simulate` that takes one sample at a time, in a diagnosis."""
+
 _N_NODES = 5  # values at which a parameter that cannot vary by row is held, to interpolate between
 _MOST_REMEMBERED = 2_000_000  # numbers of earlier calls that are kept
 _SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
@@ -42,6 +45,8 @@ class Caller:
         Whether it takes parameters (n_samples, 1) and columns (n_points,) together.
     by_row
         Parameters that it takes as arrays (n_points,) when called for one sample; ignored where it broadcasts.
+
+    `cut_short` is set where something was left undone because there had been too many calls.
     """
 
     simulate: Simulate
@@ -50,6 +55,7 @@ class Caller:
     n_calls: int = 0
     n_failed: int = 0
     interpolated: set[str] = field(default_factory=set)
+    cut_short: bool = False
     on_call: Callable[[], None] = lambda: None
     _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
 
@@ -187,7 +193,8 @@ class CountedCalls:
 
     def _again(self) -> None:
         stage, done, total, note = self._now
-        calls = f"{self._caller.n_calls:,} calls of simulate"
+        most = "" if self._caller.broadcasts else f" of at most {MOST_CALLS:,}"
+        calls = f"{self._caller.n_calls:,}{most} calls of simulate"
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
 

@@ -65,6 +65,10 @@ class LightSensor:
         """Name the effects that are not this library's."""
         return frozenset(effects.keys() - EFFECTS)
 
+    def refits_are_over(self) -> bool:
+        """Never: predictions cost nothing but time here."""
+        return False
+
     def null_forms(self, recording: Recording) -> SsfForms:
         """Give the forms of its SSF."""
         return SsfForms(Extent.of(recording))

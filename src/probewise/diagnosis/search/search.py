@@ -77,7 +77,7 @@ def search(
     templates = TemplateMemory(prepared.usable)
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
     refits, own = Refits(prepared.null, noises, templates), prepared.apparatus.own_effects(on_mean)
-    state = SearchState(on_mean, prior, noises, templates, refits, own, progress)
+    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, prepared.apparatus.refits_are_over)
     fit_nulls(state, prepared, max_order=max_order)
     unknown = _unknown(state, prepared)
     screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,6 +46,8 @@ class SearchState:
         Effects that are refitted alone whatever screening says of them.
     progress
         Told how far the search is.
+    is_over
+        Whether no further combination can be refitted.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
@@ -55,6 +57,7 @@ class SearchState:
     refits: Refits
     tried_always: frozenset[str] = frozenset()
     progress: Progress = silent
+    is_over: Callable[[], bool] = lambda: False
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)
     """By SSF order."""
@@ -121,6 +124,8 @@ class SearchState:
         The best candidate of that kind, an earlier one perhaps; None where there is none.
         """
         against = 0.0 if parent.names else self.complexity_penalty(parent.degrees_of_freedom)
+        if self.is_over():
+            return max(self.of(tuple(sorted((*parent.names, added)))), key=lambda c: c.log_z, default=None)
         self.extended.add((parent, added))
         try:
             candidate, scores = self.refits.extended(parent, self.effects[added], against)

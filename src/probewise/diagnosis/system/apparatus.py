@@ -45,6 +45,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     Quantisation,
     DriftingNoise,
 )
+CALLS_OF_A_SEARCH = 16_000  # what judging and sampling ask beyond it stays within the 20,000 that a diagnosis may
 _N_BLOCKS = 5
 
 
@@ -92,6 +93,14 @@ class PersonsSystem:
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Name the extra effects of a person's file."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
+
+    def refits_are_over(self) -> bool:
+        """Tell whether `simulate`, called for one sample after the other, has been called often enough."""
+        caller = self.system.caller
+        if caller is None or caller.broadcasts or caller.n_calls < CALLS_OF_A_SEARCH:
+            return False
+        caller.cut_short = True
+        return True
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Share the odds out over these effects."""

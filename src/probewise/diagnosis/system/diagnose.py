@@ -14,7 +14,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.noise.law import white_of
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
@@ -134,6 +134,11 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     if caller is None:
         return (f"rates raised an error for {n_failed:,} parameters tried: taken to be impossible",) if n_failed else ()
     out = []
+    if caller.cut_short:
+        out.append(
+            f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls no further combination of effects "
+            "was fitted; one that takes arrays is searched in full"
+        )
     if caller.n_failed:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameters tried: taken to be impossible")
     if caller.interpolated:

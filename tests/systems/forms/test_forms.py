@@ -1,0 +1,143 @@
+"""Forms of the vocabulary: each does what its name says, by a route of its own."""
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
+from probewise.systems.forms import About, forms_of
+
+SD = 0.01
+N_ROWS = 60
+_T = np.tile(np.linspace(0.0, 6.0, N_ROWS // 2), 2)
+TABLE = RunTable(
+    {
+        "t_s": _T,
+        "run": np.repeat([1.0, 2.0], N_ROWS // 2),
+        "drive": np.sin(_T) + 0.3 * np.sin(3.1 * _T),
+        "room_c": np.random.default_rng(1).normal(20, 2, N_ROWS),
+        "y": np.zeros(N_ROWS),
+    },
+    time="t_s",
+    run="run",
+)
+
+
+def _simulator(**more):
+    return Simulator(
+        reading="y",
+        unit="V",
+        parameters={"offset": (-5, 5), "gain": (0, 4)},
+        simulate=lambda p, u: p["offset"] + p["gain"] * u["drive"],
+        time="t_s",
+        run="run",
+        noise=Noise(sd=SD),
+        **more,
+    )
+
+
+def _about(simulator):
+    system = System.of(simulator, TABLE)
+    return About(system, TABLE, np.zeros(system.n_params), SD)
+
+
+ABOUT = _about(_simulator())
+FORMS = forms_of(ABOUT)
+NOTHING = ABOUT.predicted
+
+
+def _read(name, *setting, about=ABOUT, forms=FORMS):
+    theta = np.concatenate([about.theta[0], setting])[None, :]
+    return about.system.chain(TABLE, [forms[name]]).predict(theta, TABLE)[0]
+
+
+def test_every_name_of_the_contract_that_this_table_can_show_is_bound():
+    own = {name.split(":")[0] for name in FORMS}
+    reading = {"offset_drift", "offset_step", "offset_per_run", "gain_drift", "gain_step", "gain_per_run", "lag"}
+    reading |= {"nonlinearity", "saturation", "hysteresis", "delay", "settling", "interference", "sensitivity"}
+    inputs = {"input_offset", "input_gain", "input_delay", "input_saturation", "dead_zone", "periodic_error"}
+    assert reading | inputs | {"backlash", "drifts", "steps", "differs", "depends"} <= own
+
+
+@pytest.mark.parametrize("name", sorted(name for name, form in FORMS.items() if form.nothing))
+def test_a_form_at_nothing_changes_nothing(name):
+    form = FORMS[name]
+    setting = form.bank()[0, 0].copy()
+    for k, value in form.nothing.items():
+        setting[k] = value
+    np.testing.assert_allclose(_read(name, *setting), NOTHING, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(FORMS))
+def test_settings_of_a_bank_lie_within_the_prior_and_some_can_be_seen(name):
+    form = FORMS[name]
+    bank = form.bank().reshape(-1, form.bank().shape[-1])
+    assert np.isfinite(form.prior.log_prob(bank)).any()
+    change = max(np.sqrt(np.mean((_read(name, *setting) - NOTHING) ** 2)) for setting in bank[:: max(len(bank) // 8, 1)])
+    assert change > 0.01 * SD
+
+
+@pytest.mark.parametrize(("level", "cut"), [(0.9, np.minimum), (-0.9, np.maximum)])
+def test_saturation_is_a_ceiling_above_the_middle_of_the_readings_and_a_floor_below(level, cut):
+    np.testing.assert_allclose(_read("saturation", level), cut(NOTHING, level))
+
+
+def test_a_gain_counts_from_the_reading_of_nothing():
+    about = _about(Simulator(
+        reading="y", unit="V", parameters={"gain": (0, 4)}, simulate=lambda p, u: 1.0 + p["gain"] * u["drive"],
+        time="t_s", run="run", noise=Noise(sd=SD, zero=1.0),
+    ))  # fmt: skip
+    found = _read("gain_drift", 0.1, about=about, forms=forms_of(about))
+    np.testing.assert_allclose(found, 1.0 + (about.predicted - 1.0) * (1 + 0.1 * _T))
+
+
+def test_an_input_delay_looks_the_column_up_as_it_was():
+    """Closed form: a column on straight lines between rows, 0.4 s earlier, as at the start before it."""
+    expected = NOTHING.copy()
+    half = N_ROWS // 2
+    for rows in (slice(0, half), slice(half, N_ROWS)):
+        drive = np.interp(_T[rows] - 0.4, _T[rows], TABLE.columns["drive"][rows])
+        expected[rows] = ABOUT.theta[0, 0] + ABOUT.theta[0, 1] * drive
+    np.testing.assert_allclose(_read("input_delay:drive", 0.4), expected, atol=1e-12)
+
+
+def test_a_lag_goes_towards_what_it_should_read():
+    """Route two: exp(-dt/tau) row by row, anew in each run."""
+    expected = NOTHING.copy()
+    for k in range(1, N_ROWS):
+        gap = _T[k] - _T[k - 1]
+        if gap > 0:
+            expected[k] = NOTHING[k] + (expected[k - 1] - NOTHING[k]) * np.exp(-gap / 0.5)
+    np.testing.assert_allclose(_read("lag", 0.5), expected, atol=1e-12)
+
+
+def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"gain": (0, 4)},
+        simulate=lambda p, u: p["gain"] * u["drive"] * (1 + p["bend"] * u["drive"]),
+        time="t_s", run="run", noise=Noise(sd=SD),
+        extra={"bend": Extra(_simulator().parameters["gain"], 0.0, "the amplifier bends by {value} per V")},
+    )  # fmt: skip
+    about = _about(simulator)
+    form = forms_of(about)["bend"]
+    expected = about.theta[0, 0] * TABLE.columns["drive"] * (1 + 0.25 * TABLE.columns["drive"])
+    np.testing.assert_allclose(_read("bend", 0.25, about=about, forms={"bend": form}), expected)
+    np.testing.assert_allclose(_read("bend", 0.0, about=about, forms={"bend": form}), about.predicted)
+    assert form.sentence(np.array([0.25]), np.array([0.01])) == "the amplifier bends by 0.250 ± 0.010 per V"
+
+
+def test_forms_of_a_rate_add_to_the_law():
+    """Closed form: x' = b - a x from x = 0 goes as (b / a) (1 - exp(-a t))."""
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"rate": (0.0, 2.0)},
+        law=Law({"x": 0.0}, lambda s, p, u: {"x": p["rate"] + 0 * s["x"]}, max_step_s=0.02),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    about = _about(simulator)
+    forms = forms_of(about)
+    found = _read("damping:x", 0.7, about=about, forms=forms)
+    rate = 2.0 * ndtr(0.0)
+    np.testing.assert_allclose(found, rate / 0.7 * (1 - np.exp(-0.7 * _T)), atol=1e-6)
+    capped = _read("limit:x", 2.5, about=about, forms=forms)
+    np.testing.assert_allclose(capped, np.minimum(rate * _T, 2.5), atol=1e-6)
+    assert {"drag:x", "friction:x", "forcing:x", "periodic_forcing:x", "cubic:x:x", "quadratic:x:x"} <= forms.keys()

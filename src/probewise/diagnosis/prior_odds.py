@@ -37,7 +37,7 @@ class PriorOdds:
     by_size: tuple[float, ...] = (0.33, 0.0095, 0.0005)
     unknown_beside: float = 0.01
     white: float = 0.94
-    noise_by_size: tuple[float, ...] = (0.057, 0.003)
+    noise_by_size: tuple[float, ...] = (0.057, 0.0028, 0.0002)
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
 

@@ -93,6 +93,11 @@ class NamedEffect(Effect[V], Protocol[V]):
         ...
 
     @property
+    def n_peaks(self) -> int:
+        """Number of settings apart from each other, all in the prior, that do the same; a fit finds one of them."""
+        return 1
+
+    @property
     def scans(self) -> tuple[str, ...]:
         """Names of the scans that it is bound to; () where it acts in all."""
         return ()

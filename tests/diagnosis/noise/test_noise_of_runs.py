@@ -42,7 +42,10 @@ def test_draws_of_a_walk_scatter_as_it_says():
         RandomWalk(n_before=0).apply(NoiseLevel(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)),
     )
     draws = np.concatenate(
-        [draw_readings(level, np.zeros((1, 50)), np.zeros(50, int), rng=rng) for rng in np.random.default_rng(3).spawn(2000)]
+        [
+            draw_readings(level, np.zeros((1, 50)), np.zeros(50, int), rng=rng)
+            for rng in np.random.default_rng(3).spawn(2000)
+        ]
     )
     np.testing.assert_allclose(draws.var(axis=0), variance(level)[0], rtol=5 * math.sqrt(2 / 2000))
 

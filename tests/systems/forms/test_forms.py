@@ -73,7 +73,9 @@ def test_settings_of_a_bank_lie_within_the_prior_and_some_can_be_seen(name):
     form = FORMS[name]
     bank = form.bank().reshape(-1, form.bank().shape[-1])
     assert np.isfinite(form.prior.log_prob(bank)).any()
-    change = max(np.sqrt(np.mean((_read(name, *setting) - NOTHING) ** 2)) for setting in bank[:: max(len(bank) // 8, 1)])
+    change = max(
+        np.sqrt(np.mean((_read(name, *setting) - NOTHING) ** 2)) for setting in bank[:: max(len(bank) // 8, 1)]
+    )
     assert change > 0.01 * SD
 
 

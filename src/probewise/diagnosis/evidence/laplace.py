@@ -60,9 +60,14 @@ class NoiseEvidence:
 
     def likely_nodes(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Give up to four nodes of one effect that hold most, (n_nodes, n_params), and the log weight of each."""
-        best = np.argsort(-self.weights)[:4]
-        each = self.nodes.log_weights[best] - math.log(float(self.weights[best].sum()))
-        return self.nodes.settings[best][:, self.noise.columns_of(name)], each
+        own = self.nodes.settings[:, self.noise.columns_of(name)]
+        settings, node_of = np.unique(own, axis=0, return_inverse=True)
+        node_of = node_of.ravel()
+        weights = np.bincount(node_of, self.weights)
+        top = float(self.nodes.log_weights.max())
+        log_prior = top + np.log(np.bincount(node_of, np.exp(self.nodes.log_weights - top)))
+        best = np.argsort(-weights)[:4]
+        return settings[best], log_prior[best] - math.log(float(weights[best].sum()))
 
     @property
     def law(self) -> NoiseLaw:

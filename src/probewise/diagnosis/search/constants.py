@@ -54,4 +54,5 @@ MOST_REFITTED_LATE = 6  # such combinations
 MOST_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
 REFITTED_AT_OTHER_ORDERS = 1e-4  # probability of such a combination, among those with a formula
 WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
+MOST_FAULTS = 3  # of the noise at once
 NOISE_PAIR_WITHIN = 3.0  # nats over white noise from which a second fault of the noise is looked for

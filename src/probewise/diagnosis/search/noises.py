@@ -15,7 +15,7 @@ from probewise.diagnosis.evidence.templates import subsets
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.constants import NOISE_PAIR_WITHIN
+from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_PAIR_WITHIN
 from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, RandomWalk, lattice_step
 from probewise.recordings.plan import Recording
 
@@ -28,7 +28,7 @@ _TWO_MEMORIES = {CorrelatedNoise.name, RandomWalk.name}  # one law of the noise 
 
 @dataclass(eq=False)
 class Noises:
-    """The noise models of one recording: each fault alone, and pairs where one stands out.
+    """The noise models of one recording: each fault alone, and two or three where one or two stand out.
 
     `certain` are effects on the noise that the readings show without doubt, in every model of `models`; `least_sd` is
     the least believable sd of a reading.
@@ -61,7 +61,7 @@ class Noises:
 
     def log_prior(self, names: Names) -> float:
         """Log prior of a noise model."""
-        return self.prior.log_noise(tuple(n for n in names if n not in self.certain))
+        return self.prior.log_noise(self._uncertain(names))
 
     def over_all(self, log_z: Mapping[Names, float]) -> float:
         """Give the log evidence under whatever noise, from that under each model; of none it is minus infinity."""
@@ -77,20 +77,30 @@ class Noises:
         return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
 
     def pair_up(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
-        """Where one fault stands out about a fit, add the pairs that rival it; tell whether it was looked for."""
-        single = {names: e for names, e in evidence.items() if names != self.certain}
-        first = max(single, key=lambda names: single[names].log_z, default=self.certain)
-        if first == self.certain or single[first].log_z < evidence[self.certain].log_z + NOISE_PAIR_WITHIN:
-            return False
-        (name,) = (n for n in first if n not in self.certain)
-        likely = {name: single[first].likely_nodes(name)}
-        best = max(e.log_z + self.log_prior(names) for names, e in evidence.items())
-        for other in single:
-            both = tuple(sorted({*first, *other}))
-            if other == first or set(both) >= _TWO_MEMORIES:
-                continue
-            model = self._model(both, likely | self.models[other].every_third())
-            value = weigh(found, model).log_z
-            if value + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
-                self.models[both] = model
+        """Where one fault stands out about a fit, add the pairs that rival it, and where a pair does, what rivals that.
+
+        Returns
+        -------
+        Whether it was looked for.
+        """
+        known, singles = dict(evidence), list(evidence)
+        for size in range(1, MOST_FAULTS):
+            of_size = {names: e for names, e in known.items() if len(self._uncertain(names)) == size}
+            first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
+            parts = [n for n in known if set(n) < set(first)]
+            if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
+                return size > 1
+            likely = {name: known[first].likely_nodes(name) for name in self._uncertain(first)}
+            best = max(e.log_z + self.log_prior(names) for names, e in known.items())
+            for other in singles:
+                both = tuple(sorted({*first, *other}))
+                if len(self._uncertain(both)) != size + 1 or set(both) >= _TWO_MEMORIES:
+                    continue
+                model = self._model(both, likely | self.models[other].every_third())
+                own = weigh(found, model)
+                if own.log_z + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
+                    self.models[both], known[both] = model, own
         return True
+
+    def _uncertain(self, names: Names) -> Names:
+        return tuple(n for n in names if n not in self.certain)

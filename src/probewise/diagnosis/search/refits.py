@@ -91,6 +91,7 @@ class Refits:
         weights[tried] = np.exp(log_z - log_z[best])
         weights /= weights.sum()
         log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights)) - against
+        log_share += math.log(effect.n_peaks)
         return refitted[best].as_share(log_share, {**parent.weights, effect.name: weights}), by_noise
 
     def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:

@@ -128,6 +128,11 @@ class Form:
         return np.asarray(setting)
 
     @property
+    def n_peaks(self) -> int:
+        """Phases have two turns, so that each wave is there twice."""
+        return 2 if self.joined is not None else 1
+
+    @property
     def scans(self) -> tuple[str, ...]:
         """It acts in all runs."""
         return ()

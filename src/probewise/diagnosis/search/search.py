@@ -134,5 +134,5 @@ def _unknown(state: SearchState, prepared: Prepared) -> Unknown:
         tuple(covariates),
         state.noises,
         lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
-        lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
+        n_choices=lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
     )

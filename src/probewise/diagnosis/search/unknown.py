@@ -45,11 +45,11 @@ class Unknown:
     covariates: tuple[Covariate, ...]
     noises: Noises
     complexity_penalty: Callable[[int], float]
-    n_choices: Callable[[Names], float]
     log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
     """Log evidence by (order, mean, noise)."""
     shares: dict[str, float] = field(default_factory=dict)
     """How much of it each family of bases has, beside the null that it explains most beside."""
+    n_choices: Callable[[Names], float] = lambda names: 0.0
 
     def weigh(self, candidates: Iterable[WeighedFit]) -> None:
         """Weigh it beside each candidate."""

@@ -102,9 +102,10 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     rest, own = law.take(~out), law.take(out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     asked = np.flatnonzero(rows & recording.usable)
-    turned = rest(without.slopes)
-    of_its_own = ~np.any(turned, axis=0) & np.any(found.slopes[out], axis=0)
-    # What the part alone tells is linearised where all readings together have it: its prior may be wide.
+    of_its_own = ~np.any(found.slopes[~out], axis=0) & np.any(found.slopes[out], axis=0)
+    turned = np.where(of_its_own, 0.0, rest(without.slopes))
+    # What the part alone tells is linearised where all readings together have it: its prior may be wide, and the
+    # others may bound it on one side, as they do a ceiling that they stay below.
     about = np.where(of_its_own, found.z, without.z)
     predicted, slopes = (part[asked] for part in found.model.jacobian(about))
     free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))

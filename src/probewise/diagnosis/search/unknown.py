@@ -72,26 +72,33 @@ class Unknown:
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
     def prune(self, candidates: Collection[WeighedFit]) -> None:
-        """Leave it out by itself where a name, or two, explain as much, and leave nothing for it to explain.
+        """Leave it out, alone or beside a name, where a name more, or two, explain as much and leave nothing for it.
 
         A basis of many columns, what differs from scan to scan say, holds the traces of named effects too. Two names
         are chosen from many more combinations than one is: they have to explain as much more as that makes by chance.
         """
-        alone = max((self._beside(c) for c in candidates if not c.names), default=-np.inf)
-        believed = {
-            c: self._believed(c) for c in candidates if 1 <= len(c.names) <= 2 and not out_of_vocabulary(c.names)
-        }
+        named = [c for c in candidates if not out_of_vocabulary(c.names)]
+        for known in {c.names for c in named if len(c.names) <= 1}:
+            rivals = [c for c in named if set(c.names) > set(known) and len(c.names) <= 2]
+            if any(key[1] == known for key in self.log_z) and self._explained(known, rivals, candidates):
+                self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
+
+    def _explained(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
+        """Tell whether a candidate makes as much of the readings as something unknown beside `known` does."""
+        most = max((self._beside(c) for c in candidates if c.names == known), default=-np.inf)
+        believed = {c: self._believed(c, len(known)) for c in rivals}
         for candidate in sorted(believed, key=lambda c: -believed[c]):
-            if believed[candidate] < alone - ALIASED_NATS:
-                break
+            if believed[candidate] < most - ALIASED_NATS:
+                return False
             if self._beside(candidate) == -np.inf:
                 self.weigh([candidate])
             if self._beside(candidate) - self._evidence(candidate) < ALIASED_NATS:
-                self.log_z = {key: value for key, value in self.log_z.items() if key[1]}
-                break
+                return True
+        return False
 
-    def _believed(self, candidate: WeighedFit) -> float:
-        return self._evidence(candidate) - self.n_choices(candidate.names)
+    def _believed(self, candidate: WeighedFit, n_known: int) -> float:
+        several = len(candidate.names) - n_known > 1
+        return self._evidence(candidate) - (self.n_choices(candidate.names) if several else 0.0)
 
     def _evidence(self, candidate: WeighedFit) -> float:
         return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, judged
 from probewise.diagnosis.system.apparatus import ON_NOISE, PersonsSystem
-from probewise.effects import NUISANCES, NamedEffect, first_of
+from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, first_of
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
@@ -54,7 +54,9 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
-    on_noise = {kind.name: kind() for kind in kinds}
+    on_noise: dict[str, Any] = {kind.name: kind() for kind in kinds if kind is not NoisePerRun}
+    if len(own.scan_names) > 1:
+        on_noise[NoisePerRun.name] = NoisePerRun(own.scan_names)
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
     reasons = _reasons(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
@@ -115,7 +117,7 @@ def _reasons(about: About) -> dict[str, str]:
         out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
         out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}
         out |= {f"periodic_error:{column}": "the column has too few values"}
-    out |= {"clock_drift": timeless}
+    out |= {"clock_drift": timeless, NoisePerRun.name: one_run}
     for name in own.parameters:
         out |= {f"drifts:{name}": timeless, f"steps:{name}": nothing}
         if name not in own.per_run:

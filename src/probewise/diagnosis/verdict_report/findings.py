@@ -164,7 +164,8 @@ def _size(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> fl
     prepared = searched.prepared
     if name in prepared.on_noise:
         # On the noise: the evidence for it, as the effect of that many sd on the mean would leave.
-        gain = holder.evidence[noise].log_z - holder.evidence[tuple(n for n in noise if n != name)].log_z
+        without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]
+        gain = holder.evidence[noise].log_z - max(without)
         return math.sqrt(2 * max(gain, 0.0))
     model, stay = found.model.without(name)
     noise_free = prepared.recording.with_readings(prepared.spread(found.predicted)).unlimited()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from probewise.errors import ParameterError
 from probewise.systems.table import RunTable
 
-__all__ = ["behind", "join_tables"]
+__all__ = ["behind", "join_tables", "unused_name"]
 
 _FILE = "file"
 
@@ -57,7 +57,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
         name: _joined(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
         for name in first.columns
     }
-    run = first.run or _unused(_FILE, columns)
+    run = first.run or unused_name(_FILE, columns)
     columns[run] = np.array(list(_runs(tables, sources, named=first.run is not None)))
     return replace(first, columns=columns, run=run), tuple(notes)
 
@@ -91,13 +91,14 @@ def _runs(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) ->
     for table, source in zip(tables, sources, strict=True):
         own = {}
         for name in table.scan_names if named else (source,):
-            own[name] = _unused(name, taken)
+            own[name] = unused_name(name, taken)
         taken |= set(own.values())
         names = table.scan_names if named else (source,)
         yield from (own[names[k]] for k in table.scan.tolist())
 
 
-def _unused(name: str, taken: Iterable[str]) -> str:
+def unused_name(name: str, taken: Iterable[str]) -> str:
+    """Give a name that is not taken: this one, or with a number behind."""
     known = set(taken)
     numbered = (f"{name} ({k})" for k in itertools.count(2))
     return next(n for n in itertools.chain([name], numbered) if n not in known)

@@ -71,8 +71,8 @@ class RunTable:
 
     @property
     def has_time(self) -> bool:
-        """Whether a time was recorded."""
-        return self.time is not None
+        """Whether a time was recorded, and goes on."""
+        return self.time is not None and float(np.ptp(self.time_s)) > 0
 
     @cached_property
     def time_s(self) -> FloatArray:

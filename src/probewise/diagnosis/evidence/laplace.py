@@ -38,6 +38,7 @@ LEAST_VISIBLE = 4.0
 _INVISIBLE = -50.0  # log Bayes factor of a template of which nothing survives
 
 
+_ROUNDING = 1e-12
 _MOST_NUMBERS = 4_000_000  # held at once, of the slopes under several laws
 
 
@@ -137,7 +138,7 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) ->
     for _ in range(3):
         variance = np.maximum(squares() / n_points, least)
         curvature = jj / variance[:, None, None] + np.eye(p)
-        steps = np.asarray(np.linalg.solve(curvature, (jr / variance[:, None] - found.z)[:, :, None])[:, :, 0])
+        steps = _solved(curvature, jr / variance[:, None] - found.z)
     fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
     rss = squares()
     variance = np.maximum(rss / n_points, least)
@@ -159,12 +160,22 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> Float
         variance = sigma**2 / tail.information
         curvature = gram / variance[:, None, None] + np.eye(p)
         downhill = slopes.T @ tail.as_normal(left, sigma) / variance - found.z[:, None] - steps
-        steps += np.linalg.solve(curvature, downhill.T[:, :, None])[:, :, 0].T
+        steps += _solved(curvature, downhill.T).T
     left = residual - slopes @ steps
     sigma = tail.scale(left, n_points, floor=least, start=sigma)
     fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
     scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
     return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points) + scale)
+
+
+def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+    """Take the steps to the peaks, (n_laws, n_params), of curvatures (n_laws, n_params, n_params)."""
+    try:
+        return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
+    except np.linalg.LinAlgError:  # readings that are met exactly: beside their weight a prior's is lost in rounding
+        size = np.trace(curvature, axis1=1, axis2=2)[:, None, None] / curvature.shape[1]
+        ridge = _ROUNDING * size * np.eye(curvature.shape[1])
+        return np.asarray(np.linalg.solve(curvature + ridge, downhill[:, :, None])[:, :, 0])
 
 
 def _peak(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:

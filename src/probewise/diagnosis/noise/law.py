@@ -247,7 +247,9 @@ class Tail:
     ) -> FloatArray:
         """Most likely sigma, (k,), by expectation and maximisation; rows beyond `n_points` are 0 and do not count."""
         if self.is_normal:
-            return np.asarray(np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), floor))
+            return np.asarray(
+                np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), max(floor, _LEAST))
+            )
         squares = whitened**2
         if start is None:  # from the middle half of what is not lost, which the tail leaves alone
             middle = len(whitened) - n_points // 2 - 1

@@ -54,9 +54,11 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
-    on_noise: dict[str, Any] = {kind.name: kind() for kind in kinds if kind is not NoisePerRun}
+    on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds}
     if len(own.scan_names) > 1:
         on_noise[NoisePerRun.name] = NoisePerRun(own.scan_names)
+    else:
+        del on_noise[NoisePerRun.name]
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
     reasons = _reasons(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
@@ -103,9 +105,10 @@ def _noise(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tupl
 def _reasons(about: About) -> dict[str, str]:
     """Say of every effect on such a simulator why it could not be bound, were it not."""
     own, table = about.system.simulator, about.table
-    timeless = "no time was recorded" if not table.has_time else "it changes nothing here"
-    one_run = "there is one run" if len(table.scan_names) == 1 else "it changes nothing here"
     nothing = "it changes nothing here"
+    timeless = "no time was recorded" if not table.has_time else "it changes nothing here"
+    too_few = nothing if about.tells_runs_apart else "runs have too few rows"
+    one_run = "there is one run" if len(table.scan_names) == 1 else too_few
     out = {"offset_drift": timeless, "gain_drift": timeless, "offset_step": nothing, "gain_step": nothing}
     out |= {"offset_per_run": one_run, "gain_per_run": one_run, "nonlinearity": nothing, "saturation": nothing}
     out |= {"hysteresis": "the readings move one way only"}

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable
-from probewise.systems.joining import behind
+from probewise.systems.joining import behind, unused_name
 
 __all__ = ["RunCommand", "in_turn", "one_after_another", "run_commands"]
 
@@ -117,7 +117,7 @@ def _run(
         time = table.time_s[rows]
         begin = time[0] if table.time_begins_anew else _begin(table)
         changed[table.time] = begin + slower * (time - time[0])
-    run = table.run or _RUN
+    run = table.run or unused_name(_RUN, table.columns)
     changed[run] = np.full(len(rows), name)
     return replace(taken, columns={**taken.columns, **changed}, run=run, like={name: table.like.get(like, like)})
 

@@ -18,6 +18,7 @@ from probewise.systems.table import RunTable
 __all__ = ["About"]
 
 _ANY = Uniform(0.0, 1.0)  # prior of a trial, which no one asks for
+_ROWS_OF_A_RUN = 3  # on the average
 _UNSEEN = 1e-7  # of the noise: what changes the readings by less changes nothing
 _TYPICAL = 1.0  # noise sds, rms, that an effect of typical size changes the readings by
 _LEAST, _MOST = 0.05, 1e4  # noise sds, rms, between which sizes without an amplitude are looked for
@@ -58,6 +59,12 @@ class About:
             system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step
         )
         return {state: values[0] for state, values in found.items()}
+
+    @property
+    def tells_runs_apart(self) -> bool:
+        """Whether there are several runs, with rows enough that a value for each does not meet every reading."""
+        n_runs = len(self.table.scan_names)
+        return n_runs > 1 and len(self.table) >= _ROWS_OF_A_RUN * n_runs
 
     @property
     def time_unit(self) -> str:

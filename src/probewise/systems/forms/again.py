@@ -49,6 +49,10 @@ class _AsRecorded(About):
         assert self.known is not None
         return dict(self.known.states)
 
+    @property
+    def tells_runs_apart(self) -> bool:
+        return len(self.table.scan_names) > 1
+
     def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
 

@@ -14,7 +14,16 @@ from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import Moments, with_unit
 from probewise.systems.table import RunTable
 
-__all__ = ["Modulation", "column", "drift", "per_run", "step", "wave", "wave_joined", "wave_numbers"]
+__all__ = [
+    "Modulation",
+    "column",
+    "drift",
+    "per_run",
+    "step",
+    "wave",
+    "wave_joined",
+    "wave_numbers",
+]
 
 _MOST_MOMENTS = 512
 _MOST_WAVES = 1024

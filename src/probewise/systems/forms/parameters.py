@@ -29,7 +29,7 @@ def forms_on_parameters(about: About) -> Iterator[Form]:
     for name in own.parameters:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or 1.0)
         each = dict(over)
-        if name not in own.per_run and len(table.scan_names) > 1:
+        if name not in own.per_run and about.tells_runs_apart:
             each["differs"] = modulations.per_run(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)

@@ -60,7 +60,7 @@ def forms_on_readings(about: About) -> Iterator[Form]:
     if table.has_time:
         over["drift"] = modulations.drift(table, about.time_unit)
     over["step"] = modulations.step(table, about.time_unit, gated=True)
-    if len(table.scan_names) > 1:
+    if about.tells_runs_apart:
         over["per_run"] = modulations.per_run(table)
     for kind, how in over.items():
         yield from modulated(about, f"offset_{kind}", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)

@@ -214,4 +214,6 @@ def play(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
 
 def _turns_back(values: FloatArray, table: RunTable) -> bool:
     moves = np.concatenate([np.diff(values[rows]) for rows in table.rows_by_scan()])
+    if not moves.size:
+        return False
     return bool((moves > 0).mean() > _FORTH_AND_BACK and (moves < 0).mean() > _FORTH_AND_BACK)

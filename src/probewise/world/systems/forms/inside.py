@@ -24,7 +24,7 @@ def forms_of_parameters(scene: Scene) -> Iterator[Form]:
         over["drifts"] = modulations.along_time(scene)
     for name in scene.kind.priors:
         own = dict(over)
-        if name not in scene.kind.per_run and len(scene.rows.by_run) > 1:
+        if name not in scene.kind.per_run and scene.kind.run is not None and len(scene.rows.by_run) > 1:
             own["differs"] = modulations.by_run(scene)
         if name in scene.kind.per_run and scene.kind.law is not None:
             own = {}  # where a run starts has no later

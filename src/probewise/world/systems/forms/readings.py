@@ -59,7 +59,7 @@ def _varying(scene: Scene) -> Iterator[Form]:
     both = {"step": modulations.step(scene)}
     if timed:
         both["drift"] = modulations.along_time(scene)
-    if len(scene.rows.by_run) > 1:
+    if scene.kind.run is not None and len(scene.rows.by_run) > 1:
         both["per_run"] = modulations.by_run(scene)
     for kind, how in both.items():
         yield added_to_readings(scene, f"offset_{kind}", how)

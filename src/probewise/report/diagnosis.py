@@ -43,6 +43,7 @@ _TELLS_SOMETHING = 0.5  # nats
 _WEAK = " too weak to be felt so far"
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
+    "random_walk": "Correlation of residuals, by how many readings they lie apart: that of a walk falls slowly.",
     "signal_dependent_noise": "How far residuals scatter, by the predicted reading: plain noise scatters evenly.",
     "outliers": "How many residuals lie how far out, on a logarithmic scale, beside a normal distribution.",
     "dropouts": "Recorded against predicted readings; lost readings stand at one value, whatever is predicted.",

@@ -193,7 +193,7 @@ def _noise_panel(diagnosis: Diagnosis, chance: Chance, name: str) -> Callable[[A
             return lambda ax: lost_readings(diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax)
     if name == "quantisation" and "step" in found:
         return lambda ax: lattice_of_readings(recording.readings, found["step"], unit=unit, ax=ax)
-    if name == "correlated_noise":
+    if name in ("correlated_noise", "random_walk"):
         return lambda ax: correlation_of_neighbours(residuals, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
         return lambda ax: tails(residuals, float(chance.sd.mean()), ax=ax)

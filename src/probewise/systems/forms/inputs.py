@@ -24,6 +24,7 @@ _NUDGE = 1e-4  # of a column's spread, to see whether it drives the readings
 _MOST_WAVES_OF_A_LAW = 96
 _MOST_WAVES = 600
 _ROWS_OF_A_WAVE = 4  # distinct values to a period on the average: with fewer any readings lie on some wave
+_NEAR_ZERO = 0.1  # of a column's range
 _FORTH_AND_BACK = 0.02  # of the rows that go each way
 
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
@@ -57,7 +58,8 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
         yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
         yield from _ceiling(about, name, low, high)
         says = partial(_said, f"{name} does nothing within {{}} of 0")
-        yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
+        if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # farther off it is an offset
+            yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
         if _turns_back(values, table):
             says = partial(_said, f"{name} has {{}} of play")
             yield from _sized(

@@ -325,6 +325,12 @@ def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) ->
     return SystemEffect(form, form.sized(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
 
 
+def _at_its_moment(form: Form, values: Mapping[str, float]) -> Form:
+    """Let a form that steps at a moment step at that of an effect too: between two rows no other moment is as good."""
+    at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
+    return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
+
+
 def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
     a, b = (left_over(drawn.changed([e.placed]) - drawn.bare.readings, drawn.bare.slopes) for e in (one, other))
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
@@ -339,6 +345,13 @@ def _with_rivals(
     model = Model(drawn.kind, drawn.seen, beside)
     start = model.coordinates(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
-    rivals = rivals_of(drawn.scene, forms, target, fitted, model, frozenset({effect.name, *(e.name for e in others)}))
+    rivals = rivals_of(
+        drawn.scene,
+        [_at_its_moment(form, effect.values) for form in forms],
+        target,
+        fitted,
+        model,
+        frozenset({effect.name, *(e.name for e in others)}),
+    )
     left = (target - fitted.readings) / drawn.kind.sd
     return replace(effect, rivals=rivals, covariates=covariates_of(effect.form, left, drawn.scene))

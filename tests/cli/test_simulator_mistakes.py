@@ -59,7 +59,7 @@ def cell(row, column, text):
 
 
 TABLES = {
-    "a reading that is text": (cell(5, "temp_c", "n/a"), "n/a in row 5"),
+    "a reading that is text": (cell(5, "temp_c", "warm"), "warm in row 5"),
     "an input that is text": (cell(5, "power_w", "4;5"), "these hold texts: power_w ('4;5')"),
     "a time that is missing": (cell(5, "t_s", ""), "row 5, column t_s: the cell is empty"),
     "a time that falls": (cell(5, "t_s", "1"), "column 't_s' is '1 in row 5, after 10 in run 1'"),
@@ -111,3 +111,12 @@ def _table(x, y):
     from probewise.systems import RunTable
 
     return RunTable({"x": x, "y": y})
+
+
+@pytest.mark.slow
+def test_a_reading_that_is_not_available_is_left_out(tmp_path):
+    """The rest are met exactly, to the last digit: no matrix is singular, nothing is divided by what is not there."""
+    file, table, out = tmp_path / "heater.py", tmp_path / "runs.csv", tmp_path / "out"
+    file.write_text(FILE)
+    table.write_text(cell(5, "temp_c", "n/a"))
+    assert main(["diagnose", str(table), "--simulator", str(file), "--out", str(out), "--quiet"]) == 0

@@ -116,7 +116,7 @@ BAD_TABLES = {
     "missing column": ("x_mm,reading\n0,1\n", ["row 1", "column y_mm", "'x_mm', 'reading'"]),
     "a plan": ("x_mm,y_mm\n0,1\n", ["row 1", "column reading", "plan"]),
     "text in a number": (HEAD + "0,0,1\n0,abc,2\n", ["row 3", "column y_mm", "'abc'", "finite number"]),
-    "text in a reading": (HEAD + "0,0,dark\n", ["row 2", "column reading", "'dark'", "empty or nan"]),
+    "text in a reading": (HEAD + "0,0,dark\n", ["row 2", "column reading", "'dark'", "empty, nan or n/a"]),
     "comma as decimal point": (HEAD + '0,0,"1,5"\n', ["row 2", "column reading", "'1,5'"]),
     "underscore": (HEAD + "0,0,1_000\n", ["row 2", "'1_000'"]),
     "no coordinate": (HEAD + "0,0,1\n0,,1\n", ["row 3", "column y_mm", "empty"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -170,8 +171,9 @@ def fit(
         variance = float(sigma[0]) ** 2 / law.information
         curvature = turned.T @ turned / variance + eye
         downhill = turned.T @ law.as_normal(whitened, sigma)[:, 0] / variance - z
-        scale = np.diag(curvature)
-        tries = np.stack([np.linalg.solve(curvature + np.diag(d * scale), downhill) for d in _DAMPINGS])
+        tries = _steps(curvature, downhill)
+        if not len(tries):
+            break
         tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
         # Where many predictions cost as much as one, slopes are had along with them.
         all_predicted, all_slopes = model.jacobians(tries) if model.sensor.in_bulk else (model.predict(tries), None)
@@ -188,6 +190,19 @@ def fit(
             break
     sd = float(law.scale(law(readings - predicted)[:, None])[0])
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best)
+
+
+def _steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+    """Solve for the step at each damping, (n_solved, n_params).
+
+    Where readings are met exactly the prior is lost beside them in the last digits, and what is only just damped may
+    be singular: it is left out.
+    """
+    scale, solved = np.diag(curvature), []
+    for damping in _DAMPINGS:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            solved.append(np.linalg.solve(curvature + np.diag(damping * scale), downhill))
+    return np.array(solved).reshape(-1, len(downhill))
 
 
 def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:

@@ -87,9 +87,10 @@ class Refits:
         # What refits have shown of variants counts for more than what screening promised.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
-        weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
-        weights[tried] = np.exp(log_z - log_z[best])
-        weights /= weights.sum()
+        if np.isfinite(log_z[best]):  # else no variant could be fitted, and none is likelier than before
+            weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
+            weights[tried] = np.exp(log_z - log_z[best])
+            weights /= weights.sum()
         log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights)) - against
         log_share += math.log(effect.n_peaks)
         return refitted[best].as_share(log_share, {**parent.weights, effect.name: weights}), by_noise

@@ -32,7 +32,7 @@ from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import Experiment, Field, Step, explore
 from probewise.experiment.asking import inquire
 from probewise.experiment.loop import from_scratch
-from probewise.experiment.particles import update
+from probewise.experiment.particles import Particles, update
 from probewise.inquiry import Grid
 from probewise.scene import SHAPES, HypothesisScene
 from probewise.scene import Field as PlayingField
@@ -69,7 +69,8 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
         rng = np.random.default_rng([run, number])
         scratch = partial(from_scratch, problem, experiment, rng)
         ask = partial(inquire, experiment, after.posterior, field, at=after.reading, rng=rng)
-        infer = partial(update, before.posterior, problem, rng=rng, fall_back=scratch, blocks=experiment.blocks)
+        before_it = Particles(before.posterior, np.arange(len(before.posterior.theta)))
+        infer = partial(update, before_it, problem, rng=rng, fall_back=scratch)
         row = {"map_s": seconds(ask), "inference_s": seconds(infer)}
         if number % EVERY == 0:
             row |= {"plain_map_s": plain_map_s(experiment, after), "nested_sampling_s": seconds(scratch)}

@@ -10,9 +10,10 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
+from probewise.experiment.evidence import bridged, redrawn
 from probewise.experiment.judging import information
 from probewise.experiment.kernels import LocalKernels
-from probewise.experiment.particles import Block, prior_particles, update
+from probewise.experiment.particles import Particles, prior_particles, resized, update
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 
@@ -21,10 +22,6 @@ READINGS = [(120.0, 80.0, 10.3), (300.0, 200.0, 9.6), (250.0, 140.0, 59.2), (250
 
 def rng(seed=0):
     return np.random.default_rng(seed)
-
-
-def whole(theta):
-    return (Block(np.arange(len(theta)), np.arange(theta.shape[1])),)
 
 
 def never():
@@ -40,12 +37,16 @@ def problem_of(small, n):
     return noisy(small).problem([Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS[:n]])
 
 
-def carried(small, *, n_particles=3000, seed=0, steps=5):
+def particles(small, *, n_particles=3000, seed=0, steps=5, fall_back=never):
     random = rng(seed)
-    posterior = prior_particles(problem_of(small, 0).prior, n_particles, rng=random)
+    found = prior_particles(problem_of(small, 0).prior, n_particles, rng=random)
     for n in range(1, steps + 1):
-        posterior = update(posterior, problem_of(small, n), rng=random, fall_back=never, blocks=whole)
-    return posterior
+        found = update(found, problem_of(small, n), rng=random, fall_back=fall_back)
+    return found
+
+
+def carried(small, **options):
+    return particles(small, **options).weighted
 
 
 @pytest.fixture(scope="module")
@@ -105,10 +106,10 @@ def test_a_reading_that_keeps_the_samples_has_each_predict_once(small):
             return problem.model.predict(theta, plan)
 
     start = prior_particles(problem.prior, 300, rng=rng())
-    kept = update(start, replace(problem, model=Counted()), rng=rng(), fall_back=never, blocks=whole)
-    np.testing.assert_array_equal(kept.theta, start.theta)
+    kept = update(start, replace(problem, model=Counted()), rng=rng(), fall_back=never)
+    np.testing.assert_array_equal(kept.weighted.theta, start.weighted.theta)
     assert asked == [300]
-    assert kept.n_calls == 300
+    assert kept.weighted.n_calls == 300
 
 
 def test_a_reading_that_surprises_is_taken_in_from_scratch(small):
@@ -117,9 +118,11 @@ def test_a_reading_that_surprises_is_taken_in_from_scratch(small):
     theta = problem.prior.from_unit_cube(rng().random((500, 3)))
     theta[:, 0] *= 0.2
     even = np.full(500, -math.log(500))
-    start = prior_particles(problem.prior, 500, rng=rng())
-    before = type(start)(start.names, theta, np.zeros(500), even, 0.0, 0.0, 500.0, 0, -math.inf)
-    found = update(before, problem, rng=rng(1), fall_back=lambda: run(problem, rng=rng(2), n_live=100), blocks=whole)
+    start = prior_particles(problem.prior, 500, rng=rng()).weighted
+    certain = type(start)(start.names, theta, np.zeros(500), even, 0.0, 0.0, 500.0, 0, -math.inf)
+    before = Particles(certain, np.arange(500))
+    assert update(before, problem, rng=rng(1)).strained
+    found = update(before, problem, rng=rng(1), fall_back=lambda: run(problem, rng=rng(2), n_live=100)).weighted
     assert found.run is not None
     assert found.log_z == found.run.log_z
     assert found.mean()[0] == pytest.approx(250.0, abs=40.0)
@@ -139,7 +142,8 @@ def test_hypotheses_that_are_ruled_out_stay_so(small):
     random, posterior = rng(), prior_particles(experiment.prior, 3000, rng=rng(1))
     readings = [Reading(10.0, Pose(x, y), 0.0) for x, y in ((120.0, 80.0), (300.0, 200.0), (60.0, 250.0))]
     for n in range(1, 4):
-        posterior = update(posterior, experiment.problem(readings[:n]), rng=random, fall_back=never, blocks=whole)
+        posterior = update(posterior, experiment.problem(readings[:n]), rng=random, fall_back=never)
+    posterior = posterior.weighted
     theta = experiment.prior.from_unit_cube(rng(2).random((200_000, 3)))
     left = np.isfinite(experiment.problem(readings).log_likelihood(theta)).mean()
     assert math.exp(posterior.log_z) == pytest.approx(left, rel=5 * posterior.log_z_error + 0.02)
@@ -147,12 +151,51 @@ def test_hypotheses_that_are_ruled_out_stay_so(small):
 
 
 def test_a_missing_reading_changes_nothing(small):
-    before = carried(small, n_particles=300, steps=3)
+    before = particles(small, n_particles=300, steps=3)
     readings = [Reading(v, Pose(x, y), 0.0) for x, y, v in READINGS[:3]]
     problem = noisy(small).problem([*readings, Reading(math.nan, Pose(10.0, 10.0), 1.0)])
-    after = update(before, problem, rng=rng(), fall_back=never, blocks=whole)
-    np.testing.assert_allclose(after.log_weight, before.log_weight)
+    after = update(before, problem, rng=rng(), fall_back=never)
+    np.testing.assert_allclose(after.weighted.log_weight, before.weighted.log_weight)
     assert after.log_z == pytest.approx(before.log_z)
+
+
+@pytest.mark.parametrize("n", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_a_bridge_finds_the_evidence_anew(small, lattice, n):
+    """Whatever evidence was carried: within five stated errors, and 0.05 for the lattice."""
+    posterior = replace(carried(small, steps=n, fall_back=None), log_z=123.0)
+    found = bridged(posterior, problem_of(small, n), rng=rng(5), n_draws=3000)
+    assert found.error < 0.1
+    assert found.log_z == pytest.approx(by_lattice(small, lattice, n)[0], abs=5 * found.error + 0.05)
+
+
+@pytest.mark.slow
+def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_began(small, lattice):
+    """Nine in ten of the points are of the half of the posterior where the centre is to the left of its mean."""
+    posterior, problem = carried(small, steps=4, fall_back=None), problem_of(small, 4)
+    log_z, mean, sd = by_lattice(small, lattice, 4)
+    points = posterior.samples(2000, rng=rng(1))
+    left = points[:, 0] < mean[0]
+    uneven = np.concatenate([points[left], points[~left][: left.sum() // 9]])
+    found = redrawn(uneven, posterior.names, problem, rng=rng(2), n_draws=8000)
+    assert found.mean()[0] == pytest.approx(mean[0], abs=0.15 * sd[0])
+    assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
+
+
+def test_the_genealogy_tells_when_few_samples_at_the_start_are_ancestors_of_all(small):
+    many = particles(small, n_particles=600, fall_back=None)
+    few = replace(many, ancestor=many.ancestor % 4)
+    assert many.log_z_error < 0.3
+    assert few.log_z_error > 0.4
+
+
+def test_samples_can_be_made_fewer_and_more(small):
+    before, problem = particles(small, steps=3, fall_back=None), problem_of(small, 3)
+    fewer = resized(before, 1000, problem, rng=rng(1))
+    more = resized(fewer, 3000, problem, rng=rng(2))
+    assert [len(p.weighted.theta) for p in (fewer, more)] == [1000, 3000]
+    assert len(np.unique(more.weighted.theta, axis=0)) > 2500
+    assert more.log_z == before.log_z
+    np.testing.assert_allclose(more.weighted.mean(), before.weighted.mean(), atol=0.3 * before.weighted.sd().max())
 
 
 class Massless(Product):

@@ -38,8 +38,8 @@ class LocalKernels:
     form: FloatArray
 
     @classmethod
-    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> Self:
-        """Fit to equally weighted samples, (n_samples, n_params)."""
+    def about(cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0) -> Self:
+        """Fit to equally weighted samples, (n_samples, n_params); `widened` times as wide as the samples around."""
         n_samples, n_params = points.shape
         origin = points.mean(axis=0)
         away = points - origin
@@ -52,6 +52,7 @@ class LocalKernels:
         overall = np.atleast_2d(np.cov(points, rowvar=False))
         covariance = np.einsum("kni,knj->kij", spread, spread) / n_near
         covariance += _RIDGE * (overall + np.diag(scale**2))
+        covariance *= widened**2
         root = np.linalg.cholesky(covariance)
         precision = np.linalg.inv(covariance)
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)

@@ -29,7 +29,7 @@ from probewise.experiment.journal import (
     require_same_settings,
 )
 from probewise.experiment.judging import doubt, fit, information, learnt, moments, stop_reason
-from probewise.experiment.particles import prior_particles, update
+from probewise.experiment.posterior import prior_posterior, updated
 from probewise.experiment.setting import Experiment
 from probewise.experiment.values import Exploration, State, Step
 from probewise.inference.problem import SensorProblem
@@ -64,8 +64,8 @@ def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> 
     ParameterError
         If the prior has no mass, every place promises the same, or the only one nothing.
     """
-    posterior = prior_particles(experiment.prior, experiment.n_particles, rng=rng)
-    prospect, outlook = inquire(experiment, posterior, field, at=None, rng=rng)
+    posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
+    prospect, outlook = inquire(experiment, posterior.joined(rng=rng), field, at=None, rng=rng)
     if outlook.flat:
         raise ParameterError(
             "utility",
@@ -117,13 +117,14 @@ def step(
     with warnings.catch_warnings():
         # Each step keeps its own doubts; a warning a reading would bury them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        posterior = update(
+        carried = updated(
             state.posterior,
-            problem,
+            problem.recording,
+            experiment.n_particles,
             rng=rng,
-            fall_back=lambda: from_scratch(problem, experiment, rng),
-            blocks=experiment.blocks,
+            from_scratch=lambda kind: from_scratch(kind, experiment, rng),
         )
+    posterior = carried.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
     p_value, worst = fit(experiment, posterior, problem)
     notes = () if posterior.run is None else posterior.run.warnings
@@ -149,7 +150,7 @@ def step(
         stop_reason=reason,
         notes=notes,
     )
-    return State(readings, posterior, pose, tuple(planned)), info
+    return State(readings, carried, pose, tuple(planned)), info
 
 
 def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.Generator) -> NestedResult:
@@ -157,7 +158,7 @@ def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.
     return run_nested(
         problem,
         rng=rng,
-        n_live=max(experiment.n_live, LIVE_PER_PARAM * len(experiment.names)),
+        n_live=max(experiment.n_live, LIVE_PER_PARAM * len(problem.prior.names)),
         move=KernelMove(),
         stop=RemainingEvidence(DLOGZ),
         max_cost=1.0,  # the robot waits

@@ -1,22 +1,25 @@
-"""Keep a large weighted posterior from reading to reading: reweigh it, and renew it when few samples carry it.
+"""Carry weighted samples of one posterior from reading to reading: reweigh them, and move them when few still count.
 
 Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweighs the samples; where fewer
 than half of them still count, the reading is taken in by degrees, and at each the samples are drawn
 anew and moved by Metropolis-Hastings steps against everything read so far. The evidence is the
 product of the mean weights. What has been ruled out in a long search is remembered by thousands of
 samples, not by the few that a picture shows.
+
+How wrong the evidence may be is read off the genealogy: where few of the samples at the start are
+ancestors of those that count now, another start would have given another evidence (Lee & Whiteley 2018).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.experiment.kernels import LocalKernels
 from probewise.inference.problem import SensorProblem
@@ -25,25 +28,63 @@ from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Prior
 
-__all__ = ["Block", "prior_particles", "update"]
+__all__ = ["Particles", "prior_particles", "resized", "sampled", "update"]
 
 KEEP = 0.5  # share of the samples that must count for them to be kept
 SURPRISED = 12.5  # nats by which every sample misses the last reading, five sds of Gaussian noise: none expected it
 STIFF = 0.5  # accepted steps a sample, below which the moves cannot be trusted
 ENOUGH = 1.5  # accepted steps a sample that will do
 MOST_ROUNDS = 6
-FEWEST = 8  # samples a parameter, below which a kind is left where it is: it is dying out
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Hypotheses of one kind: their `rows` among the samples, the `columns` they use; the others follow the prior."""
+class Particles:
+    """Weighted samples, and what tells how far their evidence can be trusted.
 
-    rows: IntArray
-    columns: IntArray
+    Attributes
+    ----------
+    weighted
+        The samples with the evidence.
+    ancestor
+        Which sample of the last independent start each descends from, (n,).
+    start_variance
+        Variance of the log evidence at that start: 0 for draws from the prior.
+    n_resampled
+        How often samples have been drawn anew since then.
+    strained
+        Whether, since then, no sample expected a reading, or the samples could not be moved: their evidence may
+        be wrong by more than the genealogy tells.
+    """
+
+    weighted: Weighted
+    ancestor: IntArray
+    start_variance: float = 0.0
+    n_resampled: int = 0
+    strained: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
+
+    @property
+    def log_z(self) -> float:
+        """Natural log of the evidence."""
+        return self.weighted.log_z
+
+    @property
+    def log_z_error(self) -> float:
+        """Standard error of the log evidence by the genealogy (Lee & Whiteley 2018), or the stated one if that is more.
+
+        The stated error takes the samples for independent at every step, which moves alone do not make them.
+        """
+        if self.log_z == -math.inf:
+            return math.inf
+        n = len(self.ancestor)
+        lineages = np.bincount(self.ancestor, weights=self.weighted.weight)
+        related = float(lineages @ lineages) - (self.n_resampled + 1) / n
+        return max(math.sqrt(max(related, 0.0) + self.start_variance), self.weighted.log_z_error)
 
 
-def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Weighted:
+def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Particles:
     """Draw equally weighted samples of the prior: the posterior of no readings, whose evidence is one."""
     theta = prior.from_unit_cube(rng.random((n_particles, len(prior.names))))
     if not np.isfinite(prior.log_prob(theta)).all():
@@ -53,17 +94,17 @@ def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator)
             "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?",
         )
     even = np.full(n_particles, -math.log(n_particles))
-    return Weighted(prior.names, theta, np.zeros(n_particles), even, 0.0, 0.0, float(n_particles), 0, -math.inf)
+    drawn = Weighted(prior.names, theta, np.zeros(n_particles), even, 0.0, 0.0, float(n_particles), 0, -math.inf)
+    return Particles(drawn, np.arange(n_particles))
 
 
 def update(
-    previous: Weighted,
+    previous: Particles,
     problem: SensorProblem,
     *,
     rng: np.random.Generator,
-    fall_back: Callable[[], NestedResult],
-    blocks: Callable[[FloatArray], tuple[Block, ...]],
-) -> Weighted:
+    fall_back: Callable[[], NestedResult] | None = None,
+) -> Particles:
     """Take in the last reading of a problem.
 
     Parameters
@@ -75,27 +116,35 @@ def update(
     rng
         Source of randomness.
     fall_back
-        Runs the whole problem from scratch: where no sample expected the reading, or they cannot be moved.
-    blocks
-        Splits samples into kinds that use different parameters.
+        Runs the whole problem from scratch: where no sample expected the reading, or they cannot be moved. Without,
+        the samples go on as best they can, and are marked as strained.
 
     Returns
     -------
-    Weighted
-        As many samples as before; `run` is the run from scratch where one was needed.
+    Particles
+        As many samples as before; `run` is the run from scratch where one was needed. An evidence of zero says that
+        no sample could have given the reading: then they stay where they are.
     """
-    n = len(previous.theta)
+    before = previous.weighted
+    n = len(before.theta)
+    if before.log_z == -math.inf:
+        return previous
     bridge = _Bridge(problem)
-    predicted = problem.model.predict(previous.theta, problem.recording.plan)
+    predicted = problem.model.predict(before.theta, problem.recording.plan)
+    strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
     if bridge.missed(predicted) > SURPRISED:
-        return _from_scratch(fall_back(), n, bridge, n, blocks, rng)
-    now = _Cloud(previous.theta, problem.prior.log_prob(previous.theta), *bridge.weigh(predicted))
-    log_weight, base = previous.log_weight, previous.log_likelihood
-    log_z, variance, n_calls, share = previous.log_z, previous.log_z_error**2, n, 0.0
+        if fall_back is not None:
+            return _from_scratch(fall_back(), n, bridge, n, rng)
+        strained = True
+    now = _Cloud(before.theta, problem.prior.log_prob(before.theta), *bridge.weigh(predicted))
+    log_weight, base = before.log_weight, before.log_likelihood
+    log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
     while True:
         all_at_once = n_effective(_reweighed(log_weight, now.after, base))
         if all_at_once == 0.0:
-            return _from_scratch(fall_back(), n, bridge, n_calls, blocks, rng)
+            if fall_back is not None:
+                return _from_scratch(fall_back(), n, bridge, n_calls, rng)
+            return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
         share = 1.0 if all_at_once >= KEEP * n else _next_share(log_weight, base, now, share)
         weighed = _reweighed(log_weight, now.at(share), base)
         gained = float(logsumexp(weighed))
@@ -105,24 +154,59 @@ def update(
         if share == 1.0 and n_eff >= KEEP * n:
             break
         rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
-        now, moves = _move(now.take(rows), share, bridge, blocks, rng)
-        n_calls += moves.n_calls
+        now, moves = _move(now.take(rows), share, bridge, rng, _parted(rows) if fall_back is None else None)
+        n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
         if moves.accepted < STIFF:
-            return _from_scratch(fall_back(), n, bridge, n_calls, blocks, rng)
+            if fall_back is not None:
+                return _from_scratch(fall_back(), n, bridge, n_calls, rng)
+            strained = True
         base, log_weight = now.at(share), np.full(n, -math.log(n))
         if share == 1.0:
             break
     tail = pareto_k(log_weight) if n_eff < n else -math.inf
-    return Weighted(
-        previous.names,
+    found = Weighted(
+        before.names,
         now.theta,
         now.after,
         log_weight,
         log_z,
         math.sqrt(variance),
         n_effective(log_weight),
-        previous.n_calls + n_calls,
+        before.n_calls + n_calls,
         tail,
+    )
+    return Particles(found, ancestor, previous.start_variance, n_resampled, strained)
+
+
+def resized(particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
+    """Go on with another number of samples, drawn by weight from those there are and moved apart.
+
+    `problem` is of the readings that they have taken in.
+    """
+    had = particles.weighted
+    if n == len(had.theta) or had.log_z == -math.inf:
+        return particles
+    rows = resampled(had.weight, n, rng)
+    start = _Cloud(had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1)))
+    moved, moves = _move(start, 1.0, _Bridge(problem), rng) if len(problem.recording) else (start, _Moves(0.0, 0))
+    found = replace(_even(moved, had), n_calls=had.n_calls + moves.n_calls)
+    return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
+
+
+def sampled(found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
+    """Begin anew with `n` samples drawn by weight from a posterior and moved apart; its evidence counts from here."""
+    bridge = _Bridge(problem)
+    cloud = bridge.cloud(found.theta[resampled(found.weight, n, rng)])
+    moved, moves = _move(cloud, 1.0, bridge, rng)
+    drawn = replace(_even(moved, found), n_calls=found.n_calls + n + moves.n_calls)
+    return Particles(drawn, np.arange(n), found.log_z_error**2)
+
+
+def _even(cloud: _Cloud, of: Weighted) -> Weighted:
+    n = len(cloud.theta)
+    even = np.full(n, -math.log(n))
+    return replace(
+        of, theta=cloud.theta, log_likelihood=cloud.after, log_weight=even, n_eff=float(n), pareto_k=-math.inf
     )
 
 
@@ -202,27 +286,27 @@ def _move(
     start: _Cloud,
     share: float,
     bridge: _Bridge,
-    blocks: Callable[[FloatArray], tuple[Block, ...]],
     rng: np.random.Generator,
+    parts: Sequence[IntArray] | None = None,
 ) -> tuple[_Cloud, _Moves]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density as it is.
 
-    A round is a proposal from kernels fitted to all samples, then one along the difference of two of
+    A round is a proposal from kernels fitted to samples, then one along the difference of two of
     them (ter Braak 2006): the first follows bent shells of few parameters, the second needs no
     density and so goes on working for many.
+
+    Kernels about the very samples that are moved find them denser than they are, and the samples drift
+    apart: of `parts`, rows of the samples, each is moved by kernels fitted to the part before it.
     """
     n = len(start.theta)
-    parts = [
-        (np.ix_(block.rows, block.columns), block.rows, LocalKernels.about(own, rng=rng))
-        for block in blocks(start.theta)
-        if len(own := start.theta[np.ix_(block.rows, block.columns)]) > FEWEST * len(block.columns)
-    ]
+    parts = [np.arange(n)] if parts is None else parts
+    kernels = [LocalKernels.about(start.theta[rows], rng=rng) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
     for _ in range(MOST_ROUNDS):
         for propose in (_from_kernels, _along_differences):
-            theta, log_ratio = now.theta.copy(), np.full(n, -np.inf)
-            for where, rows, kernels in parts:
-                theta[where], log_ratio[rows] = propose(now.theta[where], kernels, rng)
+            theta, log_ratio = np.empty_like(now.theta), np.empty(n)
+            for k, rows in enumerate(parts):
+                theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
             proposed = bridge.cloud(theta)
             odds = proposed.log_prior + proposed.at(share) - now.log_prior - now.at(share) + log_ratio
             taken = np.log(rng.random(n)) < odds
@@ -250,6 +334,11 @@ def _along_differences(
     return theta + length * (theta[one] - theta[other]), np.zeros(n)
 
 
+def _parted(rows: IntArray) -> list[IntArray]:
+    """Part samples drawn anew from `rows`, so that copies of one are together."""
+    return [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
+
+
 def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:
     """Largest share of the last reading that leaves enough samples that count, by bisection."""
     low, high, enough = share, 1.0, KEEP * len(base)
@@ -272,14 +361,14 @@ def _from_scratch(
     n: int,
     bridge: _Bridge,
     n_calls: int,
-    blocks: Callable[[FloatArray], tuple[Block, ...]],
     rng: np.random.Generator,
-) -> Weighted:
+) -> Particles:
     """Draw as many samples as before from a run, and move them apart."""
     found = bridge.cloud(run.samples(n, rng=rng))
-    moved, moves = _move(found, 1.0, bridge, blocks, rng)
+    moved, moves = _move(found, 1.0, bridge, rng)
     even = np.full(n, -math.log(n))
     calls = n_calls + run.n_calls + n + moves.n_calls
-    return Weighted(
+    drawn = Weighted(
         run.names, moved.theta, moved.after, even, run.log_z, run.log_z_error, float(n), calls, -math.inf, run
     )
+    return Particles(drawn, np.arange(n), run.log_z_error**2)

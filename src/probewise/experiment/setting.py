@@ -17,7 +17,7 @@ from probewise.arm.instrument import Reading
 from probewise.errors import ParameterError
 from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import recording_of
-from probewise.experiment.particles import Block
+from probewise.experiment.kinds import Kind, kinds_of
 from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
 from probewise.inference.student_t import StudentT
 from probewise.inquiry import (
@@ -218,16 +218,10 @@ class Experiment:
         recording = recording_of(readings, instrumentation=self.instrumentation)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
-    def blocks(self, theta: FloatArray) -> tuple[Block, ...]:
-        """Split hypotheses by shape: each uses the sensor's parameters and its own."""
-        if not isinstance(self.shape, AnyOf):
-            return (Block(np.arange(len(theta)), np.arange(theta.shape[1])),)
-        sensor = np.arange(self.shape_columns[0])
-        which = self.shape.which(theta[:, self.shape_columns])
-        return tuple(
-            Block(np.flatnonzero(which == k), np.concatenate([sensor, self.shape_columns[columns]]))
-            for k, columns in enumerate(self.shape.prior.columns)
-        )
+    @cached_property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of hypotheses that are weighed against each other."""
+        return tuple(kinds_of(self.shape, self.sensor_prior, self.prior, self.forecast.model, self.likelihood))
 
     def is_known(self, sd: FloatArray, shapes: Mapping[str, float]) -> bool:
         """Tell whether the shape's posterior sds and the shapes' probabilities satisfy the stopping rule."""

@@ -13,6 +13,7 @@ from probewise._display import ShowsItself
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import recording_of
+from probewise.experiment.posterior import Posterior
 from probewise.experiment.setting import Experiment, widest_mm
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
@@ -28,12 +29,12 @@ PAPER_BITS = 25.0
 class State:
     """Where a run stands.
 
-    `readings` so far, the `posterior` given them, where the next is to be taken, and the poses of those
+    `readings` so far, the `posterior` given them, kind by kind, where the next is to be taken, and the poses of those
     `planned` after it, where several are chosen at a time.
     """
 
     readings: tuple[Reading, ...]
-    posterior: Weighted
+    posterior: Posterior
     next_pose: Pose
     planned: tuple[Pose, ...] = ()
 

@@ -1,0 +1,197 @@
+"""The posterior of a run: a mixture of kinds of hypotheses, each with its own samples, its own evidence, its own error.
+
+A kind is probable as its prior times its evidence. It is never lost for being improbable: its samples go
+on with every reading, fewer of them, so that later readings can bring it back. Carried evidences
+grow uncertain; where that could change what is believed of the kinds, the evidence is taken anew
+from all readings: by a bridge between the samples and kernels about them, and where the samples could not
+follow the readings, by nested sampling of that kind alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import expit, logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError
+from probewise.experiment.evidence import Bridged, bridged, redrawn
+from probewise.experiment.kinds import Kind
+from probewise.experiment.particles import Particles, prior_particles, resized, sampled, update
+from probewise.inference.problem import SensorProblem
+from probewise.nested.importance import Weighted
+from probewise.nested.result import NestedResult
+from probewise.recordings.plan import Recording
+
+__all__ = ["Posterior", "prior_posterior", "updated"]
+
+FromScratch = Callable[[SensorProblem], NestedResult]
+
+_IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
+_FEWER = 3  # times
+_MOST_OFF = 0.02  # by which a kind's probability may be wrong
+_CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
+_STRAINED = 6.0  # nats, where samples could not follow
+_TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
+_LOST = 0.01  # probability of a kind that must not be overlooked
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Samples of every kind, in the order of the kinds."""
+
+    kinds: tuple[Kind, ...]
+    particles: tuple[Particles, ...]
+
+    @property
+    def log_odds(self) -> FloatArray:
+        """Log of prior times evidence, (n_kinds,)."""
+        return np.array([k.log_prior + p.log_z for k, p in zip(self.kinds, self.particles, strict=True)])
+
+    @property
+    def probability(self) -> FloatArray:
+        """Probability of each kind, (n_kinds,), summing to one."""
+        return _shares(self.log_odds)
+
+    @property
+    def log_z(self) -> float:
+        """Natural log of the evidence of the mixture."""
+        return float(logsumexp(self.log_odds))
+
+    def joined(self, *, rng: np.random.Generator) -> Weighted:
+        """Write the samples of all kinds as those of one posterior; of one kind they are that."""
+        if len(self.kinds) == 1:
+            return self.particles[0].weighted
+        probability = self.probability
+        some = [k for k, p in enumerate(probability) if p > 0]
+        own = [self.particles[k].weighted for k in some]
+        leader = self.particles[int(probability.argmax())].weighted
+        theta = np.concatenate([self.kinds[k].placed(w.theta, rng) for k, w in zip(some, own, strict=True)])
+        log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
+        weight = np.exp(log_weight)
+        errors = np.array([self.particles[k].log_z_error for k in some])
+        return Weighted(
+            self.kinds[0].whole_names,
+            theta,
+            np.concatenate([w.log_likelihood for w in own]),
+            log_weight,
+            self.log_z,
+            float(np.sqrt(probability[some] ** 2 @ errors**2)),
+            float(weight.sum() ** 2 / (weight @ weight)),
+            sum(p.weighted.n_calls for p in self.particles),
+            max(w.pareto_k for w in own),
+            leader.run,
+        )
+
+
+def prior_posterior(kinds: Sequence[Kind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
+    """Draw samples of every kind's prior: the posterior of no readings."""
+    return Posterior(tuple(kinds), tuple(prior_particles(kind.prior, n_particles, rng=rng) for kind in kinds))
+
+
+def updated(
+    previous: Posterior,
+    recording: Recording,
+    n_particles: int,
+    *,
+    rng: np.random.Generator,
+    from_scratch: FromScratch,
+) -> Posterior:
+    """Take in the last reading of a recording.
+
+    Parameters
+    ----------
+    previous
+        Posterior given the readings before.
+    recording
+        All readings.
+    n_particles
+        Samples of a kind that counts.
+    rng
+        Source of randomness.
+    from_scratch
+        Runs a kind's whole problem by nested sampling.
+
+    Raises
+    ------
+    NotConvergedError
+        If no hypothesis of any kind could have given the readings.
+    """
+    problems = [kind.problem(recording) for kind in previous.kinds]
+    if len(problems) == 1:
+        (only,), (problem,) = previous.particles, problems
+        found = update(only, problem, rng=rng, fall_back=lambda: from_scratch(problem))
+        return replace(previous, particles=(found,))
+    particles = [update(p, problem, rng=rng) for p, problem in zip(previous.particles, problems, strict=True)]
+    now = replace(previous, particles=tuple(particles))
+    settled: set[int] = set()
+    while (k := _most_doubtful(now, settled)) is not None:
+        settled.add(k)
+        particles[k] = _renewed(particles[k], problems[k], n_particles, from_scratch, rng)
+        now = replace(now, particles=tuple(particles))
+    if not np.isfinite(now.log_odds).any():
+        raise NotConvergedError("no hypothesis of any kind could have given these readings")
+    for k, p in enumerate(now.probability):
+        n = n_particles if p >= _IMPROBABLE else n_particles // _FEWER
+        particles[k] = resized(particles[k], n, problems[k], rng=rng)
+    return replace(now, particles=tuple(particles))
+
+
+def _shares(log_odds: FloatArray) -> FloatArray:
+    share = np.exp(log_odds - log_odds.max())
+    return np.asarray(share / share.sum())
+
+
+def _most_doubtful(now: Posterior, settled: set[int]) -> int | None:
+    """Find the kind whose probability its doubtful evidence may make most wrong; None where none matters."""
+    log_odds = now.log_odds
+    off = np.zeros(len(log_odds))
+    for k, particles in enumerate(now.particles):
+        if k in settled:
+            continue
+        others = np.delete(log_odds, k)
+        if particles.log_z == -math.inf or not np.isfinite(others).any():
+            off[k] = 1.0 if particles.strained else 0.0
+            continue
+        odds = log_odds[k] - float(logsumexp(others))
+        doubt = 2 * particles.log_z_error + (_CARRIED if particles.n_resampled else 0.0)
+        off[k] = max(abs(_share(odds + way * doubt) - _share(odds)) for way in (-1, 1))
+        if particles.strained and _share(odds + _STRAINED) > _LOST and _share(odds - _STRAINED) < 1 - _LOST:
+            off[k] = 1.0
+    return int(off.argmax()) if off.max() > _MOST_OFF else None
+
+
+def _share(odds: float) -> float:
+    return float(expit(odds))
+
+
+def _renewed(
+    particles: Particles, problem: SensorProblem, n: int, from_scratch: FromScratch, rng: np.random.Generator
+) -> Particles:
+    """Take a kind's evidence anew from all readings; its samples too, where they may have lost something."""
+    had = particles.weighted
+    if not particles.strained:
+        found = bridged(had, problem, rng=rng, n_draws=n)
+        if abs(found.log_z - had.log_z) < _TOLD_APART:
+            return _from_here(particles, found)
+    try:
+        run = from_scratch(problem)
+    except NotConvergedError:  # nothing of this kind could have given the readings, nor ever will
+        return replace(particles, weighted=replace(had, log_z=-math.inf, log_z_error=math.inf), strained=False)
+    points = run.samples(n // 2, rng=rng)
+    if particles.log_z > -math.inf:
+        points = np.concatenate([points, had.samples(n // 2, rng=rng)])
+    drawn = redrawn(points, problem.prior.names, problem, rng=rng, n_draws=2 * n)
+    fresh = sampled(replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng)
+    fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=n))
+    return replace(fresh, weighted=replace(fresh.weighted, run=run))
+
+
+def _from_here(particles: Particles, found: Bridged) -> Particles:
+    """Go on with the samples and an evidence taken anew."""
+    had = particles.weighted
+    weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
+    return Particles(weighted, np.arange(len(had.theta)), found.error**2)

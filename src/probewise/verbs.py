@@ -150,6 +150,7 @@ def explore(
     orientations_rad: float | Sequence[float] = (0.0,),
     heights_mm: float | Sequence[float] = (),
     repeats: int | Sequence[int] = (1,),
+    trust: float | None = None,
     max_readings: int = MAX_READINGS,
     journal: str | Path | None = None,
     rng: np.random.Generator,
@@ -188,6 +189,9 @@ def explore(
     orientations_rad, heights_mm, repeats
         What else may be chosen, of an arm that can: see `probewise.experiment.experiment_for`. One number leaves no
         choice.
+    trust
+        Probability that the sensor model leaves nothing out; below 1 the run weighs what it may leave out along with
+        the shape. By default 0.9; 1 with the naive model, a sensor that is learnt along, or several shapes.
     max_readings
         Stop here if the shape is not known by then.
     journal
@@ -238,9 +242,11 @@ def explore(
     require_rng(rng)
     field = Field() if field is None else field
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
+    lies = posing.shape_of(shape, field)
+    usual = posing.usual_trust(lies, model=model, learn_sensor=learn_sensor)
     asked = posing.experiment_for(
         sensor,
-        posing.shape_of(shape, field),
+        lies,
         field,
         model=model,
         utility=utility_named(utility) if isinstance(utility, str) else utility,
@@ -249,6 +255,7 @@ def explore(
         orientations_rad=require_one_or_several("orientations_rad", orientations_rad),
         heights_mm=require_one_or_several("heights_mm", heights_mm),
         repeats=tuple(require_whole("repeats", n) for n in require_one_or_several("repeats", repeats)),
+        trust=usual if trust is None else trust,
     )
     streams, hidden = posing.Streams.of(rng), None
     path = None if journal is None else require_path("journal", journal)

@@ -70,6 +70,7 @@ def row(mean):
 
 ROWS = {"inside, naive": row(16.0), "inside, SSF, believed 30% too narrow, learning it": row(9.0)}
 RUNS = {name: [np.geomspace(300, 3, 10 + k) for k in range(4)] for name in ("inside, SSF", "anywhere, naive", "more")}
+DOUBT = [{"clean": 0.9, "lag": 0.1}, {"clean": 0.2, "lag": 0.7, "halo": 0.1}]
 WIDTHS = {"naive model": np.geomspace(300, 3, 26), "SSF model": np.geomspace(300, 3, 16)}
 EFFECTS = [f"an_effect_of_a_long_name_{k}" for k in range(24)]
 
@@ -85,6 +86,7 @@ FIGURES = {
         dict.fromkeys((1, 2, 3), blob()), {1: -389.8, 2: -394.0, 3: -397.7}, {1: 0.02, 2: 0.5, 3: 0.6}
     ),
     "log_evidences": lambda s: plots.log_evidences([1, 2], [-3.0, -5.0], [0.1, 0.2]),
+    "belief_in_the_sensor": lambda s: plots.belief_in_the_sensor(DOUBT),
     "posterior_widths": lambda s: plots.posterior_widths(WIDTHS),
     "information_gained": lambda s: plots.information_gained({k: np.arange(16.0) for k in WIDTHS}),
     "readings_by_orientation": lambda s: plots.readings_by_orientation(s.recording),

@@ -92,6 +92,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="infer the SSF's size and place and both levels along with the shape, from what sensor.json says of them",
     )
+    parser.add_argument(
+        "--trust",
+        type=float,
+        metavar="P",
+        help="probability that the sensor model leaves nothing out; below 1 the robot weighs what it may leave out "
+        "along with the shape (default 0.9; 1 with --model naive, --learn-sensor or several shapes)",
+    )
     parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
     more = parser.add_argument_group("more than a place", "what else the robot may choose, of an arm that can")
     more.add_argument(
@@ -148,8 +155,13 @@ def run(arguments: argparse.Namespace) -> int:
         orientations_rad=orientations_rad,
         repeats=repeats,
     )
+    usual = posing.usual_trust(shape, model=arguments.model, learn_sensor=arguments.learn_sensor)
     experiment = pose_it(
-        model=arguments.model, learn_sensor=arguments.learn_sensor, batch=arguments.batch, heights_mm=heights_mm
+        model=arguments.model,
+        learn_sensor=arguments.learn_sensor,
+        batch=arguments.batch,
+        heights_mm=heights_mm,
+        trust=usual if arguments.trust is None else arguments.trust,
     )
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
     other = pose_it(model=other_model) if arguments.both_models else None
@@ -256,7 +268,14 @@ def run(arguments: argparse.Namespace) -> int:
         write_bytes_atomically(stage / "run.gif", gif(frames))
         write_text_atomically(stage / "result.json", posing.result_json(result))
         write_text_atomically(stage / "samples.csv", posing.samples_csv(result))
+        learnt = posing.repaired(sensor, result.last, rng=np.random.default_rng(arguments.seed))
+        write_text_atomically(stage / "sensor.json", learnt.to_json())
     say(result.summary(), quiet=arguments.quiet)
+    missing = posing.left_out_of(result.last, experiment.trust)
+    if experiment.trust < 1:
+        say(missing.sentence, quiet=arguments.quiet)
+    if missing.leading != posing.CLEAN:
+        say(f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS", quiet=arguments.quiet)
     if known is not None:
         say(f"error        {report.errors_text(result.last, known)}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)

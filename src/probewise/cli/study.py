@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import shlex
 from functools import partial
 from typing import TYPE_CHECKING
@@ -14,6 +16,8 @@ from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from probewise.study import Row
 
 __all__ = ["VERB"]
@@ -29,6 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--quoted", type=positive_int, metavar="N", help="circles of the first row (default as --circles)"
+    )
+    parser.add_argument(
+        "--concealed",
+        action="store_true",
+        help="conceal an effect from the robot in every row, three sizes each, and look for the same circles with and "
+        "without doubt about the sensor (writes concealed.csv; no other row)",
     )
     one = parser.add_argument_group("one row instead of the table's", "what is not given is as in the reference row")
     one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, wholly in the field) or anywhere")
@@ -53,6 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.study import run_study
 
     out = check_out_directory(arguments.out)
+    if arguments.concealed:
+        return _run_concealed(arguments, out)
     rows = _rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
@@ -76,6 +88,45 @@ def run(arguments: argparse.Namespace) -> int:
         page = report.write_page(study, command=_command(arguments))
         write_text_atomically(stage / "report.html", page)
     say(report.answer(study), quiet=arguments.quiet)
+    say(f"written to {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
+    """Run what is left of the study of concealed effects and write its table."""
+    from probewise._progress import progress_shown
+    from probewise.recordings import write_text_atomically
+    from probewise.study import concealed_table, run_concealed
+
+    others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
+    if others:
+        raise ParameterError(others[0], "given", "none with --concealed, whose rows are its own")
+    out.mkdir(parents=True, exist_ok=True)
+    trials = out / "concealed.jsonl"
+    kept = partial(campaign_keeps, trials, "run", arguments)
+    with (
+        saying_what_is_kept(kept),
+        progress_shown(quiet=arguments.quiet) as progress,
+        executor_of(arguments) as executor,
+    ):
+        found = run_concealed(
+            arguments.circles,
+            path=trials,
+            max_readings=arguments.max_readings,
+            executor=executor,
+            progress=progress,
+        )
+    table = concealed_table(found)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    write_text_atomically(out / "concealed.csv", text.getvalue())
+    for row in table:
+        said = (
+            f"{row['concealed']} {row['size']}, trust {row['trust']:g}: {row['readings']:g} readings, intervals hold "
+        )
+        say(f"{said}{row['intervals_hold']}, sure and wrong {row['sure_and_wrong']}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
 

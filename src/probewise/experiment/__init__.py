@@ -16,10 +16,12 @@ from probewise.experiment.journal import (
 )
 from probewise.experiment.judging import chance_off
 from probewise.experiment.learning import AdjustedMixture, Change, sensor_prior
+from probewise.experiment.left_out import CLEAN, LeftOut, left_out_of, repaired
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
 from probewise.experiment.setting import Experiment, OneScan
 from probewise.experiment.simulation import (
+    TRUST,
     Model,
     Streams,
     arm_over,
@@ -29,14 +31,17 @@ from probewise.experiment.simulation import (
     shape_named,
     shape_of,
     surface_of,
+    usual_trust,
     world_like,
 )
 from probewise.experiment.start import run_from
 from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 
 __all__ = [
+    "CLEAN",
     "OFF_MM",
     "PAPER_BITS",
+    "TRUST",
     "AdjustedMixture",
     "Belief",
     "Change",
@@ -49,6 +54,7 @@ __all__ = [
     "Hidden",
     "Journal",
     "JournalWriter",
+    "LeftOut",
     "Model",
     "OneScan",
     "State",
@@ -63,9 +69,11 @@ __all__ = [
     "explore",
     "found_shape",
     "least_readings",
+    "left_out_of",
     "members_of",
     "read_journal",
     "recording_of",
+    "repaired",
     "require_same_settings",
     "result_json",
     "run",
@@ -78,6 +86,7 @@ __all__ = [
     "shape_of",
     "step",
     "surface_of",
+    "usual_trust",
     "value_digest",
     "world_like",
 ]

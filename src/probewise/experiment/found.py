@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from probewise.experiment.judging import chance_off
+from probewise.experiment.left_out import left_out_of
 from probewise.experiment.values import Exploration
 from probewise.nested.weights import weighted_quantiles
 from probewise.scene.albedo import Shape
@@ -75,6 +76,7 @@ def result_json(run: Exploration) -> str:
         "known": run.reached,
         "shape": asdict(found_shape(run)),
         "chance_off_12mm": chance_off(run.experiment, run.posterior, OFF_MM),
+        "left_out": left_out_of(run.last, run.experiment.trust).as_json(),
         "bits": run.last.bits,
         "seconds": run.seconds,
     }

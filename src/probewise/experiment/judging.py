@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.stats import chi2
@@ -15,7 +15,11 @@ from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.scene.shapes import AnyOf
 
-__all__ = ["chance_off", "doubt", "fit", "information", "learnt", "moments", "stop_reason"]
+__all__ = ["OFF_SDS", "chance_off", "doubt", "fit", "information", "learnt", "moments", "stop_reason"]
+
+
+OFF_SDS = 3.0
+"""How far off, in sds that the run ends on, a length is to be called wrong: 12 mm for 4 mm."""
 
 
 def information(posterior: Weighted) -> float:
@@ -94,14 +98,13 @@ def doubt(p_value: float, worst: int, readings: Sequence[Reading]) -> str:
 def stop_reason(
     experiment: Experiment,
     sd: FloatArray,
-    shapes: Mapping[str, float],
+    known: bool,
     p_value: float,
     outlook: UtilityMap,
     n_readings: int,
     max_readings: int | None,
 ) -> str | None:
     """Say why a run ends, or None where it goes on."""
-    known = experiment.is_known(sd, shapes)
     widest = widest_mm(experiment.shape.prior.names, sd)
     if known and p_value < experiment.doubt_p:
         return (

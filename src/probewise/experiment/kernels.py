@@ -44,7 +44,7 @@ class LocalKernels:
         origin = points.mean(axis=0)
         away = points - origin
         scale = np.maximum(points.std(axis=0), 1e-300)
-        rows = rng.permutation(n_samples)[:_MOST_KERNELS]
+        rows = rng.permutation(n_samples)[: min(_MOST_KERNELS, (n_samples + 1) // 2)]
         n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
         near = cKDTree(away / scale).query(away[rows] / scale, k=n_near)[1].reshape(len(rows), n_near)
         centre = away[rows]

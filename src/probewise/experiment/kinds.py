@@ -1,18 +1,24 @@
-"""The kinds of hypotheses that a run weighs against each other: one for each shape that may lie there."""
+"""The kinds of hypotheses that a run weighs against each other: what lies there, and what the sensor leaves out."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.effects import NamedEffect
+from probewise.errors import ParameterError
+from probewise.experiment.rivals import Rival
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf
+from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 
 __all__ = ["Kind", "kinds_of"]
@@ -24,26 +30,32 @@ class Kind:
 
     Attributes
     ----------
-    name
-        What the kind is called; empty where there is no other.
+    shape
+        Which shape of a set; empty where there is one only.
+    left_out
+        What the sensor model leaves out; empty where nothing.
     log_prior
         Natural log of its probability before the first reading.
     prior, model, likelihood
         Of its own parameters.
     placed
         Writes its hypotheses, (n, n_own), as hypotheses of the whole experiment, (n, n_params): what they
-        do not say follows the prior.
+        do not say follows the prior, what the sensor leaves out is left aside.
     whole_names
         Names of the experiment's parameters.
+    effect
+        What is left out, where it is an effect on the mean; its parameters are the last of the kind's.
     """
 
-    name: str
+    shape: str
+    left_out: str
     log_prior: float
     prior: Prior
     model: SensorModel
     likelihood: Likelihood
     placed: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
+    effect: NamedEffect[Any] | None = None
 
     def problem(self, recording: Recording) -> SensorProblem:
         """Set up the inference of this kind from a recording."""
@@ -51,8 +63,15 @@ class Kind:
 
 
 def kinds_of(
-    shape: Shape, sensor_prior: Prior | None, prior: Prior, model: SensorModel, likelihood: Likelihood
-) -> Sequence[Kind]:
+    shape: Shape,
+    sensor_prior: Prior | None,
+    prior: Prior,
+    models: tuple[SensorModel, SensorModel],
+    likelihood: Likelihood,
+    *,
+    trust: float = 1.0,
+    rivals: Sequence[Rival] = (),
+) -> tuple[Kind, ...]:
     """List the kinds of an experiment.
 
     Parameters
@@ -61,30 +80,89 @@ def kinds_of(
         What may lie there: each shape of a set is a kind.
     sensor_prior
         Of the parameters before the shape's, which every kind has; or None.
-    prior, model, likelihood
+    prior, likelihood
         Of all parameters of the experiment.
+    models
+        The sensor model as the plain kinds ask it, with its tables, and the chain that effects are added to.
+    trust
+        Probability that the sensor model leaves nothing out; the rivals share the rest evenly.
+    rivals
+        What it may leave out, beside each shape.
     """
-    if not isinstance(shape, AnyOf):
-        return (Kind("", 0.0, prior, model, likelihood, _as_they_are, prior.names),)
-    n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
+    quick, chain = models
     kinds = []
-    for k, (name, member) in enumerate(shape.shapes.items()):
-        columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns[k]])
-        own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
-        middle = prior.from_unit_cube(np.full((1, len(prior.names)), 0.5))[0]
-        middle[n_sensor] = k + 0.5
-        part = _Part(model, own.names, columns, frozen(middle))
-        place = _Place(prior, n_sensor, k, columns)
-        kinds.append(Kind(name, float(np.log(shape.weights[k])), own, part, likelihood, place, prior.names))
+    for part in _parts(shape, sensor_prior, prior):
+        own, log_prior = part.prior, math.log(part.share)
+        plain = log_prior + math.log(trust)
+        kinds.append(Kind(part.label, "", plain, own, part.model(quick), likelihood, part.placed, prior.names))
+        for rival in rivals:
+            log_p = log_prior + math.log((1.0 - trust) / len(rivals))
+            if rival.effect is None:
+                model, law = part.model(quick), rival.likelihood or likelihood
+                kinds.append(Kind(part.label, rival.name, log_p, own, model, law, part.placed, prior.names))
+                continue
+            if not isinstance(chain, Chain):
+                raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
+            both = Joint((own, _Called(rival.name, rival.effect.prior)))
+            model = part.model(chain.with_effects(rival.effect))
+            kinds.append(
+                Kind(part.label, rival.name, log_p, both, model, likelihood, part.placed, prior.names, rival.effect)
+            )
     return tuple(kinds)
-
-
-def _as_they_are(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return theta
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
+    """One shape: its prior with the sensor's, its share, and which columns of the whole its parameters are.
+
+    `number` is its place in the set and `n_sensor` how many columns come before the shape's; None for an only shape,
+    whose columns are all.
+    """
+
+    label: str
+    share: float
+    prior: Prior
+    whole: Prior
+    columns: IntArray
+    number: int | None
+    n_sensor: int
+
+    def placed(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """See `Kind.placed`."""
+        if self.number is None:
+            return theta[:, : len(self.columns)]
+        u = rng.random((len(theta), len(self.whole.names)))
+        full = self.whole.from_unit_cube(u)
+        full[:, self.n_sensor] = self.number + u[:, self.n_sensor]
+        full[:, self.columns] = theta[:, : len(self.columns)]
+        return np.asarray(full)
+
+    def model(self, whole: SensorModel) -> SensorModel:
+        """Ask a model of all parameters, and of an effect's behind them, for this shape alone."""
+        if self.number is None:
+            return whole
+        middle = self.whole.from_unit_cube(np.full((1, len(self.whole.names)), 0.5))[0]
+        middle[self.n_sensor] = self.number + 0.5
+        more = whole.names[len(middle) :]
+        columns = np.concatenate([self.columns, np.arange(len(middle), len(whole.names))])
+        others = frozen(np.concatenate([middle, np.zeros(len(more))]))
+        return _Asked(whole, (*self.prior.names, *more), columns, others)
+
+
+def _parts(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_Part]:
+    if not isinstance(shape, AnyOf):
+        return [_Part("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
+    n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
+    parts = []
+    for k, (name, member) in enumerate(shape.shapes.items()):
+        columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns[k]])
+        own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
+        parts.append(_Part(name, shape.weights[k], own, prior, columns, k, n_sensor))
+    return parts
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
     """A model of which some parameters are asked; the others, which make no difference, stay as they are."""
 
     whole: SensorModel
@@ -100,17 +178,25 @@ class _Part:
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
-    """Writes hypotheses of one shape among those of a set."""
+class _Called:
+    """An effect's prior with its parameters called as a chain calls them."""
 
-    prior: Prior
-    shape_column: int
-    number: int
-    columns: IntArray
+    effect: str
+    own: Prior
 
-    def __call__(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-        u = rng.random((len(theta), len(self.prior.names)))
-        full = self.prior.from_unit_cube(u)
-        full[:, self.shape_column] = self.number + u[:, self.shape_column]
-        full[:, self.columns] = theta
-        return np.asarray(full)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names as "effect.parameter"."""
+        return tuple(f"{self.effect}.{name}" for name in self.own.names)
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """See `Prior.from_unit_cube`."""
+        return self.own.from_unit_cube(u)
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """See `Prior.to_unit_cube`."""
+        return self.own.to_unit_cube(theta)
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        """See `Prior.log_prob`."""
+        return self.own.log_prob(theta)

@@ -28,9 +28,10 @@ from probewise.experiment.journal import (
     read_journal,
     require_same_settings,
 )
-from probewise.experiment.judging import doubt, fit, information, learnt, moments, stop_reason
+from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, information, learnt, moments, stop_reason
 from probewise.experiment.posterior import prior_posterior, updated
 from probewise.experiment.setting import Experiment
+from probewise.experiment.settling import settling
 from probewise.experiment.values import Exploration, State, Step
 from probewise.inference.problem import SensorProblem
 from probewise.inquiry import bits_gained, prior_entropy
@@ -126,12 +127,19 @@ def step(
         )
     posterior = carried.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
-    p_value, worst = fit(experiment, posterior, problem)
+    off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
+    leader = carried.kinds[carried.leader]
+    p_value, worst = fit(experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording))
+    if leader.likelihood is not experiment.likelihood:
+        p_value = 1.0  # that law of the noise expects readings that are far off
     notes = () if posterior.run is None else posterior.run.warnings
     if p_value < experiment.doubt_p:
         notes = (*notes, doubt(p_value, worst, readings))
     prospect, outlook = inquire(experiment, posterior, field, at=reading, rng=rng)
-    reason = stop_reason(experiment, sd, shapes, p_value, outlook, len(readings), max_readings)
+    if experiment.trust < 1:
+        outlook = settling(experiment, carried, prospect, outlook, readings, rng=rng)
+    known = experiment.is_known(sd, shapes, off)
+    reason = stop_reason(experiment, sd, known, p_value, outlook, len(readings), max_readings)
     pose, *planned = state.planned or next_poses(experiment, prospect, outlook, rng=rng)
     info = Step(
         number=len(readings),
@@ -147,6 +155,9 @@ def step(
         p_value=p_value,
         posterior=posterior,
         sensor=learnt(experiment, posterior),
+        left_out=carried.left_out,
+        kinds=carried,
+        chance_off=off,
         stop_reason=reason,
         notes=notes,
     )

@@ -32,6 +32,7 @@ FromScratch = Callable[[SensorProblem], NestedResult]
 
 _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times
+_SUSPECTED = ((0.2, 1), (0.02, 2), (0.0, 5))  # probability from which on a rival has which fraction of the samples
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
@@ -61,6 +62,19 @@ class Posterior:
         """Natural log of the evidence of the mixture."""
         return float(logsumexp(self.log_odds))
 
+    @property
+    def left_out(self) -> dict[str, float]:
+        """Probability of each thing that the sensor may leave out, whatever lies there; "" is nothing."""
+        shares: dict[str, float] = {}
+        for kind, p in zip(self.kinds, self.probability.tolist(), strict=True):
+            shares[kind.left_out] = shares.get(kind.left_out, 0.0) + p
+        return shares
+
+    @property
+    def leader(self) -> int:
+        """Number of the most probable kind."""
+        return int(self.log_odds.argmax())
+
     def joined(self, *, rng: np.random.Generator) -> Weighted:
         """Write the samples of all kinds as those of one posterior; of one kind they are that."""
         if len(self.kinds) == 1:
@@ -68,7 +82,7 @@ class Posterior:
         probability = self.probability
         some = [k for k, p in enumerate(probability) if p > 0]
         own = [self.particles[k].weighted for k in some]
-        leader = self.particles[int(probability.argmax())].weighted
+        leader = self.particles[self.leader].weighted
         theta = np.concatenate([self.kinds[k].placed(w.theta, rng) for k, w in zip(some, own, strict=True)])
         log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
         weight = np.exp(log_weight)
@@ -89,7 +103,10 @@ class Posterior:
 
 def prior_posterior(kinds: Sequence[Kind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
     """Draw samples of every kind's prior: the posterior of no readings."""
-    return Posterior(tuple(kinds), tuple(prior_particles(kind.prior, n_particles, rng=rng) for kind in kinds))
+    shares = [math.exp(kind.log_prior) for kind in kinds]
+    sizes = [_size(kind, p, n_particles) for kind, p in zip(kinds, shares, strict=True)]
+    drawn = (prior_particles(kind.prior, n, rng=rng) for kind, n in zip(kinds, sizes, strict=True))
+    return Posterior(tuple(kinds), tuple(drawn))
 
 
 def updated(
@@ -135,9 +152,17 @@ def updated(
     if not np.isfinite(now.log_odds).any():
         raise NotConvergedError("no hypothesis of any kind could have given these readings")
     for k, p in enumerate(now.probability):
-        n = n_particles if p >= _IMPROBABLE else n_particles // _FEWER
-        particles[k] = resized(particles[k], n, problems[k], rng=rng)
+        had, n = len(particles[k].ancestor), _size(now.kinds[k], p, n_particles)
+        if n > had or p < _IMPROBABLE:
+            particles[k] = resized(particles[k], n, problems[k], rng=rng)
     return replace(now, particles=tuple(particles))
+
+
+def _size(kind: Kind, probability: float, n_particles: int) -> int:
+    """Count the samples that a kind is worth; what speaks for a rival is first heard by few."""
+    if kind.left_out:
+        return max(n_particles // next(part for least, part in _SUSPECTED if probability >= least), 100)
+    return n_particles if probability >= _IMPROBABLE else n_particles // _FEWER
 
 
 def _shares(log_odds: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from probewise.errors import ParameterError
 from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import Kind, kinds_of
+from probewise.experiment.rivals import Rival, rivals_of
 from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
 from probewise.inference.student_t import StudentT
 from probewise.inquiry import (
@@ -38,6 +39,10 @@ from probewise.scene.shapes import AnyOf
 from probewise.sensor.stages import SensorModel
 
 __all__ = ["Experiment", "OneScan", "widest_mm"]
+
+
+MOST_OFF = 0.01
+"""Probability of a length that is far off, below which a run that doubts its sensor may end."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,9 @@ class Experiment:
         most probable shape has.
     stop_probability
         For a set of shapes, how probable that shape must be too.
+    trust
+        Probability, before the first reading, that the sensor model leaves nothing out. Below 1 the run weighs what
+        it may leave out (`experiment.rivals`) along with the shape, and ends only when the lengths are known under all.
     doubt_p
         Probability of readings as far from the best hypothesis as these, below which the run says that
         none explains them, and trusts its own certainty no longer; 0 for a model that is known to be coarse.
@@ -128,6 +136,7 @@ class Experiment:
     stop_sd_mm: float = 4.0
     stop_probability: float = 0.95
     doubt_p: float = 1e-6
+    trust: float = 1.0
     n_particles: int = 3000
     n_samples: int = 50
     n_live: int = 200
@@ -142,6 +151,8 @@ class Experiment:
             raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
         if not 0 < self.stop_probability < 1:
             raise ParameterError("stop_probability", self.stop_probability, "between 0 and 1")
+        if not 0 < self.trust <= 1:
+            raise ParameterError("trust", self.trust, "greater than 0, up to 1")
         if not 0 <= self.doubt_p < 1:
             raise ParameterError("doubt_p", self.doubt_p, "0 or more, below 1")
         if self.n_samples < 2:
@@ -164,6 +175,8 @@ class Experiment:
             )
         if not any(name.endswith("_mm") for name in self.shape.prior.names):
             raise ParameterError("shape", self.names, "a shape with a parameter in mm, which the run can stop on")
+        if self.trust < 1:
+            rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
         _ = self.readout, self.designs  # check what they are made of
 
     @cached_property
@@ -221,12 +234,28 @@ class Experiment:
     @cached_property
     def kinds(self) -> tuple[Kind, ...]:
         """The kinds of hypotheses that are weighed against each other."""
-        return tuple(kinds_of(self.shape, self.sensor_prior, self.prior, self.forecast.model, self.likelihood))
+        rivals: tuple[Rival, ...] = ()
+        if self.trust < 1:
+            rivals = rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
+        models = self.forecast.model, self.model
+        return kinds_of(
+            self.shape, self.sensor_prior, self.prior, models, self.likelihood, trust=self.trust, rivals=rivals
+        )
 
-    def is_known(self, sd: FloatArray, shapes: Mapping[str, float]) -> bool:
-        """Tell whether the shape's posterior sds and the shapes' probabilities satisfy the stopping rule."""
+    def is_known(self, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0) -> bool:
+        """Tell whether the stopping rule is met.
+
+        Parameters
+        ----------
+        sd, shapes
+            Posterior sds of the shape's parameters, and the shapes' probabilities.
+        chance_off
+            Probability that a length is off by three times the sd that is asked for (`judging.chance_off`); it
+            counts where the sensor is doubted, for then the posterior has tails that its sds do not show.
+        """
         likely = max(shapes.values(), default=1.0)
-        return widest_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability
+        sure = self.trust == 1 or chance_off < MOST_OFF
+        return widest_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
 
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
         """Say what decides a run: a journal's first line."""
@@ -259,6 +288,7 @@ class Experiment:
                 "stop_sd_mm": self.stop_sd_mm,
                 "stop_probability": self.stop_probability,
                 "doubt_p": self.doubt_p,
+                "trust": self.trust,
                 "n_particles": self.n_particles,
                 "n_samples": self.n_samples,
                 "n_live": self.n_live,

@@ -38,6 +38,7 @@ from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSe
 from probewise.world import Oval, Spot, Surface, World
 
 __all__ = [
+    "TRUST",
     "Model",
     "Streams",
     "arm_over",
@@ -48,6 +49,7 @@ __all__ = [
     "shape_of",
     "surface_of",
     "surface_under",
+    "usual_trust",
     "world_like",
 ]
 
@@ -129,6 +131,7 @@ def experiment_for(
     orientations_rad: tuple[float, ...] = (0.0,),
     repeats: tuple[int, ...] = (1,),
     heights_mm: tuple[float, ...] = (),
+    trust: float = 1.0,
 ) -> Experiment:
     """Pose the experiment: a fitted sensor over a shape that is not known, read on the sensor's own scale.
 
@@ -156,6 +159,9 @@ def experiment_for(
     orientations_rad, repeats, heights_mm
         How the sensor may be turned, how often it may read on the spot and how high it may stand, for an arm that
         can do so; heights for the SSF model of a sensor whose description says at which it was calibrated.
+    trust
+        Probability that the sensor model leaves nothing out, before the first reading; below 1 for the SSF model of
+        a sensor that is known.
     """
     require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
@@ -180,6 +186,7 @@ def experiment_for(
         calibrated_height_mm=_calibrated_height(sensor, model, heights_mm) if heights_mm else None,
         batch=batch,
         n_live=n_live,
+        trust=trust,
     )
     if model == "naive":
         if learn_sensor:
@@ -199,6 +206,15 @@ def experiment_for(
         free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, effects, n_nodes=FAST_NODES)
         return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
     return pose(Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES), likelihood)
+
+
+TRUST = 0.9
+"""Probability that a sensor model leaves nothing out, where nobody says otherwise."""
+
+
+def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool) -> float:
+    """Trust a sensor as one does where nobody says otherwise: wholly where doubt has no model, or several shapes."""
+    return 1.0 if model == "naive" or learn_sensor or isinstance(shape, AnyOf) else TRUST
 
 
 def _calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:

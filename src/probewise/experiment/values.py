@@ -67,6 +67,12 @@ class Step(ShowsItself):
         The weighted posterior of all parameters, with the evidence and its error.
     sensor
         Posterior mean and sd of the sensor's parameters by name, where they are learnt too.
+    left_out
+        Probability of each thing that the sensor model may leave out, by name; "" is nothing.
+    kinds
+        The posterior kind by kind.
+    chance_off
+        Probability that a length is off by three times the sd that the run ends on.
     stop_reason
         Why the run ends here, or None.
     notes
@@ -88,6 +94,9 @@ class Step(ShowsItself):
     p_value: float
     posterior: Weighted
     sensor: Mapping[str, tuple[float, float]]
+    left_out: Mapping[str, float]
+    kinds: Posterior
+    chance_off: float
     stop_reason: str | None
     notes: tuple[str, ...]
     replayed: bool = False
@@ -163,7 +172,7 @@ class Exploration(ShowsItself):
     def reached(self) -> bool:
         """Whether shape and lengths are known well enough, by readings that some hypothesis explains."""
         trusted = self.last.p_value >= self.experiment.doubt_p
-        return trusted and self.experiment.is_known(self.last.sd, self.last.shapes)
+        return trusted and self.experiment.is_known(self.last.sd, self.last.shapes, self.last.chance_off)
 
     @property
     def seconds(self) -> float:

@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise.experiment import OFF_MM, Experiment, Exploration, Step, chance_off, found_shape
+from probewise.experiment import CLEAN, OFF_MM, Experiment, Exploration, Step, chance_off, found_shape, left_out_of
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
+    belief_in_the_sensor,
     explain_field,
     grid_of_axes,
     information_gained,
@@ -227,6 +228,23 @@ def write_page(
         for name, (mean, sd) in run.last.sensor.items()
     ]
     learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)
+    doubted = left_out_of(run.last, run.experiment.trust)
+    doubt = (
+        Section(
+            "What the sensor model leaves out",
+            (
+                paragraph(doubted.sentence),
+                figure(
+                    png(belief_in_the_sensor([{n or CLEAN: p for n, p in s.left_out.items()} for s in run.steps])),
+                    "What the robot believes about its sensor after each reading; a dashed line marks a changed mind.",
+                ),
+                table(
+                    ("left out", "probability"),
+                    ((n.replace("_", " "), probability(p)) for n, p in list(doubted.probability.items())[:6]),
+                ),
+            ),
+        ),
+    )
     shapes = (table(("shape", "probability"), ((n, probability(p)) for n, p in run.last.shapes.items())),)
     sections = [
         Section(
@@ -239,6 +257,7 @@ def write_page(
                 *(paragraph(f"Doubtful: {note}.") for note in run.notes),
             ),
         ),
+        *(doubt if run.experiment.trust < 1 else ()),
         Section(
             "How fast",
             (

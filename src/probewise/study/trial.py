@@ -22,15 +22,15 @@ from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeL
 from probewise.study.circles import FIELD, POPULATIONS, noise_of
 from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
-from probewise.world import Blob, World, gaussian_spot
+from probewise.world import Blob, Spot, World, gaussian_spot
 
 __all__ = ["Trial", "arm_of", "experiment_of", "run_trial"]
 
-_SEED = 2013
+SEED = 2013
 # The study's sensor: one Gaussian, mm and LEGO units; the same numbers for the robot and, by pixels, for the world.
-_DARK, _BRIGHT = 10.0, 60.0
+DARK, BRIGHT = 10.0, 60.0
 _CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
-_ON_WHITE = _DARK + 0.1 * (_BRIGHT - _DARK)
+_ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
 _PIXEL_MM = 0.5
 
 
@@ -65,15 +65,15 @@ def experiment_of(row: Row) -> Experiment:
     }
     shape = POPULATIONS[row.population].shape
     if row.model == "naive":
-        likelihood = Naive(_DARK, row.noise_sd, _BRIGHT, row.noise_sd)
-        model = NaiveSensor(FixedLevels(_DARK, _BRIGHT), scene)
+        likelihood = Naive(DARK, row.noise_sd, BRIGHT, row.noise_sd)
+        model = NaiveSensor(FixedLevels(DARK, BRIGHT), scene)
         # A reading on the edge fits neither level, and the naive model knows no edge.
         return Experiment(shape, model, likelihood, **common, doubt_p=0.0)
     sd_u, sd_v = (row.width * sd for sd in _SD)
     covariance = np.array([[sd_u**2, _CORRELATION * sd_u * sd_v], [_CORRELATION * sd_u * sd_v, sd_v**2]])
     mixture = FixedMixture(np.ones(1), np.array([_CENTRE]), covariance[None])
     if not row.learn_sensor:
-        chain = Chain(mixture, FixedLevels(_DARK, _BRIGHT), scene, n_nodes=FAST_NODES)
+        chain = Chain(mixture, FixedLevels(DARK, BRIGHT), scene, n_nodes=FAST_NODES)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
     return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_changed())
@@ -93,7 +93,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     """
     experiment = experiment_of(trial.row)
     arm = arm_of(trial)
-    rng = np.random.default_rng([_SEED, trial.circle])
+    rng = np.random.default_rng([SEED, trial.circle])
     widest, cpu, first_white, bits_at_white = [], [], None, None
     with arm:
         steps = explore(arm, experiment, rng=rng, max_readings=trial.max_readings)
@@ -108,7 +108,9 @@ def run_trial(trial: Trial) -> dict[str, Any]:
             if first_white is None and step.reading.value > _ON_WHITE:
                 first_white, bits_at_white = step.number, round(step.bits, 3)
     return {
-        "reached": bool(last.p_value >= experiment.doubt_p and experiment.is_known(last.sd, last.shapes)),
+        "reached": bool(
+            last.p_value >= experiment.doubt_p and experiment.is_known(last.sd, last.shapes, last.chance_off)
+        ),
         "readings": last.number,
         "first_white": first_white,
         "bits": round(last.bits, 3),
@@ -138,8 +140,7 @@ def _judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, 
 
 def arm_of(trial: Trial) -> SimulatedArm:
     """Stand an arm that reaches the whole grid over the circle, with the noise that every row meets there."""
-    spot = gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
-    world = World(spot, black=_DARK, white=_BRIGHT, noise_sd=0.0)
+    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
     noise, number = noise_of(trial.circle, trial.max_readings), itertools.count()
@@ -152,10 +153,16 @@ def arm_of(trial: Trial) -> SimulatedArm:
     return SimulatedArm(light, reach=everywhere, scale=None)
 
 
+@lru_cache(maxsize=1)
+def spot_of() -> Spot:
+    """Paint what the study's sensor sees, pixel by pixel."""
+    return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
+
+
 def _changed() -> Product:
     """Believe that the sensor may have changed as `experiment.sensor_prior` believes by default."""
     change = Change()
-    level = change.level * (_BRIGHT - _DARK)
+    level = change.level * (BRIGHT - DARK)
     size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)
     return Product(
         {
@@ -163,7 +170,7 @@ def _changed() -> Product:
             "log_size_v": size,
             "shift_u_mm": shift,
             "shift_v_mm": shift,
-            "I_min": Normal(_DARK, level),
-            "I_max": Normal(_BRIGHT, level),
+            "I_min": Normal(DARK, level),
+            "I_max": Normal(BRIGHT, level),
         }
     )

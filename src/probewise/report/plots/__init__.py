@@ -15,6 +15,7 @@ from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
 from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
+from probewise.report.plots.doubt import belief_in_the_sensor
 from probewise.report.plots.fit import predicted_and_recorded
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.noise import (
@@ -48,6 +49,7 @@ __all__ = [
     "arm_and_sensor",
     "audit_matrix",
     "before_and_after",
+    "belief_in_the_sensor",
     "beliefs_by_round",
     "calibration_check",
     "confusion_matrix",

@@ -1,0 +1,112 @@
+"""What a run believes its sensor model leaves out: by name, in a sentence, and written into the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from probewise.calibration import FittedSensor
+from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
+from probewise.experiment.values import Step
+
+__all__ = ["CLEAN", "LeftOut", "left_out_of", "repaired"]
+
+CLEAN = "clean"
+_CREDIBLE = 0.95
+_NAMED = 0.5
+# What belongs to the hours of one run, not to the sensor: the next run has another clock.
+_OF_THE_RUN = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name})
+_ALIASES = (
+    "No reading of the field can show a tilt of the sensor, an offset of the arm or one error of scale along both "
+    "axes: each amounts to another shape."
+)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Probability of each thing, by name, most probable first; `sentence` says it, `leading` is the most probable."""
+
+    probability: Mapping[str, float]
+    sentence: str
+
+    @property
+    def leading(self) -> str:
+        """The most probable."""
+        return next(iter(self.probability))
+
+    @property
+    def credible_set(self) -> tuple[str, ...]:
+        """Names of the fewest that hold 0.95."""
+        held, names = 0.0, []
+        for name, p in self.probability.items():
+            names.append(name)
+            held += p
+            if held >= _CREDIBLE:
+                break
+        return tuple(names)
+
+    def as_json(self) -> dict[str, Any]:
+        """Write it as result.json has it."""
+        hypotheses = [
+            {"effects": [] if name == CLEAN else [name], "probability": p} for name, p in self.probability.items()
+        ]
+        return {"hypotheses": hypotheses, "credible_set": list(self.credible_set), "sentence": self.sentence}
+
+
+def left_out_of(last: Step, trust: float) -> LeftOut:
+    """Sum up what is believed after a step, in a run that trusted its sensor so much."""
+    shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
+    probability = {name: p for p, name in shares}
+    if trust == 1:
+        return LeftOut(probability, "The sensor model was taken for complete, as it was told to be.")
+    name, p = next(iter(probability.items()))
+    others = [spoken_name(n) for n in LeftOut(probability, "").credible_set[1:] if n != CLEAN]
+    beside = f" Not excluded: {', '.join(others)}." if others else ""
+    if name == CLEAN:
+        return LeftOut(probability, f"The sensor model leaves nothing out that shows (p = {p:.3g}).{beside} {_ALIASES}")
+    if p < _NAMED:
+        said = f"Something may be left out, most probably {spoken_name(name)} (p = {p:.3g})."
+    else:
+        said = f"The sensor model leaves something out: {_said(last, name)} (p = {p:.3g})."
+    return LeftOut(probability, f"{said}{beside} {_ALIASES}")
+
+
+def _said(last: Step, name: str) -> str:
+    """Say what an effect does, with its numbers, where it has any."""
+    best = max(
+        (k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name), key=lambda k: last.kinds.log_odds[k]
+    )
+    kind = last.kinds.kinds[best]
+    if kind.effect is None:
+        return spoken_name(name)
+    own = slice(-len(kind.effect.prior.names), None)
+    posterior = last.kinds.particles[best].weighted
+    return kind.effect.sentence(posterior.mean()[own], posterior.sd()[own])
+
+
+def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
+    """Write the effect that a run found into its sensor, with the doubt that it left.
+
+    An effect of the noise, and one that belongs to the hours of the run, is told in a note alone.
+    """
+    name, p = max(last.left_out.items(), key=lambda item: item[1])
+    if not name or p < _NAMED:
+        return sensor
+    kinds = [k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name]
+    best = max(kinds, key=lambda k: last.kinds.log_odds[k])
+    effect = last.kinds.kinds[best].effect
+    note = f"a run that explored with it found {spoken_name(name)} (p = {p:.3g})"
+    if effect is None or name in _OF_THE_RUN or name in sensor.effects:
+        return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
+    n_own, n = len(effect.prior.names), len(sensor.samples)
+    own = last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:]
+    return replace(
+        sensor,
+        names=(*sensor.names, *(f"{name}.{parameter}" for parameter in effect.prior.names)),
+        samples=np.concatenate([sensor.samples, own], axis=1),
+        effects=(*sensor.effects, name),
+        notes=(*sensor.notes, note),
+    )

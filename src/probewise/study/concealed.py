@@ -1,0 +1,211 @@
+"""Measure the robot with a concealed fault: whether it finds the circle, finds the fault, or is sure and wrong.
+
+The sensor model is exact but for one thing, which the world does and the robot is not told: three sizes of each
+effect. The world is `probewise.world`, which sums pixels and shares no code
+with the models. Every row looks for the same circles, with the same noise, with and without doubt.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from probewise._version import __version__
+from probewise.arm import Pose, Reach, SimulatedArm
+from probewise.campaign import run_campaign
+from probewise.experiment import CLEAN, TRUST, chance_off, explore, left_out_of
+from probewise.progress import Progress, silent
+from probewise.recordings import Disc
+from probewise.study.circles import FIELD
+from probewise.study.rows import REFERENCE
+from probewise.study.table import WRONG_MM, share_within
+from probewise.study.trial import BRIGHT, DARK, SEED, Trial, experiment_of, spot_of
+from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
+from probewise.world.concealed import AlbedoGradient, AmbientStep, Dropouts, EdgeBlur, Halo, OffsetDrift, Outliers
+
+__all__ = ["CONCEALED", "ConcealedTrial", "concealed_table", "run_concealed", "run_concealed_trial"]
+
+_EACH_S = 8.0  # between readings, about
+
+CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, float]]] = {
+    "backlash": (Backlash, (1.5, 6.0, 12.0)),
+    "saturation": (Saturation, (55.0, 40.0, 25.0)),
+    "nonlinearity": (Nonlinearity, (1.1, 1.5, 2.2)),
+    "albedo_gradient": (lambda share: AlbedoGradient(-share / FIELD.width_mm, 0.0), (0.1, 0.3, 0.5)),
+    "ambient_gradient": (lambda units: AmbientGradient(units / FIELD.width_mm, 0.0), (2.0, 10.0, 25.0)),
+    "ambient_step": (lambda units: AmbientStep(units, 6 * _EACH_S), (2.0, 8.0, 16.0)),
+    "offset_drift": (lambda units: OffsetDrift(units * 3600.0 / (30 * _EACH_S)), (2.0, 8.0, 16.0)),
+    "gain_drift": (lambda share: GainDrift(share, 15 * _EACH_S), (0.05, 0.15, 0.3)),
+    "edge_blur": (EdgeBlur, (3.0, 11.0, 20.0)),
+    "halo": (lambda share: Halo(share, 25.0), (0.05, 0.2, 0.4)),
+    "dropouts": (lambda share: Dropouts(share, DARK), (0.03, 0.1, 0.2)),
+    "outliers": (lambda share: Outliers(share, 12.0), (0.03, 0.1, 0.2)),
+}
+"""What the world conceals, by name, from a number, and the three sizes: barely detectable, plain, gross."""
+
+
+@dataclass(frozen=True)
+class ConcealedTrial:
+    """One run: what is concealed (empty: nothing) at which of its sizes, which circle, at what trust."""
+
+    effect: str
+    size: int
+    circle: int
+    trust: float
+    max_readings: int = 100
+
+    @property
+    def key(self) -> str:
+        """Name it in the campaign's file."""
+        return f"{self.effect or CLEAN} / {self.size} / {self.circle} / {self.trust:g}"
+
+
+def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
+    """Look for a circle with a sensor that does what the robot is not told.
+
+    Returns
+    -------
+    A JSON object: `known`, `readings`, `error_mm` (the largest of a length), `held` (of each 95 % interval),
+    `chance_wrong`, the probability of the truth among what may be left out and the credible set of names, whether the
+    run itself says that something is wrong (`noticed`), and processor time a decision (`cpu_s`: median, 95 %).
+    """
+    experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
+    plain = Trial(REFERENCE, trial.circle, trial.max_readings)
+    cpu = []
+    with _arm(trial, plain) as arm:
+        steps = explore(
+            arm, experiment, rng=np.random.default_rng([SEED, trial.circle]), max_readings=trial.max_readings
+        )
+        while True:
+            before = time.process_time()
+            step = next(steps, None)
+            if step is None:
+                break
+            last = step
+            cpu.append(time.process_time() - before)
+    theta, weight = last.posterior.theta[:, experiment.shape_columns], last.posterior.weight
+    below = [float(weight[values < true].sum()) for values, true in zip(theta.T, plain.truth, strict=True)]
+    left_out = left_out_of(last, trial.trust)
+    trusted = last.p_value >= experiment.doubt_p
+    return {
+        "known": bool(trusted and experiment.is_known(last.sd, last.shapes, last.chance_off)),
+        "readings": last.number,
+        "error_mm": round(float(np.abs(last.mean - plain.truth).max()), 3),
+        "held": [bool(0.025 <= share <= 0.975) for share in below],
+        "chance_wrong": chance_off(experiment, last.posterior, WRONG_MM),
+        "p_truth": round(left_out.probability.get(trial.effect or CLEAN, 0.0), 4),
+        "credible": list(left_out.credible_set),
+        "noticed": bool(not trusted or left_out.leading != CLEAN),
+        "cpu_s": [round(float(np.quantile(cpu, q)), 3) for q in (0.5, 0.95)],
+    }
+
+
+def _arm(trial: ConcealedTrial, plain: Trial) -> SimulatedArm:
+    """Stand an arm in the world that conceals; its noise goes by the reading's number alone."""
+    concealed: tuple[Concealed, ...] = ()
+    if trial.effect:
+        make, sizes = CONCEALED[trial.effect]
+        concealed = (make(sizes[trial.size]),)
+    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=REFERENCE.noise_sd, concealed=concealed)
+    x_mm, y_mm, radius_mm = plain.truth.tolist()
+    disc, number = Disc((x_mm, y_mm), radius_mm), itertools.count()
+    came: list[tuple[float, float, tuple[float, float]]] = []
+
+    def light(pose: Pose, time_s: float, height_mm: float) -> float:
+        direction = came[-1][2] if came else (0.0, 0.0)
+        if came and (away := math.hypot(pose.x_mm - came[-1][0], pose.y_mm - came[-1][1])) > 0:
+            direction = ((pose.x_mm - came[-1][0]) / away, (pose.y_mm - came[-1][1]) / away)
+        came.append((pose.x_mm, pose.y_mm, direction))
+        rng = np.random.default_rng([SEED, trial.circle, next(number)])
+        return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
+
+    everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
+    return SimulatedArm(light, reach=everywhere, scale=None)
+
+
+def run_concealed(
+    n_circles: int,
+    *,
+    path: str | os.PathLike[str],
+    max_readings: int = 100,
+    effects: Sequence[str] = tuple(CONCEALED),
+    sizes: Sequence[int] = (0, 1, 2),
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> dict[ConcealedTrial, dict[str, Any]]:
+    """Run every row over the first circles, with doubt and without, or go on with a study that was stopped.
+
+    Parameters
+    ----------
+    n_circles
+        Circles a row.
+    path
+        The campaign's file; what it holds is not done again.
+    max_readings
+        A run that knows too little after so many readings counts as a miss.
+    effects, sizes
+        Rows beside that in which nothing is concealed.
+    executor, progress
+        As for `run_study`.
+    """
+    rows = [("", 0), *((name, size) for name in effects for size in sizes)]
+    trials = [
+        ConcealedTrial(name, size, circle, trust, max_readings)
+        for circle in range(n_circles)
+        for name, size in rows
+        for trust in (TRUST, 1.0)
+    ]
+    results = run_campaign(
+        run_concealed_trial,
+        {trial.key: trial for trial in trials},
+        path=path,
+        settings={"concealed": __version__, "max_readings": max_readings},
+        executor=executor,
+        progress=progress,
+        noun="runs",
+    )
+    return {trial: dict(results[trial.key]) for trial in trials}
+
+
+def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Sum up each row, (effect, size, trust): shares with Wilson's 95 % intervals as text."""
+    rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
+    for trial, result in results.items():
+        rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.effect or CLEAN, result))
+    return [_summed(key, runs) for key, runs in rows.items()]
+
+
+def _summed(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    effect, size, trust = key
+    found = [run for _, run in runs]
+    held = [hit for run in found for hit in run["held"]]
+    wrong = sum(run["known"] and run["error_mm"] > WRONG_MM for run in found)
+    return {
+        "concealed": effect or "nothing",
+        "size": CONCEALED[effect][1][size] if effect else "",
+        "trust": trust,
+        "runs": len(found),
+        "readings": float(np.median([run["readings"] for run in found])),
+        "mean_readings": round(float(np.mean([run["readings"] for run in found])), 1),
+        "reached": _share(sum(run["known"] for run in found), len(found)),
+        "intervals_hold": _share(sum(held), len(held)),
+        "sure_and_wrong": _share(wrong, len(found)),
+        "noticed": _share(sum(run["noticed"] for run in found), len(found)),
+        "in_credible_set": _share(sum(name in run["credible"] for name, run in runs), len(found)),
+        "names": round(float(np.mean([len(run["credible"]) for run in found])), 1),
+        "cpu_s_median": round(float(np.median([run["cpu_s"][0] for run in found])), 2),
+        "cpu_s_95": round(float(np.median([run["cpu_s"][1] for run in found])), 2),
+    }
+
+
+def _share(k: int, n: int) -> str:
+    share = share_within(k, n)
+    return f"{share.value:.2f} ({share.low:.2f} to {share.high:.2f})"

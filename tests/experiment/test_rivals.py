@@ -1,0 +1,183 @@
+"""What a sensor model may leave out, weighed along with the shape."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from probewise.calibration import FittedSensor, mean_field
+from probewise.errors import ParameterError
+from probewise.experiment import CLEAN, Exploration, begin, left_out_of, repaired, result_json, step
+from probewise.experiment.asking import Field
+from probewise.experiment.rivals import Lost, Tailed, rivals_of
+from probewise.inquiry import prior_entropy
+from probewise.recordings import Instrumentation
+from probewise.sensor import mixture_names
+from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
+from probewise.study.rows import REFERENCE
+from probewise.study.trial import Trial
+
+
+@pytest.fixture(scope="module")
+def doubting():
+    return replace(experiment_of(REFERENCE), trust=0.9, n_particles=600, n_samples=20)
+
+
+@pytest.fixture(scope="module")
+def stepped(doubting):
+    """Two steps of a run that doubts, both of the prior's first places."""
+    rng = np.random.default_rng(3)
+    with arm_of(Trial(REFERENCE, 0)) as arm:
+        field = Field.under(arm, doubting.grid)
+        state = begin(doubting, field, rng=rng)
+        prior_bits = prior_entropy(doubting.prior, rng=rng)
+        found = []
+        for _ in range(2):
+            reading = arm.measure(state.next_pose)
+            state, info = step(state, reading, doubting, field, prior_bits=prior_bits, rng=rng, max_readings=2)
+            found.append(info)
+    return found
+
+
+@pytest.fixture
+def sensor():
+    """A sensor as calibrated: one Gaussian, its posterior narrow about it."""
+    truth = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
+    sd = np.array([0.0, 0.03, 0.03, 0.001, 0.002, 0.0005, 0.05, 0.05])
+    samples = truth + sd * np.random.default_rng(11).standard_normal((500, 8))
+    return FittedSensor(
+        names=(*mixture_names(1), "I_min", "I_max"),
+        samples=samples,
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.5),
+        field=mean_field(samples, 1, pixel_mm=0.5),
+        instrumentation=Instrumentation(),
+    )
+
+
+def rivals():
+    plain = experiment_of(REFERENCE)
+    return rivals_of(plain.model, plain.likelihood, (1048.0, 520.0))
+
+
+def test_the_rivals_share_what_trust_leaves(doubting):
+    prior = {kind.left_out: math.exp(kind.log_prior) for kind in doubting.kinds}
+    assert prior.pop("") == pytest.approx(0.9)
+    np.testing.assert_allclose(list(prior.values()), 0.1 / len(prior))
+    assert {"backlash", "saturation", "dropouts", "outliers"} <= set(prior)
+
+
+def test_with_full_trust_there_is_one_kind():
+    assert [kind.left_out for kind in experiment_of(REFERENCE).kinds] == [""]
+
+
+@pytest.mark.parametrize("row", [replace(REFERENCE, model="naive"), replace(REFERENCE, learn_sensor=True)])
+def test_a_sensor_that_has_no_rivals_cannot_be_doubted(row):
+    with pytest.raises(ParameterError, match="trust"):
+        replace(experiment_of(row), trust=0.9)
+
+
+@pytest.mark.parametrize("trust", [0.0, 1.5])
+def test_trust_is_a_probability(trust):
+    with pytest.raises(ParameterError, match="trust"):
+        replace(experiment_of(REFERENCE), trust=trust)
+
+
+@pytest.mark.parametrize("law", [rival.likelihood for rival in rivals() if rival.likelihood is not None])
+def test_laws_of_the_noise_are_densities(law):
+    """The density of one reading over all readings is one."""
+
+    def density(reading):
+        return math.exp(law.log_prob(np.array([reading]), np.array([[35.0]]))[0])
+
+    total = quad(
+        density, -200.0, 270.0, points=[4.999, 5.001, 10.0, 15.0, 30.0, 35.0, 40.0, 60.0, 64.999, 65.001], limit=400
+    )[0]
+    assert total == pytest.approx(1.0, abs=0.01)
+
+
+def test_rounded_laws_of_the_noise_are_probabilities_of_cells():
+    cells = np.arange(-200.0, 271.0)
+    shares, sizes = np.array([0.1]), np.array([3.0])
+    for law in (Tailed(1.5, 1.0, shares, sizes), Lost(1.5, 1.0, 10.0, 10.0, 60.0)):
+        total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
+        assert total == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_step_says_what_may_be_left_out(stepped):
+    for info in stepped:
+        assert sum(info.left_out.values()) == pytest.approx(1.0)
+        assert info.left_out[""] > 0.5
+        assert 0 <= info.chance_off <= 1
+
+
+def test_the_result_holds_hypotheses_a_credible_set_and_a_sentence(doubting, stepped):
+    document = json.loads(result_json(Exploration(doubting, tuple(stepped))))["left_out"]
+    assert sum(h["probability"] for h in document["hypotheses"]) == pytest.approx(1.0)
+    assert document["hypotheses"][0]["effects"] == []
+    assert document["credible_set"][0] == CLEAN
+    assert "leaves nothing out that shows" in document["sentence"]
+    assert "tilt" in document["sentence"]
+
+
+def leading(info, name):
+    """The step as if one rival led."""
+    weighted = [
+        replace(p.weighted, log_z=0.0 if kind.left_out == name else -40.0)
+        for kind, p in zip(info.kinds.kinds, info.kinds.particles, strict=True)
+    ]
+    particles = tuple(replace(p, weighted=w) for p, w in zip(info.kinds.particles, weighted, strict=True))
+    kinds = replace(info.kinds, particles=particles)
+    return replace(info, kinds=kinds, left_out=kinds.left_out)
+
+
+def test_what_leads_is_said_with_its_numbers(stepped):
+    said = left_out_of(leading(stepped[-1], "backlash"), 0.9)
+    assert said.leading == "backlash"
+    assert said.credible_set == ("backlash",)
+    assert "gear play of" in said.sentence
+
+
+def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
+    rng = np.random.default_rng(1)
+    assert repaired(sensor, stepped[-1], rng=rng) is sensor
+    mended = repaired(sensor, leading(stepped[-1], "saturation"), rng=rng)
+    assert mended.effects == ("saturation",)
+    again = type(sensor).from_json(mended.to_json())
+    assert again.mean()["saturation.level"] == pytest.approx(mended.mean()["saturation.level"])
+    told = repaired(sensor, leading(stepped[-1], "dropouts"), rng=rng)
+    assert told.effects == ()
+    assert any("dropouts" in note for note in told.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["saturation", "ambient_gradient"])
+def test_a_robot_that_doubts_finds_the_circle_and_what_is_wrong_with_its_sensor(effect):
+    """Without doubt it ends sure and wrong on this circle or does not end; with doubt it finds both."""
+    found = run_concealed_trial(ConcealedTrial(effect, 1, 0, 0.9, 40))
+    assert found["known"]
+    assert found["error_mm"] < 12.0
+    assert effect in found["credible"]
+
+
+def test_rows_of_the_study_are_summed_up():
+    runs = {
+        ConcealedTrial("backlash", 1, k, 0.9): {
+            "known": True,
+            "readings": 10 + k,
+            "error_mm": 20.0 * k,
+            "held": [True, False],
+            "noticed": False,
+            "credible": [CLEAN, "backlash"],
+            "cpu_s": [0.1, 0.2],
+        }
+        for k in range(2)
+    }
+    (row,) = concealed_table(runs)
+    assert row["sure_and_wrong"].startswith("0.50")
+    assert row["intervals_hold"].startswith("0.50")
+    assert row["in_credible_set"].startswith("1.00")
+    assert row["size"] == 6.0

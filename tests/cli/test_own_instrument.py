@@ -194,6 +194,7 @@ def test_a_journal_finds_the_sensor_of_its_run_and_refuses_another_truth(sensor_
         run("diagnose", journal, "--out", tmp_path / "d")
     assert seen[0].names == read_sensor(sensor_file).names
 
+    (out / "sensor.json").unlink()  # the run's own, which would be found in its place
     text = sensor_file.read_text()
     sensor_file.write_text(text.replace('"source"', '"source" ').replace("0.6", "0.7"))
     assert run("diagnose", journal, "--out", tmp_path / "d") == 2

@@ -232,7 +232,7 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
     (out / "notes.txt").write_text("mine")
     assert main(command(sensor_file, out)) == 0
     names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
-    results = {"report.html", "run.gif", "result.json", "samples.csv"}
+    results = {"report.html", "run.gif", "result.json", "samples.csv", "sensor.json"}
     assert names == {"journal.jsonl", "frames/001.png", "notes.txt"} | results
 
 

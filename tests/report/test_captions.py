@@ -122,6 +122,7 @@ def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run
         "known",
         "shape",
         "chance_off_12mm",
+        "left_out",
         "bits",
         "seconds",
     ]

@@ -191,7 +191,7 @@ def explore(
         choice.
     trust
         Probability that the sensor model leaves nothing out; below 1 the run weighs what it may leave out along with
-        the shape. By default 0.9; 1 with the naive model, a sensor that is learnt along, or several shapes.
+        the shape. By default 0.9; 1 with the naive model, a sensor learnt along, another utility, or several shapes.
     max_readings
         Stop here if the shape is not known by then.
     journal
@@ -243,13 +243,14 @@ def explore(
     field = Field() if field is None else field
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     lies = posing.shape_of(shape, field)
-    usual = posing.usual_trust(lies, model=model, learn_sensor=learn_sensor)
+    worth = utility_named(utility) if isinstance(utility, str) else utility
+    usual = posing.usual_trust(lies, model=model, learn_sensor=learn_sensor, utility=worth)
     asked = posing.experiment_for(
         sensor,
         lies,
         field,
         model=model,
-        utility=utility_named(utility) if isinstance(utility, str) else utility,
+        utility=worth,
         learn_sensor=learn_sensor,
         batch=require_whole("batch", batch),
         orientations_rad=require_one_or_several("orientations_rad", orientations_rad),

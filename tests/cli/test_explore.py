@@ -54,6 +54,7 @@ def test_the_journal_names_the_utility(explore, options, utility):
     assert lines[0]["options"]["reading_range"] == [1.0, 100.0]
 
 
+@pytest.mark.slow
 def test_readings_may_be_chosen_several_at_a_time(explore):
     status, lines = explore("--batch", 2, "--max-readings", 2)
     assert status == 0
@@ -62,6 +63,7 @@ def test_readings_may_be_chosen_several_at_a_time(explore):
     assert lines[1]["belief"]["next"] == second != first
 
 
+@pytest.mark.slow
 def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, monkeypatch, tmp_path):
     """The naive model left, as in the paper, whichever chooses; the run itself is the same as without."""
     drawn, quick = [], exploration.frame_of_both
@@ -150,6 +152,7 @@ def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behin
     assert not list(tmp_path.glob("found/*"))
 
 
+@pytest.mark.slow
 def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path):
     """Of a set of shapes the samples name theirs, and leave the parameters of the others empty."""
     status, lines = explore("--shape", "circle", "rectangle", "--max-readings", 2)

@@ -49,7 +49,7 @@ def test_what_a_tab_offers_is_there_and_nothing_else_is_offered():
     assert [name for name in offered if name.startswith("_")] == ["__version__"]
     for name in offered:
         assert getattr(probewise, name) is not None
-    assert probewise.nested.run.__module__ == "probewise.nested.sampler"
+    assert probewise.nested.run.__module__ == "probewise.nested.run"
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         _ = probewise.calibrat
 
@@ -122,6 +122,7 @@ def test_a_seed_calibrates_the_same_sensor_in_python_and_on_the_command_line(
     assert json.loads(own.sensor.to_json()) == json.loads(theirs.to_json())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_a_seed_makes_the_same_run_in_python_and_on_the_command_line(sensor_file, sensor, tmp_path):
     """What is hidden, where the robot looks and what it reads, noise included."""
@@ -140,6 +141,7 @@ def test_a_seed_makes_the_same_run_in_python_and_on_the_command_line(sensor_file
     assert "hidden       circle: x_mm" in run.summary()
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_its_journal_with_the_noise_it_would_have_had(sensor, tmp_path):
     whole = probewise.explore(sensor, max_readings=3, rng=np.random.default_rng(7), progress=False)
     journal = tmp_path / "journal.jsonl"
@@ -200,6 +202,7 @@ def test_a_truth_that_cannot_be_is_named(sensor, truth, message):
         probewise.explore(sensor, truth=truth, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 def test_results_of_audit_and_predict_show_themselves(sensor, recording):
     prediction = probewise.predict(sensor, recording)
@@ -215,6 +218,7 @@ def test_an_audit_takes_the_noise_of_the_sensor_that_it_is_given(sensor, recordi
     assert "noise 0.6" in audit_plan(plan, sensor=sensor, effects=FEW).assumed
 
 
+@pytest.mark.slow
 def test_the_reports_package_shows_what_people_use_and_loads_it_when_asked():
     assert dir(probewise.report) == probewise.report.__all__
     code = "import probewise; print(probewise.report.plots.png.__name__, 'heart' in dir(probewise.report))"
@@ -224,6 +228,7 @@ def test_the_reports_package_shows_what_people_use_and_loads_it_when_asked():
         _ = probewise.report.heart
 
 
+@pytest.mark.slow
 def test_a_result_printed_is_its_summary(sensor, recording):
     audit = probewise.audit(recording)
     for result in (sensor, recording, audit, probewise.predict(sensor, recording)):

@@ -37,6 +37,7 @@ def test_one_round_leaves_a_diagnosis_and_all_it_was_made_of(few, tmp_path, caps
     assert "http://" not in page
 
 
+@pytest.mark.slow
 def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
     out = tmp_path / "out"
     options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--quiet", "--out", out)
@@ -106,6 +107,7 @@ class Edge:
 """
 
 
+@pytest.mark.slow
 def test_an_instrument_of_ones_own_is_investigated_and_closed(few, tmp_path):
     file, closed, out = tmp_path / "edge.py", tmp_path / "closed.txt", tmp_path / "out"
     file.write_text(OWN.replace("CLOSED", repr(str(closed))))

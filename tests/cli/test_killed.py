@@ -56,6 +56,7 @@ def test_a_resumed_run_is_byte_for_byte_the_one_that_was_never_interrupted(
         assert contents(out) == contents(tmp_path / "whole") or cut == cuts[-1]  # which notes the torn line
 
 
+@pytest.mark.slow
 def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
     sensor_file, tmp_path, quick_frames, monkeypatch, capsys
 ):

@@ -141,6 +141,7 @@ def killed_at(n, write, out):
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) != 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
 def test_wherever_a_command_is_killed_the_next_one_finds_all_of_its_files_or_none(tmp_path):
     """Killed before each step on the disk; then a command that fails begins, which settles what it finds."""

@@ -64,6 +64,7 @@ def ten_bits(sensor_file):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_a_run_goes_on_where_the_instrument_failed_and_keeps_what_its_readings_brought(
     arm_file, ten_bits, tmp_path, capsys, closed
@@ -172,6 +173,7 @@ def test_tasks_of_the_bench_that_need_the_lego_arm_say_so(words, message, arm_fi
     assert re.search(message, capsys.readouterr().err)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_the_emulator_is_an_arm_like_the_others(sensor_file, tmp_path):
     out = tmp_path / "out"

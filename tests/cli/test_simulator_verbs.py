@@ -34,6 +34,7 @@ def fit(folder):
     return folder / "fit"
 
 
+@pytest.mark.slow
 def test_a_fit_finds_what_the_readings_were_made_with(fit):
     document = strict_json((fit / "fit.json").read_text())
     found = {p["name"]: p["interval95"] for p in document["parameters"]}

@@ -176,6 +176,7 @@ def command(sensor_file, out, *more):
     return [str(word) for word in ("explore", *where, "--max-readings", 1, *more)]
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_the_report_is_written_says_how_to_go_on_and_that_goes_on(
     sensor_file, tmp_path, quick_frames, monkeypatch, capsys
 ):
@@ -214,6 +215,7 @@ def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
     assert [p.name for p in out.iterdir()] == ["journal.jsonl"]
 
 
+@pytest.mark.slow
 def test_what_the_journal_holds_is_counted_not_what_this_command_took(
     sensor_file, tmp_path, quick_frames, monkeypatch, capsys
 ):
@@ -225,6 +227,7 @@ def test_what_the_journal_holds_is_counted_not_what_this_command_took(
     assert "keeps 2 readings" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_next(sensor_file, tmp_path, quick_frames):
     out = tmp_path / "out"
     assert main(command(sensor_file, out, "--max-readings", 2)) == 0

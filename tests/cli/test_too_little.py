@@ -23,6 +23,7 @@ def set_all(path, reading):
     path.write_text("\n".join([header, *changed]) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("harm", "said"), [("one reading", "1 usable reading is too few"), ("few", "are too few"), ("equal", "are equal")]
 )

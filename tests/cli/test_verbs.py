@@ -33,6 +33,7 @@ def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, 
     assert "chi-square" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, tmp_path, capsys):
     out = tmp_path / "out"
     assert run("calibrate", recording_file, "--out", out, "--orders", 1, "--live", 16, "--seed", 1) == 0
@@ -44,6 +45,7 @@ def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, 
     assert "seed 1" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, quick_frames):
     options = ("--sensor", sensor_file, "--truth", "500,250,90", "--quiet", "--seed", 3)
     whole, cut = tmp_path / "whole", tmp_path / "cut"

@@ -49,6 +49,7 @@ def clean_diagnosis() -> Diagnosis:
     return diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_a_diagnosis_can_be_sent_to_another_process():
     sent = pickle.loads(pickle.dumps(clean_diagnosis()))
     assert json.dumps(diagnosis_json(sent)) == json.dumps(diagnosis_json(clean_diagnosis()))

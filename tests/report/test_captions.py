@@ -83,6 +83,7 @@ def has_green(image):
     return (np.abs(np.asarray(image.convert("RGB")).astype(int) - COLOURS["green"]).max(axis=2) < 16).sum() > 40
 
 
+@pytest.mark.slow
 def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_picture(frames):
     """In the frames it is in the key and in the field; the last frame has no next place."""
     moving = Image.open(io.BytesIO(gif(frames)))
@@ -163,6 +164,7 @@ def hand_made_sensor():
     )
 
 
+@pytest.mark.slow
 def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_zero():
     recording = read_recording(shipped("paper"))
     sensor = hand_made_sensor()

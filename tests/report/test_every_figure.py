@@ -187,6 +187,7 @@ def hidden_by_keys(figure):
     return hidden
 
 
+@pytest.mark.slow
 def test_drawing_on_given_axes_opens_no_figure(result):
     sheet = plt.figure()
     cells = sheet.subplots(6, 6)

@@ -92,6 +92,7 @@ def test_a_long_trace_is_thinned():
     assert len(dots.get_offsets()) <= 4000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_params", [1, 2, 10])
 def test_a_corner_has_each_parameter_and_each_pair(n_params):
     axes = plots.corner_plot(synthetic(n_params))
@@ -198,6 +199,7 @@ def test_merged_runs_are_drawn_as_one():
     assert plots.insertion_plot(merged).get_title(loc="left").startswith(f"{merged.insertion_rank.size} new points")
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_no_more_than_six_parameters():
     shown = synthetic(9)._repr_html_()
     assert "of the first 6 of 9 parameters" in shown

@@ -26,6 +26,7 @@ def small_calibration():
     return calibrate(few, orders=(1,), n_live=16, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 def test_a_calibration_its_sensor_and_its_nested_run_show_themselves():
     calibration = small_calibration()

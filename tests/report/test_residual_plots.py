@@ -43,6 +43,7 @@ def images(figures):
     return {name: plots.svg(drawing) for name, drawing in figures.items()}
 
 
+@pytest.mark.slow
 def test_every_figure_is_svg_that_a_browser_can_read(images):
     for image in images.values():
         assert ElementTree.fromstring(image).tag.endswith("svg")
@@ -102,6 +103,7 @@ def test_neighbours_of_ar_1_noise_are_correlated_by_rho():
     np.testing.assert_allclose(found.get_ydata()[:2], [rho, rho**2], atol=0.08)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_needs_no_plotting_library():
     """A second of its start alone is a fifth of what a whole diagnosis may take."""
     asked = "import sys, probewise.cli.diagnose, probewise.diagnosis; print(*sys.modules)"

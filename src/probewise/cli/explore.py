@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="P",
         help="probability that the sensor model leaves nothing out; below 1 the robot weighs what it may leave out "
-        "along with the shape (default 0.9; 1 with --model naive, --learn-sensor or several shapes)",
+        "along with the shape (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
     )
     parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
     more = parser.add_argument_group("more than a place", "what else the robot may choose, of an arm that can")
@@ -155,7 +155,7 @@ def run(arguments: argparse.Namespace) -> int:
         orientations_rad=orientations_rad,
         repeats=repeats,
     )
-    usual = posing.usual_trust(shape, model=arguments.model, learn_sensor=arguments.learn_sensor)
+    usual = posing.usual_trust(shape, model=arguments.model, learn_sensor=arguments.learn_sensor, utility=utility)
     experiment = pose_it(
         model=arguments.model,
         learn_sensor=arguments.learn_sensor,

@@ -212,9 +212,13 @@ TRUST = 0.9
 """Probability that a sensor model leaves nothing out, where nobody says otherwise."""
 
 
-def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool) -> float:
-    """Trust a sensor as one does where nobody says otherwise: wholly where doubt has no model, or several shapes."""
-    return 1.0 if model == "naive" or learn_sensor or isinstance(shape, AnyOf) else TRUST
+def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
+    """Trust a sensor as one does where nobody says otherwise.
+
+    Wholly where doubt has no model, with several shapes, or where a reading is to be worth something of one's own.
+    """
+    plain = model == "naive" or learn_sensor or isinstance(shape, AnyOf) or utility != Finishing()
+    return 1.0 if plain else TRUST
 
 
 def _calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:

@@ -73,6 +73,7 @@ def test_where_orders_differ_in_density_what_is_drawn_has_the_folded_one():
         assert abs(upper.mean() - 0.5) < 4.4 * np.hypot(upper.std(), 0.5) / 200
 
 
+@pytest.mark.slow
 def test_the_evidence_of_two_gaussians_is_the_same_folded():
     """A likelihood that does not ask for names: prior draws, a folded run, one from a prior near what that found."""
     prior = prior_of(2)

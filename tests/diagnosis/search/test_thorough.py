@@ -78,6 +78,7 @@ def test_the_time_of_a_weighing_grows_with_its_live_points_and_its_hypotheses(st
     assert thorough._in_words((3.2, 14.1)) == "3 to 15 minutes"
 
 
+@pytest.mark.slow
 def test_a_line_weighs_what_quadrature_says():
     """The noise's sd integrated out in closed form, 1/2 Gamma(n/2) (pi rss)^(-n/2), then a fine grid over a and b."""
     recording = line_recording(0.0)

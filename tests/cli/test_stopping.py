@@ -26,11 +26,12 @@ GEOMETRY = read_geometry(shipped_geometry())
 
 
 @pytest.fixture(autouse=True)
-def ctrl_c_is_heard():
-    """A test runner in the background ignores Ctrl-C."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+def signals_are_heard():
+    """A test runner in the background ignores Ctrl-C, one under nohup a closed terminal."""
+    before = {number: signal.signal(number, signal.default_int_handler) for number in ENDING}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("number", ENDING, ids=lambda number: number.name)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from probewise.report.plots.canvas import axes_or_new, legend_above, tidy
 
@@ -46,5 +47,6 @@ def belief_in_the_sensor(left_out: Sequence[Mapping[str, float]], *, ax: Axes | 
         if leaders[k] != leaders[k - 1]:
             ax.axvline(number[k] - 0.5, color="black", linestyle="--", linewidth=1.0)
     ax.set(ylim=(0, 1), xlim=(0.4, len(left_out) + 0.6))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(ax)
     return tidy(ax, x="reading", y="probability")

@@ -236,7 +236,7 @@ def write_page(
                 paragraph(doubted.sentence),
                 figure(
                     png(belief_in_the_sensor([{n or CLEAN: p for n, p in s.left_out.items()} for s in run.steps])),
-                    "What the robot believes about its sensor after each reading. Where it changes its mind, a line is dashed.",
+                    "What the robot believes about its sensor after each reading. A dashed line: it changed its mind.",
                 ),
                 table(
                     ("left out", "probability"),

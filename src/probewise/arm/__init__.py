@@ -1,6 +1,6 @@
 """Where readings come from: one interface, simulated arm and LEGO arm behind it (paper, "Robotic Arm Test Bed")."""
 
-from probewise.arm.carry_out import Request, carry_out, recorded
+from probewise.arm.carry_out import Request, carry_out, readings_of, recorded
 from probewise.arm.geometry import Geometry, Joint
 from probewise.arm.geometry_file import read_geometry, shipped_geometry
 from probewise.arm.instrument import Instrument, Pose, Reading
@@ -36,6 +36,7 @@ __all__ = [
     "in_lego_units",
     "instrument_of",
     "read_geometry",
+    "readings_of",
     "recorded",
     "require_reach",
     "shipped_geometry",

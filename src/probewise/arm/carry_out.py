@@ -17,7 +17,7 @@ from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["Request", "bounds_of", "carry_out", "recorded"]
+__all__ = ["Request", "bounds_of", "carry_out", "readings_of", "recorded"]
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
@@ -188,6 +188,20 @@ def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
         covariates={**rows.covariates, **covariates},
     )
     return Recording(taken, np.array([reading.value for reading in readings]))
+
+
+def readings_of(recording: Recording) -> list[Reading]:
+    """Read back what `recorded` wrote down: each row's reading with its place, time and covariates."""
+    rows = recording.plan
+    return [
+        Reading(
+            float(value),
+            Pose(float(rows.x_mm[k]), float(rows.y_mm[k]), float(rows.orientation_rad[k])),
+            float(rows.time_s[k]),
+            {name: float(values[k]) for name, values in rows.covariates.items()},
+        )
+        for k, value in enumerate(recording.readings)
+    ]
 
 
 def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:

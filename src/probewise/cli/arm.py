@@ -313,7 +313,7 @@ def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Rea
     """Read back the readings of an earlier go, which must be those of the plan's first rows."""
     import numpy as np
 
-    from probewise.arm import Pose, Reading
+    from probewise.arm import readings_of
     from probewise.recordings import read_recording
 
     if dry:
@@ -329,15 +329,7 @@ def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Rea
     same = same_length and all((off <= _OFF_PLAN_MM).all() for off in off_mm)
     if not same or [rows.pattern_names[k] for k in rows.pattern] != [first.pattern_names[k] for k in first.pattern]:
         raise FileError(out, "readings of another plan", "the first rows of this plan, as an earlier go left them")
-    return [
-        Reading(
-            float(before.readings[k]),
-            Pose(float(rows.x_mm[k]), float(rows.y_mm[k]), float(rows.orientation_rad[k])),
-            float(rows.time_s[k]),
-            {name: float(values[k]) for name, values in rows.covariates.items()},
-        )
-        for k in range(len(before))
-    ]
+    return readings_of(before)
 
 
 def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:

@@ -17,7 +17,7 @@ from probewise.arm.instrument import Reading
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.setting import Experiment
 from probewise.inquiry import Prospect, UtilityMap
-from probewise.inquiry.forecast import spread_levels
+from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
 from probewise.scene.regions import EllipseRegion, PolygonRegion
@@ -31,8 +31,6 @@ _COUNTS = 1e-5  # probability of a kind that is asked
 _BEST = 60  # places, by the information about everything
 _AT_EDGES = 40
 _ANYWHERE = 20
-_PER_SD = 2.0
-_LEAST = 1e-12
 _LABEL = "expected bits about the shape, whatever the sensor leaves out"
 
 
@@ -132,25 +130,10 @@ def _plan(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
 def _bits(
     lengths: FloatArray, weight: FloatArray, spread: FloatArray, answers: FloatArray, prospect: Prospect
 ) -> FloatArray:
-    """Half the log2 ratio of each length's variance before and, on average, after a reading, summed, (n_designs,).
-
-    The moments given every cell of the reading come from sums over the hypotheses by level.
-    """
-    n = answers.shape[1]
-    away = lengths - weight @ lengths
-    sd = prospect.readout.noise_sd
-    levels = spread_levels(float(answers.min()), float(answers.max()), sd / _PER_SD)
-    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-    key = (index + np.arange(n) * len(levels)).ravel()
-    chance = prospect.readout.probability(levels, fine=1.0)
-
-    def given_cell(values: FloatArray) -> FloatArray:
-        by_level = np.bincount(key, np.repeat(weight * values, n), minlength=n * len(levels))
-        return np.asarray(by_level.reshape(n, len(levels)) @ chance)
-
-    mass = np.maximum(given_cell(np.ones(len(weight))), _LEAST)
-    bits = np.zeros(n)
-    for length, now in zip(away.T, spread, strict=True):
-        after = now - (given_cell(length) ** 2 / mass).sum(axis=1)
+    """Half the log2 ratio of each length's variance before and, on average, after a reading, summed, (n_designs,)."""
+    given = GivenReading(answers, weight, prospect.readout)
+    bits = np.zeros(answers.shape[1])
+    for length, now in zip((lengths - weight @ lengths).T, spread, strict=True):
+        after = now - (given.sum(length) ** 2 / given.mass).sum(axis=1)
         bits += 0.5 * np.log2(now / np.maximum(after, 1e-3 * now))
     return np.maximum(bits, 0.0)

@@ -8,7 +8,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.inquiry.forecast import spread_levels, thinned
+from probewise.inquiry.forecast import thinned
+from probewise.inquiry.given_reading import GivenReading
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
 
@@ -17,8 +18,6 @@ __all__ = ["Finishing"]
 _NEAR = 15.0  # times the sd that is asked for: farther off than that no single reading ends a run
 _MOST_ASKED = 800  # hypotheses
 _MOST_DESIGNS = 250  # the best by the other utility
-_PER_SD = 2.0
-_LEAST = 1e-12
 
 
 @dataclass(frozen=True)
@@ -74,28 +73,14 @@ def _is_near(prospect: Prospect, goal: Goal) -> bool:
 
 
 def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
-    """Probability of a reading after which every length is known well enough, at some designs, (n_designs,).
-
-    The moments of every length given every cell of the reading come from sums over the hypotheses by level.
-    """
+    """Probability of a reading after which every length is known well enough, at some designs, (n_designs,)."""
     rows, share = thinned(prospect.weight, _MOST_ASKED)
     away = prospect.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()
-    n = len(designs)
     answers = prospect.forecast.predict(prospect.theta[rows], prospect.plan.take(prospect.rows[designs]))
-    sd = prospect.readout.noise_sd
-    levels = spread_levels(float(answers.min()), float(answers.max()), sd / _PER_SD)
-    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-    key = (index + np.arange(n) * len(levels)).ravel()
-    chance = prospect.readout.probability(levels, fine=1.0)
-
-    def given_cell(values: FloatArray) -> FloatArray:
-        by_level = np.bincount(key, np.repeat(share * values, n), minlength=n * len(levels))
-        return np.asarray(by_level.reshape(n, len(levels)) @ chance)
-
-    mass = np.maximum(given_cell(np.ones(len(rows))), _LEAST)
-    ends = np.ones(mass.shape, dtype=np.bool_)
+    given = GivenReading(answers, share, prospect.readout)
+    ends = np.ones(given.mass.shape, dtype=np.bool_)
     for length in away.T:
-        mean = given_cell(length) / mass
-        ends &= given_cell(length**2) / mass - mean**2 < goal.sd**2
-    return np.asarray((mass * ends).sum(axis=1) / mass.sum(axis=1))
+        mean = given.sum(length) / given.mass
+        ends &= given.sum(length**2) / given.mass - mean**2 < goal.sd**2
+    return np.asarray((given.mass * ends).sum(axis=1) / given.mass.sum(axis=1))

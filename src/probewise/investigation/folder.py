@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from probewise.arm import Pose, Reading, recorded
+from probewise.arm import Reading, readings_of, recorded
 from probewise.errors import FileError
 from probewise.progress import Progress, silent
 from probewise.recordings import (
@@ -78,7 +78,7 @@ class RoundsFolder:
                 )
             write_plan(plan, planned)
         plan = read_plan(planned)
-        readings = list(_taken(readings_file))
+        readings = readings_of(read_recording(readings_file)) if readings_file.exists() else []
         kept_s = time.monotonic()
         progress(f"round {number}, readings", len(readings), len(plan))
         for reading in take(number, plan, asked, tuple(readings)):
@@ -111,18 +111,3 @@ def _require_same(file: Path, wanted: Mapping[str, Any]) -> None:
     for name, value in wanted.items():
         if before.get(name) != value:
             raise FileError(file, f"an investigation with {name} {before.get(name)!r}", f"{value!r}, as asked now")
-
-
-def _taken(file: Path) -> Iterator[Reading]:
-    """Read back the readings of a round that was cut."""
-    if not file.exists():
-        return
-    before = read_recording(file)
-    rows = before.plan
-    for k in range(len(before)):
-        yield Reading(
-            float(before.readings[k]),
-            Pose(float(rows.x_mm[k]), float(rows.y_mm[k]), float(rows.orientation_rad[k])),
-            float(rows.time_s[k]),
-            {name: float(values[k]) for name, values in rows.covariates.items()},
-        )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise.arm import Pose, Reading
+from probewise.arm import Reading, readings_of
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.world import World, concealed
@@ -31,10 +31,7 @@ class SimulatedRecorder:
         """Yield the readings of a round's plan that follow those taken already."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         recording = self.world.simulate(plan, rng=rng)
-        for row in range(len(taken), len(plan)):
-            pose = Pose(float(plan.x_mm[row]), float(plan.y_mm[row]), float(plan.orientation_rad[row]))
-            known = {name: float(values[row]) for name, values in plan.covariates.items()}
-            yield Reading(float(recording.readings[row]), pose, float(plan.time_s[row]), known)
+        yield from readings_of(recording)[len(taken) :]
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:

@@ -1,0 +1,52 @@
+"""What weighted hypotheses amount to given each value that a reading may take, for many designs at once."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.inquiry.forecast import spread_levels
+from probewise.inquiry.readout import Readout
+
+__all__ = ["GivenReading"]
+
+_PER_SD = 2.0  # levels of the predicted reading per sd of the noise
+_LEAST = 1e-12
+
+
+class GivenReading:
+    """Means over the hypotheses given each cell of a reading.
+
+    Hypotheses that predict nearly the same reading are summed first, so that the noise is applied to some hundred
+    levels and not to every hypothesis.
+
+    Parameters
+    ----------
+    answers
+        Predicted readings, (n, n_designs).
+    weight
+        Weights of the hypotheses, (n,).
+    readout
+        The cells of a reading and its noise.
+    """
+
+    def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout) -> None:
+        self._n = answers.shape[1]
+        levels = spread_levels(float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD)
+        index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+        self._key = (index + np.arange(self._n) * len(levels)).ravel()
+        self._weight, self._n_levels = weight, len(levels)
+        self._chance = readout.probability(levels, fine=1.0)
+
+    @cached_property
+    def mass(self) -> FloatArray:
+        """Weight of all hypotheses together in each cell, (n_designs, n_cells); never 0."""
+        return np.maximum(self.sum(np.ones(len(self._weight))), _LEAST)
+
+    def sum(self, values: FloatArray) -> FloatArray:
+        """Sum weight times value, (n,), over the hypotheses in each cell, (n_designs, n_cells)."""
+        weighted = np.repeat(self._weight * values, self._n)
+        by_level = np.bincount(self._key, weighted, minlength=self._n * self._n_levels)
+        return np.asarray(by_level.reshape(self._n, self._n_levels) @ self._chance)

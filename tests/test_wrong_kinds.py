@@ -142,7 +142,7 @@ MISTAKES = {
     "a sensor's path to audit": (lambda: probewise.audit(PLAN, sensor="s.json"), f"sensor is 's.json'; {A_SENSOR}"),
     "a misspelt word of an audit": (
         lambda: probewise.audit(PLAN).seen_as("invisibel"),
-        "detectability is 'invisibel'; .*; did you mean 'invisible'",
+        "detectability is 'invisibel'; .*; did you mean invisible",
     ),
     "an unknown pattern to audit": (lambda: probewise.audit(UNDESCRIBED), "'edge' is named but not described"),
     # diagnose

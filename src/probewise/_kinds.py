@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import numpy as np
 from probewise.errors import ParameterError
 
 __all__ = [
+    "did_you_mean",
     "require_callable",
     "require_finite_number",
     "require_flag",
@@ -84,9 +85,13 @@ def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
     """Raise ParameterError unless `value` is one of these names, saying which was perhaps meant."""
     if isinstance(value, str) and value in known:
         return
-    near = difflib.get_close_matches(value, known, n=1) if isinstance(value, str) else []
-    meant = f"; did you mean {near[0]!r}?" if near else ""
-    raise ParameterError(name, value, ", ".join(map(repr, known)) + meant)
+    raise ParameterError(name, value, ", ".join(map(repr, known)) + did_you_mean(value, known))
+
+
+def did_you_mean(value: object, known: Iterable[str]) -> str:
+    """Ask after the known name that is nearest to a misspelt one, as the end of a message; "" where none is near."""
+    near = difflib.get_close_matches(value, list(known), n=1) if isinstance(value, str) else []
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def require_flag(name: str, value: object) -> None:

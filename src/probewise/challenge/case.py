@@ -144,7 +144,7 @@ def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
         **said(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
-        "parameters": {h.name: parameters_within(h, found[h.name]) for h in named},
+        "parameters": {h.name: parameters_within(h.parameters, found[h.name]) for h in named},
         "sensor": sensor_within(case.world, diagnosis.repaired),
         "held_out": log_densities(case, diagnosis, rng=files),
         "settled": _settled(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import EffectFound, ModelSamples, Place
 from probewise.sensor import footprint_of
-from probewise.world.challenge import Hidden, Region
+from probewise.world.challenge import Region
 from probewise.world.world import World
 
 __all__ = ["parameters_within", "place_overlap", "sensor_within"]
@@ -18,14 +19,14 @@ __all__ = ["parameters_within", "place_overlap", "sensor_within"]
 _NOT_STATED = frozenset({"softness"})  # the vocabulary leaves it open
 
 
-def parameters_within(hidden: Hidden, found: EffectFound) -> dict[str, list[float]]:
+def parameters_within(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
     """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
 
-    An angle counts by its nearest turn.
+    An angle counts by its nearest turn. What is no single number is left out: values of runs, which share one prior.
     """
     out = {}
     for stated in found.parameters:
-        truth = hidden.parameters.get(stated.name)
+        truth = parameters.get(stated.name)
         if not isinstance(truth, float) or stated.name in _NOT_STATED:
             continue
         low, high = stated.interval95

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import itertools
 import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from probewise._kinds import did_you_mean
 from probewise.errors import ProbewiseError
 
 __all__ = [
@@ -66,17 +66,14 @@ class OneLineParser(argparse.ArgumentParser):
     def _require_known(self, name: str) -> None:
         options = self._option_string_actions
         if name.startswith("--") and not any(option.startswith(name) for option in options):
-            self.error(f"no option {name}{_meant(name, options)}")
+            self.error(f"no option {name}{did_you_mean(name, options)}")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             choices = [str(choice) for choice in action.choices]
-            raise argparse.ArgumentError(action, f"{value!r} is none of {', '.join(choices)}{_meant(value, choices)}")
-
-
-def _meant(name: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {near[0]}?" if near else ""
+            raise argparse.ArgumentError(
+                action, f"{value!r} is none of {', '.join(choices)}{did_you_mean(value, choices)}"
+            )
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:

@@ -9,9 +9,11 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 from probewise.cli._common import keeps, positive_int
+from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import LinkError
+from probewise.progress import Progress
 
-__all__ = ["add_executor", "campaign_keeps", "executor_of"]
+__all__ = ["add_executor", "campaign_keeps", "campaign_running"]
 
 
 def add_executor(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +26,7 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 
 
 @contextlib.contextmanager
-def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
+def _executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
     """Yield what does the tasks; None stands for this process."""
     if arguments.scheduler is not None:
         with _cluster(arguments.scheduler) as executor:
@@ -36,6 +38,21 @@ def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
             yield pool
     else:
         yield None
+
+
+@contextlib.contextmanager
+def campaign_running(
+    path: Path, noun: str, arguments: argparse.Namespace
+) -> Iterator[tuple[Executor | None, Progress]]:
+    """Yield what does a campaign's tasks and where its progress is shown; a stop says what the file keeps."""
+    from probewise._progress import progress_shown
+
+    with (
+        saying_what_is_kept(lambda: campaign_keeps(path, noun, arguments)),
+        progress_shown(quiet=arguments.quiet) as progress,
+        _executor_of(arguments) as executor,
+    ):
+        yield executor, progress
 
 
 def campaign_keeps(path: Path, noun: str, arguments: argparse.Namespace) -> str:

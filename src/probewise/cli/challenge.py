@@ -7,7 +7,7 @@ import shlex
 from functools import partial
 
 from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, positive_int, say
-from probewise.cli._executor import add_executor, campaign_keeps, executor_of
+from probewise.cli._executor import add_executor, campaign_keeps, campaign_running
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
 
@@ -59,11 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         work, scored, of = Investigated(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
     kept = partial(campaign_keeps, cases, "case", arguments)
-    with (
-        saying_what_is_kept(kept),
-        progress_shown(quiet=arguments.quiet) as progress,
-        executor_of(arguments) as executor,
-    ):
+    with campaign_running(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
             arguments.cases,
             seed=arguments.seed,

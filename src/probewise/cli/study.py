@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_out_directory, add_quiet, positive_int, say
-from probewise.cli._executor import add_executor, campaign_keeps, executor_of
+from probewise.cli._executor import add_executor, campaign_keeps, campaign_running
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import ParameterError
@@ -73,11 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "trials.jsonl"
     kept = partial(campaign_keeps, trials, "run", arguments)
-    with (
-        saying_what_is_kept(kept),
-        progress_shown(quiet=arguments.quiet) as progress,
-        executor_of(arguments) as executor,
-    ):
+    with campaign_running(trials, "run", arguments) as (executor, progress):
         study = run_study(
             numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
         )
@@ -94,7 +90,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run what is left of the study of concealed effects and write its table."""
-    from probewise._progress import progress_shown
     from probewise.recordings import write_text_atomically
     from probewise.study import concealed_table, run_concealed
 
@@ -103,12 +98,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
         raise ParameterError(others[0], "given", "none with --concealed, whose rows are its own")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "concealed.jsonl"
-    kept = partial(campaign_keeps, trials, "run", arguments)
-    with (
-        saying_what_is_kept(kept),
-        progress_shown(quiet=arguments.quiet) as progress,
-        executor_of(arguments) as executor,
-    ):
+    with campaign_running(trials, "run", arguments) as (executor, progress):
         found = run_concealed(
             arguments.circles,
             path=trials,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from probewise._kinds import did_you_mean
 from probewise.arm import Reading, readings_of
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
@@ -49,8 +49,7 @@ def _one(text: str) -> Concealed:
     name, _, numbers = text.partition(":")
     kinds = _kinds()
     if name not in kinds:
-        near = difflib.get_close_matches(name, list(kinds), n=1)
-        meant = f"; did you mean {near[0]}?" if near else ""
+        meant = did_you_mean(name, kinds)
         raise ParameterError(
             "--truth", name, f"{NOTHING}, or an effect of probewise.world.concealed with its values{meant}"
         )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -21,13 +20,13 @@ import numpy as np
 from probewise._version import __version__
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.campaign import run_campaign
-from probewise.experiment import CLEAN, TRUST, chance_off, explore, left_out_of
+from probewise.experiment import CLEAN, TRUST, left_out_of
 from probewise.progress import Progress, silent
 from probewise.recordings import Disc
 from probewise.study.circles import FIELD
 from probewise.study.rows import REFERENCE
 from probewise.study.table import WRONG_MM, share_within
-from probewise.study.trial import BRIGHT, DARK, SEED, Trial, experiment_of, spot_of
+from probewise.study.trial import BRIGHT, DARK, SEED, Trial, experiment_of, judged, reached, spot_of, timed_steps
 from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
 from probewise.world.concealed import AlbedoGradient, AmbientStep, Dropouts, EdgeBlur, Halo, OffsetDrift, Outliers
 
@@ -80,30 +79,17 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
     plain = Trial(REFERENCE, trial.circle, trial.max_readings)
     cpu = []
-    with _arm(trial, plain) as arm:
-        steps = explore(
-            arm, experiment, rng=np.random.default_rng([SEED, trial.circle]), max_readings=trial.max_readings
-        )
-        while True:
-            before = time.process_time()
-            step = next(steps, None)
-            if step is None:
-                break
-            last = step
-            cpu.append(time.process_time() - before)
-    theta, weight = last.posterior.theta[:, experiment.shape_columns], last.posterior.weight
-    below = [float(weight[values < true].sum()) for values, true in zip(theta.T, plain.truth, strict=True)]
+    for step, cpu_s in timed_steps(_arm(trial, plain), experiment, plain):
+        last = step
+        cpu.append(cpu_s)
     left_out = left_out_of(last, trial.trust)
-    trusted = last.p_value >= experiment.doubt_p
     return {
-        "known": bool(trusted and experiment.is_known(last.sd, last.shapes, last.chance_off)),
+        "known": reached(last, experiment),
         "readings": last.number,
-        "error_mm": round(float(np.abs(last.mean - plain.truth).max()), 3),
-        "held": [bool(0.025 <= share <= 0.975) for share in below],
-        "chance_wrong": chance_off(experiment, last.posterior, WRONG_MM),
+        **judged(last, experiment, plain.truth),
         "p_truth": round(left_out.probability.get(trial.effect or CLEAN, 0.0), 4),
         "credible": list(left_out.credible_set),
-        "noticed": bool(not trusted or left_out.leading != CLEAN),
+        "noticed": bool(last.p_value < experiment.doubt_p or left_out.leading != CLEAN),
         "cpu_s": [round(float(np.quantile(cpu, q)), 3) for q in (0.5, 0.95)],
     }
 

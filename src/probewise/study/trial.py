@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -24,7 +25,7 @@ from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
 
-__all__ = ["Trial", "arm_of", "experiment_of", "run_trial"]
+__all__ = ["Trial", "arm_of", "experiment_of", "judged", "reached", "run_trial", "timed_steps"]
 
 SEED = 2013
 # The study's sensor: one Gaussian, mm and LEGO units; the same numbers for the robot and, by pixels, for the world.
@@ -92,30 +93,20 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     after each reading (`widest_mm`), and the fit (`p_value`).
     """
     experiment = experiment_of(trial.row)
-    arm = arm_of(trial)
-    rng = np.random.default_rng([SEED, trial.circle])
     widest, cpu, first_white, bits_at_white = [], [], None, None
-    with arm:
-        steps = explore(arm, experiment, rng=rng, max_readings=trial.max_readings)
-        while True:
-            before = time.process_time()
-            step = next(steps, None)
-            if step is None:
-                break
-            last = step
-            cpu.append(time.process_time() - before)
-            widest.append(round(step.widest_mm, 3))
-            if first_white is None and step.reading.value > _ON_WHITE:
-                first_white, bits_at_white = step.number, round(step.bits, 3)
+    for step, cpu_s in timed_steps(arm_of(trial), experiment, trial):
+        last = step
+        cpu.append(cpu_s)
+        widest.append(round(step.widest_mm, 3))
+        if first_white is None and step.reading.value > _ON_WHITE:
+            first_white, bits_at_white = step.number, round(step.bits, 3)
     return {
-        "reached": bool(
-            last.p_value >= experiment.doubt_p and experiment.is_known(last.sd, last.shapes, last.chance_off)
-        ),
+        "reached": reached(last, experiment),
         "readings": last.number,
         "first_white": first_white,
         "bits": round(last.bits, 3),
         "bits_at_white": bits_at_white,
-        **_judged(last, experiment, trial.truth),
+        **judged(last, experiment, trial.truth),
         "arm_s": round(last.reading.time_s, 2),
         "cpu_s": round(float(np.median(cpu)), 4),
         "widest_mm": widest,
@@ -123,7 +114,26 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     }
 
 
-def _judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
+def timed_steps(arm: SimulatedArm, experiment: Experiment, trial: Trial) -> Iterator[tuple[Step, float]]:
+    """Yield the steps of a run and the processor time of each (s); its randomness goes by the circle alone."""
+    rng = np.random.default_rng([SEED, trial.circle])
+    with arm:
+        steps = explore(arm, experiment, rng=rng, max_readings=trial.max_readings)
+        while True:
+            before = time.process_time()
+            step = next(steps, None)
+            if step is None:
+                return
+            yield step, time.process_time() - before
+
+
+def reached(last: Step, experiment: Experiment) -> bool:
+    """Tell whether a run ended because every length is known, by a posterior that fits its readings."""
+    known = experiment.is_known(last.sd, last.shapes, last.chance_off)
+    return bool(last.p_value >= experiment.doubt_p and known)
+
+
+def judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
     """Hold the last posterior of the shape against the truth, (3,)."""
     columns = experiment.shape_columns
     theta, weight = last.posterior.theta[:, columns], last.posterior.weight

@@ -6,15 +6,15 @@ import math
 import tempfile
 import time
 import warnings
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from probewise.challenge.case import Task, said
+from probewise.challenge.covering import parameters_within
 from probewise.challenge.systems.held_out import log_densities_of_runs
-from probewise.diagnosis import Diagnosis, EffectFound
+from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.systems import read_run_table, read_simulator
@@ -106,28 +106,11 @@ def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
     return {
         **said(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
-        "parameters": {e.name: _within(e.parameters, found[e.name]) for e in named},
+        "parameters": {e.name: parameters_within(e.parameters, found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
         "cpu_s": cpu_s,
     }
-
-
-def _within(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
-    """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
-
-    A phase counts by its nearest turn. Values of runs are left out: what they share is the simulator's too.
-    """
-    out = {}
-    for stated in found.parameters:
-        truth = parameters.get(stated.name)
-        if not isinstance(truth, float):
-            continue
-        low, high = stated.interval95
-        if stated.unit == "rad":
-            truth += 2 * math.pi * round(((low + high) / 2 - truth) / (2 * math.pi))
-        out[stated.name] = [truth, low, high]
-    return out
 
 
 def _has_formula(diagnosis: Diagnosis) -> bool:

@@ -259,7 +259,16 @@ def _fit_order(
             f"two routes to the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
             f"{result.log_z_error:.2f} and {refined.log_z:.2f} ± {refined.log_z_error:.2f}; use more live points",
         )
-    sensor = _fitted(recording, problem, result, n_samples, pixel_mm, geometry.step_mm, notes, rng)
+    sensor = _fitted(
+        recording,
+        problem,
+        result,
+        n_samples=n_samples,
+        pixel_mm=pixel_mm,
+        step_mm=geometry.step_mm,
+        notes=notes,
+        rng=rng,
+    )
     return OrderFit(n_gaussians, belief, result, refined, sensor)
 
 
@@ -271,6 +280,7 @@ def _fitted(
     recording: Recording,
     problem: SensorProblem,
     result: NestedResult,
+    *,
     n_samples: int,
     pixel_mm: float | None,
     step_mm: float,

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from probewise.diagnosis.names import Names
 from probewise.world.challenge import NO_PHYSICS, NOISE_NAMES
 
 __all__ = [
@@ -33,7 +34,6 @@ HONEST_NATS = 3.0
 _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
 
 Result = Mapping[str, Any]
-Names = tuple[str, ...]
 
 
 def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:

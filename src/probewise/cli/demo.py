@@ -84,7 +84,12 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
     prediction = predict(sensor, recording.plan, recording.readings)
     searches, started_alike = as_searches(sensor, runs, truth), as_searches(sensor, alike, truth)
     drawn = report.figures(
-        calibration, recording, prediction, searches, started_alike, read_geometry(shipped_geometry())
+        calibration,
+        recording,
+        prediction=prediction,
+        searches=searches,
+        started_alike=started_alike,
+        geometry=read_geometry(shipped_geometry()),
     )
     drawn |= report.diagnosis_figures(diagnosis)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
@@ -102,12 +107,12 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
         page = report.write_page(
             calibration,
             recording,
-            prediction,
-            searches,
-            started_alike,
-            frames,
-            diagnosis,
-            drawn,
+            prediction=prediction,
+            searches=searches,
+            started_alike=started_alike,
+            frames=frames,
+            diagnosis=diagnosis,
+            drawn=drawn,
             concealed=concealed,
             seed=seed,
             seconds=seconds,

@@ -7,12 +7,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+from probewise.diagnosis.names import Names
 from probewise.effects import UNNAMED, NamedEffect, first_of, is_out_of_vocabulary
 from probewise.sensor import Stage
 
 __all__ = ["PriorOdds"]
-
-Names = tuple[str, ...]
 
 
 @dataclass(frozen=True)

@@ -218,7 +218,9 @@ def refine(
     known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_proposals(np.concatenate(known), rng=rng)
-        pilots = [_weigh(p, 0.0, _Held.nothing(), space, evaluate, max(n_draws // 8, 50), rng) for p in proposals]
+        pilots = [
+            _weigh(p, 0.0, _Held.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals
+        ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         told = pilots[first]
         # The other form keeps a share: one may reach where the other does not.
@@ -226,7 +228,7 @@ def refine(
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if told.n_eff > 2 * len(evaluate.names):
             known.append(_to_fit(told.theta, told.log_weight, space, rng))
-    found = _with_lost(_weigh(best, 0.0, held, space, evaluate, n_draws, rng), lines, space, rng)
+    found = _with_lost(_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), lines, space, rng)
     return replace(found, inherited=_inherited(found, result))
 
 
@@ -299,7 +301,7 @@ def update(
     n_eff, k = n_effective(log_weight), math.inf
     if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
         proposal = fit_proposals(_to_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng)[-1]
-        found = _weigh(proposal, prior_share, _Held.nothing(), space, evaluate, n_draws, rng)
+        found = _weigh(proposal, prior_share, _Held.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
         found = _with_lost(found, _lines(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
@@ -388,6 +390,7 @@ def _weigh(
     held: _Held,
     space: Space,
     evaluate: Evaluator,
+    *,
     n_draws: int,
     rng: np.random.Generator,
 ) -> Weighted:

@@ -107,20 +107,20 @@ def search(
     `probewise.nested.run` has the parameters, what is raised, and the check; here a doubt is only stored in the result.
     """
     require_rng(rng)
-    _require_options(stop, move, progress, checkpoint, checkpoint_every_s, executor, return_interrupted)
+    _require_options(
+        stop=stop,
+        move=move,
+        progress=progress,
+        checkpoint=checkpoint,
+        checkpoint_every_s=checkpoint_every_s,
+        executor=executor,
+        return_interrupted=return_interrupted,
+    )
     if n_workers is not None:
         n_workers = require_whole("n_workers", n_workers)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
-    least = least_live(n_params)
-    n_live = require_whole("n_live", n_live, least=None)
-    if n_live < least:
-        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
-    n_replaced = n_live // 2 if n_replaced is None else require_whole("n_replaced", n_replaced, least=None)
-    if not 1 <= n_replaced <= n_live // 2:
-        raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and require_whole("max_calls", max_calls, least=None) < n_live:
-        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
+    n_live, n_replaced = _require_counts(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(_plain(rng.bit_generator.state))
     if n_params == 0:
@@ -188,7 +188,22 @@ def search(
     return result
 
 
+def _require_counts(n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int) -> tuple[int, int]:
+    """Return the numbers of live points and of those replaced a round, or raise ParameterError."""
+    least = least_live(n_params)
+    n_live = require_whole("n_live", n_live, least=None)
+    if n_live < least:
+        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
+    n_replaced = n_live // 2 if n_replaced is None else require_whole("n_replaced", n_replaced, least=None)
+    if not 1 <= n_replaced <= n_live // 2:
+        raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
+    if max_calls is not None and require_whole("max_calls", max_calls, least=None) < n_live:
+        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
+    return n_live, n_replaced
+
+
 def _require_options(
+    *,
     stop: object,
     move: object,
     progress: object,

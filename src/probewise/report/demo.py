@@ -179,6 +179,7 @@ def comparison_table(searches: Sequence[Search], caption: str = "") -> Markup:
 def figures(
     calibration: Calibration,
     recording: Recording,
+    *,
     prediction: Prediction,
     searches: Sequence[Search],
     started_alike: Sequence[Search],
@@ -263,13 +264,13 @@ def _views(searches: Sequence[Search], numbers: Sequence[int]) -> AxesGrid:
 def write_page(
     calibration: Calibration,
     recording: Recording,
+    *,
     prediction: Prediction,
     searches: Sequence[Search],
     started_alike: Sequence[Search],
     frames: Sequence[Sequence[bytes]],
     diagnosis: Diagnosis,
     drawn: Mapping[str, bytes],
-    *,
     concealed: str,
     seed: int,
     seconds: float,

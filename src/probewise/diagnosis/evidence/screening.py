@@ -13,10 +13,9 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised, block_log_bayes_factors, project_scaled
 from probewise.diagnosis.evidence.templates import EffectTemplates
+from probewise.diagnosis.names import Names
 
 __all__ = ["log_mean", "score_effects", "score_pairs", "score_unknown"]
-
-Names = tuple[str, ...]
 
 _BEST_ENTRIES = 2  # of each effect's bank, for pairs
 

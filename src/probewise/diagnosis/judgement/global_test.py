@@ -9,13 +9,12 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.convergence import require_converged
 from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import global_p_value
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["N_DRAWS", "GlobalTest", "run_global_test"]
-
-Names = tuple[str, ...]
 
 N_DRAWS = 999
 """Residuals drawn under the null."""

@@ -8,14 +8,13 @@ from typing import Literal, TypeAlias
 
 from probewise.diagnosis.advice.aliases import Alias, aliased_pairs
 from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import in_vocabulary, out_of_vocabulary
 from probewise.effects import public_name
 
 __all__ = ["Hypothesis", "Judged", "Verdict", "credible_set", "decide", "hypotheses_of", "judge", "verdict_on"]
-
-Names = tuple[str, ...]
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 

@@ -9,13 +9,12 @@ import numpy as np
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.repair.improvement import Improvement, improvement_of
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["Best", "best_repair", "ruins"]
-
-Names = tuple[str, ...]
 
 _RUIN = -1.0  # nats per held-out reading, below which what was named repairs nothing
 

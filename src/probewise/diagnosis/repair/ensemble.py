@@ -11,6 +11,7 @@ import numpy as np
 
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
 from probewise.diagnosis.repair.best import Best, ruins
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
@@ -19,8 +20,6 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.progress import Progress, silent
 
 __all__ = ["Drawn", "Ensemble", "draw_models"]
-
-Names = tuple[str, ...]
 
 _LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
 _LEAST_OF_A_RIVAL = 0.02  # probability of a hypothesis, below which the model does without it

@@ -9,13 +9,12 @@ import numpy as np
 from probewise.diagnosis.evidence.held_out import held_out_gain
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import global_p_value
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["N_DRAWS", "Improvement", "improvement_of"]
-
-Names = tuple[str, ...]
 
 N_DRAWS = 499
 

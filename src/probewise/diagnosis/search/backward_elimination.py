@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import ELIMINATED, STEERING, SWAPPED
 from probewise.diagnosis.search.forward_selection import promising, proposals_for
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 
 __all__ = ["eliminate_backward"]
-
-Names = tuple[str, ...]
 
 
 def eliminate_backward(state: SearchState) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import (
     ABSORBED,
     EXTENDED_WITHIN,
@@ -24,8 +25,6 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import AGAIN, first_of
 
 __all__ = ["Proposal", "promising", "proposals_for", "select_forward"]
-
-Names = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)

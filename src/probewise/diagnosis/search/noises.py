@@ -13,6 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
 from probewise.diagnosis.evidence.templates import subsets
 from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_PAIR_WITHIN
@@ -20,8 +21,6 @@ from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, Random
 from probewise.recordings.plan import Recording
 
 __all__ = ["Noises"]
-
-Names = tuple[str, ...]
 
 _TWO_MEMORIES = {CorrelatedNoise.name, RandomWalk.name}  # one law of the noise carries one of them
 

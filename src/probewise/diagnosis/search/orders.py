@@ -7,14 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import MOST_AT_OTHER_ORDERS, REFITTED_AT_OTHER_ORDERS, REFITTED_WITHIN
 from probewise.diagnosis.search.refits import is_significant
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["at_other_orders"]
-
-Names = tuple[str, ...]
 
 
 def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, out_of_vocabulary
 
 __all__ = ["prune"]
-
-Names = tuple[str, ...]
 Key = tuple[int, Names]
 
 

@@ -18,6 +18,7 @@ from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemo
 from probewise.diagnosis.evidence.visible import log_visible
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.constants import VARIANTS_TRIED
 from probewise.diagnosis.search.noises import Noises
@@ -25,8 +26,6 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
 
 __all__ = ["Refits", "is_significant"]
-
-Names = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)

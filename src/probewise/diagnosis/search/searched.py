@@ -13,6 +13,7 @@ from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
@@ -23,8 +24,6 @@ from probewise.effects import is_out_of_vocabulary
 from probewise.sensor import Stage
 
 __all__ = ["Evidences", "Posterior", "Screening", "Searched", "posterior_of"]
-
-Names = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)

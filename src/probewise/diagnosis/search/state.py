@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.refits import Refits, is_significant
@@ -22,8 +23,6 @@ from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
 __all__ = ["SearchState", "rivals_of"]
-
-Names = tuple[str, ...]
 
 
 @dataclass(eq=False)

@@ -22,6 +22,7 @@ from probewise.diagnosis.evidence.folded import folded
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary
 from probewise.diagnosis.search.weighed_twice import Weighing
@@ -46,8 +47,6 @@ _FEWEST_RUNS, _MOST_RUNS_IN_ALL = 2, 1 + 2 * _MOST_RUNS
 _USUAL_RUNS = 5  # a bar that counts so many ends early, or waits near its end
 _TIMED = 100  # hypotheses whose evaluation is timed
 _STEPS = 100  # of the bar, for each hypothesis
-
-Names = tuple[str, ...]
 Run = Callable[..., nested.NestedResult]
 
 

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_unknown
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.outlying import outlying, score_together
 from probewise.diagnosis.search.constants import ALIASED_NATS
@@ -19,8 +20,6 @@ from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 
 __all__ = ["Unknown"]
-
-Names = tuple[str, ...]
 
 
 @dataclass(eq=False)

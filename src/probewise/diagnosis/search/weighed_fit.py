@@ -10,6 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.constants import STEERING
 from probewise.effects import NUISANCES, is_out_of_vocabulary
@@ -20,8 +21,6 @@ __all__ = [
     "in_vocabulary",
     "out_of_vocabulary",
 ]
-
-Names = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)

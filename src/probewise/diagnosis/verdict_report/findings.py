@@ -12,6 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.fit import fit
 from probewise.diagnosis.judgement.judged import Hypothesis
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import noise_statistics, steps_within_scans
 from probewise.diagnosis.repair.best import Best
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
@@ -22,8 +23,6 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 
 __all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
-
-Names = tuple[str, ...]
 
 _LEAST_PROBABILITY = 1e-3
 _N_DRAWS = 999

@@ -13,7 +13,7 @@ from probewise.world.systems.kind import Kind
 from probewise.world.systems.motion import travel
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Trace", "now_at_rows", "read", "simulate"]
+__all__ = ["Trace", "read", "simulate"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def simulate(
     else:
         assert kind.formula is not None
         states, p = {}, dict(parameters)
-        now = now_at_rows(rows)
+        now = Now.at_rows(rows)
         for form, numbers in inner:
             p[form.target] = p[form.target] + form.act(now, numbers)
         readings = np.asarray(kind.formula(p, columns))
@@ -70,8 +70,3 @@ def read(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> F
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)
     return readings
-
-
-def now_at_rows(rows: SystemRows) -> Now:
-    """Give the moments of all rows."""
-    return Now(rows.t[None, :], rows.since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.world.systems.rows import SystemRows
 
 __all__ = ["Bank", "Form", "Now", "Numbers", "Placed", "Side", "as_numbers"]
 
@@ -34,6 +35,11 @@ class Now:
     u: Mapping[str, Any]
     run: IntArray
     row: FloatArray
+
+    @classmethod
+    def at_rows(cls, rows: SystemRows) -> Self:
+        """Give the moments of all rows."""
+        return cls(rows.t[None, :], rows.since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
 
 
 @dataclass(frozen=True, eq=False)

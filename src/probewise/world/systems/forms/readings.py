@@ -8,9 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.chain import now_at_rows
 from probewise.world.systems.forms import modulations
-from probewise.world.systems.forms.form import Form, Numbers
+from probewise.world.systems.forms.form import Form, Now, Numbers
 from probewise.world.systems.forms.modulations import Modulation
 from probewise.world.systems.forms.scene import Scene
 from probewise.world.systems.rows import SystemRows
@@ -32,7 +31,7 @@ def added_to_readings(scene: Scene, name: str, how: Modulation, *, gain: bool = 
     """Bind a modulation to the reading, as an offset or a gain about 0."""
 
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-        change = how.over(now_at_rows(rows), v)
+        change = how.over(Now.at_rows(rows), v)
         return np.asarray(y * (1 + change) if gain else y + change)
 
     typical = float(np.sqrt(np.mean(scene.readings**2))) if gain else 1.0

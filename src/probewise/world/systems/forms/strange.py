@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.chain import now_at_rows
-from probewise.world.systems.forms.form import Form, Numbers
+from probewise.world.systems.forms.form import Form, Now, Numbers
 from probewise.world.systems.forms.inside import pushing
 from probewise.world.systems.forms.modulations import one_by_one
 from probewise.world.systems.forms.readings import OFFSET
@@ -164,7 +163,7 @@ def _two_settlings(scene: Scene) -> Form:
     longest = float(scene.rows.since_start.max())
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-        since = now_at_rows(rows).since[0]
+        since = Now.at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
     return _added(

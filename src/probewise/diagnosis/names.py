@@ -1,0 +1,9 @@
+"""What a combination of effects is called by: their names."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+__all__ = ["Names"]
+
+Names: TypeAlias = tuple[str, ...]

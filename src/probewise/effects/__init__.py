@@ -21,9 +21,9 @@ from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Known
 from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
-from probewise.effects.moves import in_scans, sign_of_move
+from probewise.effects.motion import in_scans, sign_of_motion
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
-from probewise.effects.noise_law import NoiseRows, draw_readings, log_density, variance
+from probewise.effects.noise_distribution import NoiseRows, draw_readings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.predictive_mixture import PredictiveMixture
@@ -83,42 +83,45 @@ UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
         for effect in (ArmKnock, GainStep, BentRails, MissingTooth, StickSlip, Reflection, SlowTurn, SlowSinking)
     }
 )
-"""Physics outside the vocabulary, by names of our own: what a diagnosis says is unknown, and what it may be."""
+"""Physics outside the vocabulary, by name: a diagnosis reports it as unknown, and suggests it as a possible cause."""
 
 EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **UNNAMED})
-"""All physics that has a formula here, by name, whether the vocabulary has it or not."""
+"""Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
 PROPOSAL = "formula:"
-"""What the names of formulas begin with that are proposed for what has no name."""
+"""Prefix of the names of proposed formulas: what a residual without a name may follow."""
 
 
 def is_out_of_vocabulary(name: str) -> bool:
-    """Tell whether an effect has a formula and no name in the vocabulary."""
+    """Whether an effect has a formula but no name in the vocabulary."""
     return name in UNNAMED or name.startswith(PROPOSAL)
 
 
 AGAIN = "~again"
-"""What the name of an effect ends with that may be there a second time, beside the first."""
+"""Suffix of an effect's second copy: the same physics twice, as two steps of the light."""
 
 
 def public_name(name: str) -> str:
-    """Name an effect as a person knows it, be it the first of its kind or the second."""
+    """Return the vocabulary's name of an effect, without the suffix of a second copy."""
     return name.removesuffix(AGAIN)
 
 
 def spoken_name(name: str) -> str:
-    """Write a name without underscores, but for those of a person's own columns, parameters and states."""
+    """Write a name with spaces for underscores, unless it is one of a user's own columns, parameters or states."""
     own = public_name(name)
     return own if ":" in own else own.replace("_", " ")
 
 
 def first_of(name: str) -> str | None:
-    """Name the effect that has to be there before this one; None where it can stand alone."""
+    """Return the first copy, which a second copy requires; None for an effect that needs no other."""
     return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
 
 
+sign_of_move = sign_of_motion
+"""The old name of `sign_of_motion`."""
+
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
-"""What may be wrong with the noise and has no name in the vocabulary, by a name of our own."""
+"""Departures of the noise that have no name in the vocabulary; they only keep the tests of the mean valid."""
 
 __all__ = [
     "AGAIN",
@@ -185,7 +188,7 @@ __all__ = [
     "lattice_step_sd",
     "log_density",
     "public_name",
-    "sign_of_move",
+    "sign_of_motion",
     "spoken_name",
     "variance",
 ]

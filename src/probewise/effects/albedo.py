@@ -1,8 +1,8 @@
 """Surfaces that are not as white or black as they should be: effects on the scene.
 
-Both change every pattern's albedo S, and what a Gaussian footprint N(m, C) sees of the change has a
-closed form. Of S times a linear field t.p, by parts (Stein's lemma):
-E[S t.p] = t.m E[S] + (C t) . dE[S]/dm; of a Gaussian patch, a product of two Gaussians.
+Both change every pattern's albedo S, and its mean under a Gaussian footprint N(m, C) has a closed form.
+For S times a linear field t.p, by parts (Stein's lemma): E[S t.p] = t.m E[S] + (C t) . dE[S]/dm.
+For a Gaussian patch it is the integral of a product of two Gaussians.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.spots import ALONG_X, Line, SpotPrior, bell, scanned_lines, spot_bank
+from probewise.effects.spots import ALONG_X, ScanLine, SpotPrior, bell, scanned_lines, spot_bank
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
@@ -33,7 +33,7 @@ _STEP = 1e-3  # of a standard deviation, for the central difference: its error i
 
 @dataclass(frozen=True)
 class AlbedoGradient(NamedEffect[SceneView]):
-    """Paper or light that fades across the table: S (1 + per_mm_x X + per_mm_y Y), lab frame."""
+    """Paper or illumination that is uneven across the table: S (1 + per_mm_x X + per_mm_y Y), lab frame."""
 
     typical_per_mm: float = 2e-4
 
@@ -45,21 +45,21 @@ class AlbedoGradient(NamedEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take two hundredths over the longest scan as typical."""
+        """Set the typical slope to 2 % over the longest scan."""
         return cls(typical_per_mm=0.02 / extent.length_mm)
 
     @cached_property
     def prior(self) -> Product:
-        """Share gained a millimetre, along X and along Y."""
+        """Relative change of albedo per millimetre, along X and along Y."""
         slope = HeavyTailed(self.typical_per_mm)
         return Product({"per_mm_x": slope, "per_mm_y": slope})
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Grade every pattern."""
+        """Multiply every pattern's albedo by the gradient."""
         return replace(value, regions={name: GradedRegion(r, theta) for name, r in _under(value, plan).items()})
 
     def bank(self) -> FloatArray:
-        """One setting of two columns: linear in both slopes."""
+        """One entry of two columns: the change is linear in both slopes."""
         return self.typical_per_mm * np.eye(2)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -75,12 +75,12 @@ class AlbedoGradient(NamedEffect[SceneView]):
 class AlbedoPatch(NamedEffect[SceneView]):
     """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y).
 
-    `line` is the scanned line that it is seen from, `lines` are all that it might be.
+    `line` is the scanned line on or beside which it lies; `lines` are the candidates.
     """
 
     typical: float = 0.05
-    line: Line = ALONG_X
-    lines: tuple[Line, ...] = ()
+    line: ScanLine = ALONG_X
+    lines: tuple[ScanLine, ...] = ()
 
     name: ClassVar[str] = "albedo_patch"
     stage: ClassVar[Stage] = Stage.SCENE
@@ -90,25 +90,25 @@ class AlbedoPatch(NamedEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look along straight scans, where there are any."""
+        """Search along the straight scans; None where there are none."""
         lines = scanned_lines(extent.plan)
         return cls(line=lines[0], lines=lines) if lines else None
 
     @cached_property
     def prior(self) -> SpotPrior:
-        """Albedo at the middle, place and radius."""
+        """Albedo added at the centre, its place and its radius."""
         return SpotPrior("albedo", self.typical, self.line)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Lay the patch on every pattern."""
+        """Add the patch to every pattern."""
         return replace(value, regions={name: PatchedRegion(r, theta) for name, r in _under(value, plan).items()})
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the line."""
+        """One variant for each scanned line."""
         return tuple(replace(self, line=line) for line in self.lines)
 
     def bank(self) -> FloatArray:
-        """Places and radii."""
+        """Spots of three radii along the line."""
         return spot_bank(self.typical, self.line)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -130,7 +130,7 @@ class GradedRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return max(self.region.n_regions, len(self.per_mm))
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -138,7 +138,7 @@ class GradedRegion:
         return self.region.albedo(points_mm) * self._factor(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over pixels, the gradient taken at their centres: (n_regions, n_points)."""
+        """Mean albedo over pixels, with the gradient's value at their centres: (n_regions, n_points)."""
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._factor(centers_mm)
 
     def _factor(self, points_mm: FloatArray) -> FloatArray:
@@ -147,7 +147,7 @@ class GradedRegion:
 
 @seen_by_one.register
 def _(region: GradedRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By parts: the response times the field at the footprint's centre, and a central difference of the response."""
+    """By Stein's lemma: the field at the footprint's centre times the response, plus a central difference of it."""
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
     x, y = a * spot.var_x + b * spot.cov_xy, a * spot.cov_xy + b * spot.var_y  # C t
     rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
@@ -171,7 +171,7 @@ class PatchedRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return max(self.region.n_regions, len(self.patch))
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -179,7 +179,7 @@ class PatchedRegion:
         return self.region.albedo(points_mm) + self._added(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over pixels, the patch taken at their centres: (n_regions, n_points)."""
+        """Mean albedo over pixels, with the patch's value at their centres: (n_regions, n_points)."""
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added(centers_mm)
 
     def _added(self, points_mm: FloatArray) -> FloatArray:
@@ -189,7 +189,7 @@ class PatchedRegion:
 
 @seen_by_one.register
 def _(region: PatchedRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By the product of two Gaussians: N(m, C) over the patch is a bell of covariance C + r^2."""
+    """By the convolution of two Gaussians: the patch under N(m, C) is a bell of covariance C + r^2."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
     from_x, from_y = spot.x_mm + spot.dx_mm - x, spot.y_mm + spot.dy_mm - y
     var_x, var_y = spot.var_x + r**2, spot.var_y + r**2
@@ -200,7 +200,7 @@ def _(region: PatchedRegion, spot: Spot, n_nodes: int) -> FloatArray:
 
 
 def _under(view: SceneView, plan: Plan) -> Mapping[str, Region]:
-    """Name the regions that lie under some reading."""
+    """Keep the regions that lie under at least one reading."""
     return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
 
 

@@ -1,4 +1,4 @@
-"""How the sensor is really turned: effects on its orientation."""
+"""Errors of the sensor's orientation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moves import in_scans, mountings
+from probewise.effects.motion import in_scans, mountings
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
@@ -34,24 +34,24 @@ class OrientationError(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: three degrees are typical of a mount set by eye."""
+        """Keep the default scale: three degrees are typical of a mount set by eye."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """The angle, to either side."""
+        """The angle, of either sign."""
         return Product({"deg": HeavyTailed(self.typical_deg)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Turn the poses."""
+        """Add the angle to every pose."""
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta))
 
     def is_of_the_ssf(self, plan: Plan) -> bool:
-        """Tell that it is: a sensor that is turned has a turned SSF."""
+        """Return True: turning the sensor turns its SSF, so calibration absorbs it."""
         return True
 
     def bank(self) -> FloatArray:
-        """One setting: linear in a small angle."""
+        """One entry: the change is linear in a small angle."""
         return np.full((1, 1, 1), self.typical_deg)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -64,9 +64,9 @@ class OrientationError(NamedEffect[Poses]):
 
 @dataclass(frozen=True)
 class ScanAngleError(NamedEffect[Poses]):
-    """The same in every scan of one mounting (scans that share an orientation), or in one scan.
+    """The sensor is turned by deg more than was commanded in one mounting (scans of one orientation) or one scan.
 
-    `scans` names those scans, `choices` are all that they might be.
+    `scans` are the affected scans; `choices` are the candidate groups of scans.
     """
 
     typical_deg: float = 3.0
@@ -81,25 +81,25 @@ class ScanAngleError(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """List the mountings and scans, where there is more than one."""
+        """Take each mounting and each scan as a candidate; None where there is only one."""
         choices = mountings(extent.plan)
         return cls(choices=choices) if choices else None
 
     @cached_property
     def prior(self) -> Product:
-        """The angle, to either side."""
+        """The angle, of either sign."""
         return Product({"deg": HeavyTailed(self.typical_deg)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Turn the poses of those scans."""
+        """Add the angle to the poses of the affected scans."""
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta) * in_scans(plan, self.scans))
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the mounting or the scan."""
+        """One variant for each mounting and each scan."""
         return tuple(replace(self, scans=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        """Lay out a small angle, and two large ones to either side."""
+        """One small angle, and two large ones of either sign."""
         return self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0])[:, None, None]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

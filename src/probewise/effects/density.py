@@ -1,4 +1,4 @@
-"""The normal density of a reading, and its mean over the cell that a reading was rounded to."""
+"""The normal density of a reading, and its mean over the rounding cell of a quantised reading."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["log_cell_density", "log_gaussian_density"]
 
 
 def log_gaussian_density(readings: FloatArray, mean: FloatArray, sd: FloatArray) -> FloatArray:
-    """Log density of readings under Gaussians, arrays that broadcast; per unit of the reading."""
+    """Natural log of the normal density, per unit of the reading; the arrays broadcast."""
     z = (readings - mean) / sd
     return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
 
 
 def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray) -> FloatArray:
-    """Log of the Gaussian mass within half a step of the readings, divided by the step.
+    """Natural log of the Gaussian mass within half a step of each reading, divided by the step.
 
-    The tail further out is subtracted from the nearer one in logs, so the result stays finite
-    however far the reading lies from the mean.
+    The two tail masses are subtracted in logs, so the result stays finite however far the reading
+    lies from the mean.
     """
     low = (readings - step / 2 - mean) / sd
     high = (readings + step / 2 - mean) / sd

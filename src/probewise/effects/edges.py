@@ -1,4 +1,4 @@
-"""What happens where black meets white, and what a wide skirt of the sensor sees of it."""
+"""Effects at the edges between black and white: blur, shadow, and a halo that sees edges from afar."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ __all__ = ["EdgeBlur", "EdgeShadow", "Halo"]
 
 @dataclass(frozen=True)
 class EdgeBlur(NamedEffect[Footprint]):
-    """Printed edges blurred by a Gaussian of sd_mm: a Gaussian footprint sees them as a wider one sees sharp ones.
+    """Printed edges are blurred by a Gaussian of sd_mm, which equals a wider footprint over sharp edges.
 
-    Its covariance grows by sd_mm^2 along each axis, however the sensor is turned.
+    The footprint's covariance grows by sd_mm^2 along each axis, whatever the sensor's orientation.
     """
 
     typical_mm: float = 2.0
@@ -41,7 +41,7 @@ class EdgeBlur(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take two hundredths of the longest scan as typical."""
+        """Set the typical width to 2 % of the longest scan."""
         return cls(typical_mm=0.02 * extent.length_mm)
 
     @cached_property
@@ -55,16 +55,16 @@ class EdgeBlur(NamedEffect[Footprint]):
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
 
     def is_of_the_ssf(self, plan: Plan) -> bool:
-        """Tell that it is, a blurred SSF, but where heights differ: a footprint grows with them, a blur does not."""
+        """Return True (it equals a wider SSF) unless the height varies, which scales a footprint but not a blur."""
         ratio = height_ratio(plan)
         return ratio is None or float(np.ptp(ratio)) == 0.0
 
     def bank(self) -> FloatArray:
-        """One setting: the change goes with the square of the width."""
+        """One entry: the change is proportional to the square of the width."""
         return np.full((1, 1, 1), self.typical_mm)
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Scale the square of the width."""
+        """Scale the square of the width by the fitted amount."""
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -74,9 +74,9 @@ class EdgeBlur(NamedEffect[Footprint]):
 
 @dataclass(frozen=True)
 class Halo(NamedEffect[Footprint]):
-    """Light scattered in the lens: (1 - share) u + share u(skirt), the skirt a Gaussian of sd r_mm about the footprint.
+    """Light scattered in the lens: (1 - share) u + share u(halo), the halo a Gaussian of sd r_mm about the footprint.
 
-    That is one more Gaussian in the mixture.
+    It adds one Gaussian to the mixture.
     """
 
     least_share: float = 1e-3
@@ -91,18 +91,18 @@ class Halo(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look for skirts from a tenth of the longest scan to its whole length."""
+        """Search radii from a tenth of the longest scan to its whole length."""
         return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
 
     @cached_property
     def prior(self) -> Product:
-        """Share and radius, over their orders of magnitude."""
+        """Share and radius, log-uniform."""
         return Product(
             {"share": LogUniform(self.least_share, 0.7), "r_mm": LogUniform(self.narrowest_mm, self.widest_mm)}
         )
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Add the skirt to the mixture."""
+        """Add the halo to the mixture."""
         share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
 
         def joined(own: FloatArray, skirt: FloatArray) -> FloatArray:
@@ -124,7 +124,7 @@ class Halo(NamedEffect[Footprint]):
         )
 
     def bank(self) -> FloatArray:
-        """One column each for five radii."""
+        """Five entries of one column, one for each radius."""
         radii = np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5)
         return np.stack([np.full(5, 0.02), radii], axis=-1)[:, None, :]
 
@@ -140,8 +140,8 @@ class Halo(NamedEffect[Footprint]):
 class EdgeShadow(NamedEffect[View]):
     """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge.
 
-    Patterns may be made in different ways, one glued on, another printed. `patterns` names those with raised edges,
-    () all; `choices` are all that they might be.
+    Patterns may be made in different ways, one glued on, another printed. `patterns` are those with raised edges,
+    () for all; `choices` are the candidate groups.
     """
 
     typical: float = 0.01
@@ -158,9 +158,9 @@ class EdgeShadow(NamedEffect[View]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look for widths from a hundredth to a third of the longest scan.
+        """Search widths from a hundredth to a third of the longest scan.
 
-        Of the patterns' kinds all may have raised edges, or one, or all but one.
+        Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
         """
         kinds = _by_kind(extent.plan)
         but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
@@ -173,7 +173,7 @@ class EdgeShadow(NamedEffect[View]):
         return Product({"amp": HeavyTailed(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
 
     def apply(self, value: View, theta: FloatArray, plan: Plan) -> View:
-        """Darken what is seen near an edge."""
+        """Darken the seen fraction near an edge."""
         everywhere = (1, len(plan))
         x_mm, y_mm = (
             np.broadcast_to(place, np.broadcast_shapes(place.shape, everywhere))
@@ -190,11 +190,11 @@ class EdgeShadow(NamedEffect[View]):
         return replace(value, seen=value.seen - theta[:, :1] * bell(distance**2, theta[:, 1:2]))
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the patterns."""
+        """One variant for each group of patterns."""
         return tuple(replace(self, patterns=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        """One column each for six widths."""
+        """Six entries of one column, one for each width."""
         widths = np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6)
         return np.stack([np.full(6, self.typical), widths], axis=-1)[:, None, :]
 
@@ -210,7 +210,7 @@ class EdgeShadow(NamedEffect[View]):
 
 
 def _by_kind(plan: Plan) -> tuple[tuple[str, ...], ...]:
-    """Names of the patterns with edges that a plan reads over, those of one kind together."""
+    """Group by kind the names of the plan's patterns that have edges."""
     kinds: dict[type, list[str]] = {}
     for name, _ in plan.rows_by_pattern():
         if isinstance(pattern := plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):

@@ -1,4 +1,4 @@
-"""How far a recording reaches, in readings, place and time: what effects take their scales and their banks from."""
+"""The scales of a recording (readings, length, time) from which effects set their priors and template banks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["Extent"]
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """The range of a recording's readings, and its plan.
+    """Scales of a recording: the range of its readings, and its plan.
 
     Parameters
     ----------
     low, high
         Least and largest usable reading.
     plan
-        Where, when and over what was read.
+        Pose, time and pattern of every reading.
     """
 
     low: float
@@ -36,7 +36,7 @@ class Extent:
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
-        """Measure the extent of a recording.
+        """Measure the scales of a recording.
 
         Raises
         ------
@@ -57,19 +57,19 @@ class Extent:
 
     @cached_property
     def length_mm(self) -> float:
-        """Length of the longest scan; 1 where nothing moves."""
+        """Length of the longest scan, mm; 1 where nothing moves."""
         plan = self.plan
         ends = [(plan.x_mm[rows], plan.y_mm[rows]) for rows in plan.rows_by_scan() if rows.size]
         return max(float(np.hypot(np.ptp(x), np.ptp(y))) for x, y in ends) or 1.0
 
     @cached_property
     def duration_s(self) -> float:
-        """Time from the first reading to the last; 1 where there is none."""
+        """Time from the first reading to the last, s; 1 where it is 0."""
         return float(np.ptp(self.plan.time_s)) or 1.0
 
     @cached_property
     def gap_s(self) -> float:
-        """Time from one reading of a scan to the next, the median; 1 where there is none."""
+        """Median time between consecutive readings of a scan, s; 1 where no time passes."""
         gaps = np.diff(self.plan.time_s)[np.diff(self.plan.scan) == 0]
         gaps = gaps[gaps > 0]
         return float(np.median(gaps)) if gaps.size else 1.0

@@ -1,4 +1,4 @@
-"""Single readings that went wrong: heavy tails, and readings lost to one value."""
+"""Single faulty readings: heavy-tailed noise, and readings lost to one value."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_law import NoiseRows
+from probewise.effects.noise_distribution import NoiseRows
 from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -18,7 +18,7 @@ from probewise.sensor.stages import NoiseLevel, Stage
 
 __all__ = ["Dropouts", "Outliers"]
 
-_FAR = 4.0  # noise sd beyond which a reading may be lost rather than noisy
+_FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,20 @@ class Outliers(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: share and size are pure numbers."""
+        """Keep the default scales: share and size are pure numbers."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """Share and size, over their orders of magnitude."""
+        """Share and size, log-uniform."""
         return Product({"share": LogUniform(2e-3, 0.2), "size": LogUniform(2.5, 40.0)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the tail."""
+        """Set the share and width of the outliers."""
         return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
 
     def bank(self) -> FloatArray:
-        """Equally weighted nodes of the prior, four of each parameter."""
+        """Equally weighted nodes of the prior, four per parameter."""
         u = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) + 0.5) / 4
         return self.prior.from_unit_cube(u)[:, None, :]
 
@@ -60,9 +60,9 @@ class Outliers(NoiseEffect):
 
 @dataclass(frozen=True)
 class Dropouts(NoiseEffect):
-    """Readings lost: with probability `share` a reading is `value`, whatever lies under the sensor.
+    """Lost readings: with probability `share` a reading is `value`, whatever lies under the sensor.
 
-    `ends` are those of the range that the instrument is declared to have: a lost reading is most likely one of them.
+    `ends` are the ends of the instrument's declared range: a lost reading is most likely one of them.
     """
 
     lowest: float = -50.0
@@ -77,28 +77,28 @@ class Dropouts(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take any value within the range of the readings, or a little outside; and the ends of the declared range."""
+        """Allow any value from 1 % below the range of the readings to 1 % above; note the declared range's ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
         return cls(low, high, extent.plan.instrumentation.ends)
 
     @cached_property
     def prior(self) -> Product:
-        """Share, over its orders of magnitude, and value."""
+        """Share, log-uniform, and value, uniform."""
         return Product({"share": LogUniform(2e-3, 0.2), "value": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the share that is lost, and the value."""
+        """Set the share of lost readings and their value."""
         return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
 
     def bank(self) -> FloatArray:
-        """Both ends of the range, where readings are lost to, at two shares."""
+        """Both ends of the range of values, at two shares."""
         ends = (self.lowest + 0.01, self.highest - 0.01)
         return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
 
     def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Take the value that most readings far off share at twelve shares, two of them at least or one at an end."""
+        """Pair the commonest outlying value with twelve shares; none unless it occurs twice or is a range end."""
         far = (rows.predicted + rows.sd * residuals)[np.abs(residuals) > _FAR]
-        # As floats differ in their last digits, the value is one of the readings, not their mean.
+        # Floats differ in their last digits, so the value is one of the readings, not their mean.
         n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
         at_end = (np.abs(far[:, None] - np.array(self.ends)) <= 1e-6 * rows.sd).any(axis=1)
         if not (at_end | (n_alike > 1)).any():

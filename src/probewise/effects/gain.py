@@ -1,4 +1,4 @@
-"""How strongly the light is turned into a signal: effects on the gain."""
+"""Effects on the gain, which turns the seen light into a signal."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ class GainDrift(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look for time constants from a hundredth to twice the recording's duration."""
+        """Search time constants from a hundredth of the recording's duration to twice the duration."""
         return cls(shortest_s=0.01 * extent.duration_s, longest_s=2 * extent.duration_s)
 
     @cached_property
     def prior(self) -> Product:
-        """Share at time 0, of either sign, and time constant."""
+        """Relative error at time 0, of either sign, and time constant."""
         return Product({"frac": HeavyTailed(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal, (n_samples, n_points), never the dark level."""
-        # A time before 0 would let the exponential overflow; nothing warms up backwards.
+        """Scale the signal above the dark level, (n_samples, n_points)."""
+        # A negative time would let the exponential overflow.
         fade = np.exp(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
         return np.asarray(value * (1 + theta[:, :1] * fade))
 
     def bank(self) -> FloatArray:
-        """One column each for seven time constants."""
+        """Seven entries of one column, one for each time constant."""
         taus = np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7)
         return np.stack([np.full(7, self.typical), taus], axis=-1)[:, None, :]
 
@@ -70,7 +70,7 @@ class GainDrift(NamedEffect[FloatArray]):
 class BatterySag(NamedEffect[FloatArray]):
     """A lamp that dims with its battery: signal x (1 + per_volt (V - V0)), V from `battery_mv`, V0 = 8 V.
 
-    Readings whose voltage is not known are taken at V0.
+    Readings without a recorded voltage are taken to be at V0.
     """
 
     typical_per_volt: float = 0.05
@@ -84,26 +84,26 @@ class BatterySag(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take two percent of the signal over the voltages that occurred as typical, where they were recorded."""
+        """Set the typical change to 2 % over the recorded voltages; None where there are none or they do not vary."""
         above = _volts_above_reference(extent.plan)
         fall = float(np.ptp(above))
         return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
 
     @cached_property
     def prior(self) -> Product:
-        """Share of the signal a volt, of either sign."""
+        """Relative change of the signal per volt, of either sign."""
         return Product({"per_volt": HeavyTailed(self.typical_per_volt)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal, (n_samples, n_points), never the dark level."""
+        """Scale the signal above the dark level, (n_samples, n_points)."""
         return np.asarray(value * (1 + theta[:, :1] * _volts_above_reference(plan)))
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the share."""
+        """One entry: the change is linear in the parameter."""
         return np.full((1, 1, 1), self.typical_per_volt)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much signal a volt is worth."""
+        """Say by how many percent the signal changes per volt."""
         way = "loses" if mean[0] > 0 else "gains"
         return (
             f"the signal {way} {give_or_take(abs(mean[0]), sd[0], factor=100)} % for each volt that the battery "
@@ -112,6 +112,6 @@ class BatterySag(NamedEffect[FloatArray]):
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
-    """Battery voltage less V0, 0 where it is not known, (n_points,)."""
+    """Battery voltage minus V0, 0 where it is not recorded, (n_points,)."""
     millivolts = plan.covariates.get(_BATTERY, np.full(len(plan), _REFERENCE_MV))
     return np.where(np.isfinite(millivolts), (millivolts - _REFERENCE_MV) / 1000, 0.0)

@@ -1,4 +1,4 @@
-"""Light that the surface throws back at one place, black or white: an effect on the offset."""
+"""A specular reflection at one place, on black and white alike: an effect on the offset."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.spots import ALONG_X, Line, SpotPrior, bell, scanned_lines, spot_bank
+from probewise.effects.spots import ALONG_X, ScanLine, SpotPrior, bell, scanned_lines, spot_bank
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -22,12 +22,12 @@ __all__ = ["Glint"]
 class Glint(NamedEffect[FloatArray]):
     """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y).
 
-    `line` is the scanned line that it is seen from, `lines` are all that it might be.
+    `line` is the scanned line on or beside which it lies; `lines` are the candidates.
     """
 
     typical: float = 1.0
-    line: Line = ALONG_X
-    lines: tuple[Line, ...] = ()
+    line: ScanLine = ALONG_X
+    lines: tuple[ScanLine, ...] = ()
 
     name: ClassVar[str] = "glint"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -37,7 +37,7 @@ class Glint(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take two hundredths of the readings' range as typical; look along straight scans, where there are any."""
+        """Set the typical height to 2 % of the readings' range; search along straight scans, None without any."""
         lines = scanned_lines(extent.plan)
         return cls(0.02 * extent.span, lines[0], lines) if lines else None
 
@@ -52,11 +52,11 @@ class Glint(NamedEffect[FloatArray]):
         return np.asarray(value + amp * bell((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r))
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the line."""
+        """One variant for each scanned line."""
         return tuple(replace(self, line=line) for line in self.lines)
 
     def bank(self) -> FloatArray:
-        """Places and radii."""
+        """Spots of three radii along the line."""
         return spot_bank(self.typical, self.line)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""Priors of an effect's size: zero most likely, large never ruled out."""
+"""Heavy-tailed priors of an effect's size: highest density at zero, large values never ruled out."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from probewise.errors import ParameterError
 __all__ = ["SMALLEST_AND_LARGEST", "HeavyTailed", "LogHeavyTailed"]
 
 SMALLEST_AND_LARGEST = (0.05, 25.0)
-"""Scales of the mixture over the typical size: a narrower prior names worse as the effect grows."""
+"""Smallest and largest sd of the mixture, in typical sizes: with a narrower range large effects are misnamed."""
 
 _N_SCALES = 9
 
 
 @dataclass(frozen=True)
 class HeavyTailed:
-    """Mix normal distributions about zero whose sd run from 0.05 to 25 times a typical size.
+    """Scale mixture of normal distributions about zero, with sds from 0.05 to 25 times a typical size.
 
     The weights are equal, so the density falls about as 1/abs(x) over three decades and is
-    proper at both ends. With `positive` only the upper half is kept.
+    proper. With `positive` the distribution is folded onto x >= 0.
     """
 
     typical: float
@@ -56,12 +56,12 @@ class HeavyTailed:
 
     @cached_property
     def _table(self) -> tuple[FloatArray, FloatArray]:
-        """Size against minus log of twice the upper tail: smooth, monotone, from 0."""
+        """Tabulate -log(2 x upper tail) and the size it belongs to: smooth, monotone, from 0."""
         x = self.typical * np.concatenate([[0.0], np.geomspace(1e-5, 300.0, 600)])
         return -np.log(2 * self._upper(x)), x
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape: a table, then Newton steps on the log of the tail."""
+        """Quantile function, any shape: a table lookup, then Newton steps on the log of the tail."""
         u = np.asarray(u, dtype=np.float64)
         if self.positive:
             tail, sign = (1.0 - u) / 2, np.ones_like(u)
@@ -79,7 +79,7 @@ class HeavyTailed:
         return np.asarray(sign * x)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Distribution function, any shape."""
+        """Cumulative distribution function, any shape."""
         value = np.asarray(value, dtype=np.float64)
         tail = self._upper(np.abs(value))
         if self.positive:
@@ -93,7 +93,7 @@ class HeavyTailed:
 
 @dataclass(frozen=True)
 class LogHeavyTailed:
-    """Believe that the logarithm is heavy-tailed about zero: a factor or exponent near one."""
+    """Prior of a factor or exponent near one: its logarithm is heavy-tailed about zero."""
 
     typical_log: float
 
@@ -106,7 +106,7 @@ class LogHeavyTailed:
         return np.exp(self._log.from_unit(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Distribution function, any shape."""
+        """Cumulative distribution function, any shape."""
         return self._log.to_unit(np.log(value))
 
     def log_prob(self, value: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""How high the sensor hangs: the higher, the wider its footprint and the weaker its signal."""
+"""Errors of the sensor's height: a higher sensor has a wider footprint and a weaker signal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moves import in_scans, mountings
+from probewise.effects.motion import in_scans, mountings
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
@@ -20,14 +20,14 @@ from probewise.sensor.stages import Footprint, Stage
 
 __all__ = ["HeightGradient", "HeightOffset"]
 
-_USUAL_MM = 14.0  # where a recording does not say
+_USUAL_MM = 14.0  # the height assumed where a recording gives none
 
 
 @dataclass(frozen=True)
 class HeightGradient(NamedEffect[Footprint]):
     """A table that slopes: height h = h0 + mm_per_mm X; footprint x h/h0, signal x (h0/h)^2.
 
-    h0 is the height of the recording's description, 14 mm where it has none.
+    h0 is the height in the recording's description, or 14 mm where it gives none.
     """
 
     typical: float = 0.001
@@ -40,12 +40,12 @@ class HeightGradient(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the height over the longest scan as typical."""
+        """Set the typical slope to 1 % of the height over the longest scan."""
         return cls(typical=0.01 * _height_mm(extent.plan) / extent.length_mm)
 
     @cached_property
     def prior(self) -> Product:
-        """Rise of the sensor above the surface, of either sign."""
+        """Change of height per millimetre along X, of either sign."""
         return Product({"mm_per_mm": HeavyTailed(self.typical)})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -53,7 +53,7 @@ class HeightGradient(NamedEffect[Footprint]):
         return raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the slope."""
+        """One entry: the change is linear in the slope."""
         return np.full((1, 1, 1), self.typical)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -67,9 +67,9 @@ class HeightGradient(NamedEffect[Footprint]):
 
 @dataclass(frozen=True)
 class HeightOffset(NamedEffect[Footprint]):
-    """A mounting, or a scan, at another height: h = h0 + mm there; footprint x h/h0, signal x (h0/h)^2.
+    """One mounting or scan at another height: h = h0 + mm there; footprint x h/h0, signal x (h0/h)^2.
 
-    `scans` names those scans, `choices` are all that they might be.
+    `scans` are the affected scans; `choices` are the candidate groups of scans.
     """
 
     typical_mm: float = 0.15
@@ -84,25 +84,25 @@ class HeightOffset(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the height as typical, where there is more than one scan."""
+        """Set the typical offset to 1 % of the height; None for a single scan."""
         choices = mountings(extent.plan)
         return cls(0.01 * _height_mm(extent.plan), (), choices) if choices else None
 
     @cached_property
     def prior(self) -> Product:
-        """How much higher, of either sign."""
+        """Height difference, of either sign."""
         return Product({"mm": HeavyTailed(self.typical_mm)})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Widen and dim the footprint in those scans."""
+        """Widen and dim the footprint in the affected scans."""
         return raised(value, 1 + theta * in_scans(plan, self.scans) / _height_mm(plan))
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the mounting or the scan."""
+        """One variant for each mounting and each scan."""
         return tuple(replace(self, scans=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the height."""
+        """One entry: the change is linear in the height."""
         return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""What changes at one moment and has no name in the vocabulary: the arm is knocked, the signal jumps."""
+"""Changes at one time that are outside the vocabulary: the arm is knocked, or the gain jumps."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moments import SinceAMoment, moments_of
 from probewise.effects.vocabulary import give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
@@ -21,8 +21,8 @@ __all__ = ["ArmKnock", "GainStep"]
 
 
 @dataclass(frozen=True)
-class ArmKnock(SinceAMoment[Poses]):
-    """The arm is pushed: from at_s on every place is (dx_mm, dy_mm) off, and the sensor turned by turn_deg."""
+class ArmKnock(ChangePointEffect[Poses]):
+    """The arm is pushed: after at_s every position is off by (dx_mm, dy_mm) and the sensor is turned by turn_deg."""
 
     typical_mm: float = 0.3
     typical_deg: ClassVar[float] = 2.0
@@ -35,18 +35,18 @@ class ArmKnock(SinceAMoment[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take half a percent of the longest scan as typical; look between any two readings."""
-        moments = moments_of(extent)
-        return None if moments is None else cls(moments, typical_mm=0.005 * extent.length_mm)
+        """Set the typical shift to 0.5 % of the longest scan; None where all readings share one time."""
+        times = change_point_times(extent)
+        return None if times is None else cls(times, typical_mm=0.005 * extent.length_mm)
 
     @cached_property
     def prior(self) -> Product:
-        """Shift along X and along Y, turn, and the moment."""
+        """Shift along X and along Y, turn, and time of the knock."""
         shift, turn = HeavyTailed(self.typical_mm), HeavyTailed(self.typical_deg)
         return Product({"dx_mm": shift, "dy_mm": shift, "turn_deg": turn, "at_s": Uniform(*self.open_s)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the places of the readings taken after the moment, and turn the sensor there."""
+        """Shift and turn the poses of the readings taken after the knock."""
         since = self.since(theta, plan)
         return replace(
             value,
@@ -56,7 +56,7 @@ class ArmKnock(SinceAMoment[Poses]):
         )
 
     def bank(self) -> FloatArray:
-        """One setting of three columns, in the middle of the time left open."""
+        """One entry of three columns, its time in the middle of the open interval."""
         sizes = np.diag([self.typical_mm, self.typical_mm, self.typical_deg])
         return np.concatenate([sizes, np.full((3, 1), sum(self.open_s) / 2)], axis=1)[None, :, :]
 
@@ -70,8 +70,8 @@ class ArmKnock(SinceAMoment[Poses]):
 
 
 @dataclass(frozen=True)
-class GainStep(SinceAMoment[FloatArray]):
-    """Lamp or lens changes at once: signal x (1 + frac 1(t > at_s))."""
+class GainStep(ChangePointEffect[FloatArray]):
+    """The lamp or lens changes suddenly: signal x (1 + frac 1(t > at_s))."""
 
     typical: float = 0.02
 
@@ -83,21 +83,21 @@ class GainStep(SinceAMoment[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look between any two readings of the recording."""
-        moments = moments_of(extent)
-        return None if moments is None else cls(moments)
+        """Search all times between readings; None where all readings share one time."""
+        times = change_point_times(extent)
+        return None if times is None else cls(times)
 
     @cached_property
     def prior(self) -> Product:
-        """Share, of either sign, and the moment."""
+        """Relative change, of either sign, and its time."""
         return Product({"frac": HeavyTailed(self.typical), "at_s": Uniform(*self.open_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal of the readings taken after the moment, (n_samples, n_points)."""
+        """Scale the signal of the readings taken after the step, (n_samples, n_points)."""
         return np.asarray(value * (1 + theta[:, :1] * self.since(theta, plan)))
 
     def bank(self) -> FloatArray:
-        """One setting, in the middle of the time left open."""
+        """One entry, its time in the middle of the open interval."""
         return np.array([[[self.typical, sum(self.open_s) / 2]]])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

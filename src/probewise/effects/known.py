@@ -1,4 +1,4 @@
-"""An effect whose parameters are known: nothing is left to infer."""
+"""An effect with fixed parameters."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ V = TypeVar("V")
 
 @dataclass(frozen=True)
 class Known(Effect[V]):
-    """Fix an effect's parameters, so that a repaired sensor is as known to the robot as any other.
+    """Fix an effect's parameters, so that the robot can use a repaired sensor like any other.
 
     `values` are in the order of `effect.prior.names`.
     """
@@ -44,9 +44,9 @@ class Known(Effect[V]):
 
     @property
     def prior(self) -> Empty:
-        """Nothing to infer."""
+        """The empty prior: no free parameters."""
         return Empty()
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
-        """Apply with the known values; theta has no columns, (n_samples, 0)."""
+        """Apply the effect with the fixed values; theta is (n_samples, 0)."""
         return self.effect.apply(value, np.array([self.values]), plan)

@@ -1,4 +1,4 @@
-"""Readings on a lattice: rounding that nobody declared."""
+"""Undeclared quantisation: readings that lie on a lattice."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_law import NoiseRows
+from probewise.effects.noise_distribution import NoiseRows
 from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -19,8 +19,8 @@ from probewise.sensor.stages import NoiseLevel, Stage
 
 __all__ = ["Quantisation", "lattice_step", "lattice_step_sd"]
 
-_TELLING = 15.0  # printed digits that a coarser step is, at least
-_DIGITS = 1e-6  # of a step: what is not told from rounding
+_TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printed values
+_DIGITS = 1e-6  # of a step: below this a difference is rounding
 
 
 @dataclass(frozen=True)
@@ -37,26 +37,26 @@ class Quantisation(NoiseEffect):
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
     n_nodes: ClassVar[int] = 16
     seen_above: ClassVar[float] = 0.3
-    """Noise sd: a finer lattice, as of printing, is no effect."""
+    """Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look from a thousandth of the readings' range to a fifth, where no step is declared."""
+        """Search steps from a thousandth to a fifth of the readings' range; None where a step is declared."""
         if extent.plan.instrumentation.step is not None:
             return None
         return cls(1e-3 * extent.span, 0.2 * extent.span)
 
     @cached_property
     def prior(self) -> Product:
-        """The step, over its orders of magnitude."""
+        """The step, log-uniform."""
         return Product({"step": LogUniform(self.smallest, self.largest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the step."""
+        """Set the rounding step."""
         return replace(value, step=theta[:, :1])
 
     def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Take the step of the lattice that the readings are on; none where it is too fine to matter."""
+        """Return the step of the readings' lattice as the only node; no node where it is too fine to matter."""
         step = lattice_step(rows.predicted + rows.sd * residuals)
         return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
@@ -66,10 +66,10 @@ class Quantisation(NoiseEffect):
 
 
 def lattice_step(readings: FloatArray) -> float:
-    """Find the step of a lattice that holds all readings, 0 where there is none coarser than a millionth of the range.
+    """Find the step of a lattice that holds all readings; 0 where none is coarser than a millionth of the range.
 
-    Readings are printed to some digits, which is a lattice too; a coarser one shows through it, each of its values
-    off by half a printed digit at most.
+    Readings printed to some digits lie on a lattice too; a coarser lattice is found through it, since printing moves
+    each value by at most half a digit.
     """
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 3:
@@ -80,7 +80,7 @@ def lattice_step(readings: FloatArray) -> float:
 
 
 def lattice_step_sd(readings: FloatArray, step: float) -> float:
-    """Say how well a lattice's step is known: the rounding of what is printed over the lattice's reach."""
+    """Estimate the sd of a lattice's step: the rounding error over the norm of the values' centred lattice numbers."""
     values = np.unique(readings[np.isfinite(readings)])
     digits = (10.0**-n for n in range(10) if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n))
     reach = float(np.linalg.norm(values - values.mean())) / step
@@ -88,17 +88,17 @@ def lattice_step_sd(readings: FloatArray, step: float) -> float:
 
 
 def _through(values: FloatArray, rounding: float) -> float:
-    """Find the step of a lattice that shows through rounding, from two neighbours outwards; 0 where there is none.
+    """Find the step of a lattice of rounded values, from the two closest outwards; 0 where there is none.
 
-    `rounding` is how far printing may have moved each value, both ways.
+    `rounding` is the full width of the rounding error of each value.
     """
     gaps = np.diff(values)
     step, start = float(gaps.min()), float(values[np.argmin(gaps)])
     if step <= _TELLING * rounding:
         return 0.0
-    reach, known = 0.0, 1.0  # how far the lattice is told, and over how many steps the step is known to the rounding
+    reach, known = 0.0, 1.0  # distance up to which values are numbered, and how many steps the last fit spanned
     while reach < values[-1] - values[0]:
-        further = 0.2 * step / rounding * known * step  # so far no number can be missed
+        further = 0.2 * step / rounding * known * step  # up to here every value's number is certain
         near = values[np.abs(values - start) <= further]
         if further <= reach or len(near) < 2:
             return 0.0
@@ -112,7 +112,7 @@ def _through(values: FloatArray, rounding: float) -> float:
 def _common_step(values: FloatArray, tolerance: float) -> float:
     """Find the greatest common step of sorted values; 0 where it is below ten times the tolerance.
 
-    Euclid's algorithm on their differences, each remainder below the tolerance taken for rounding.
+    Euclid's algorithm on their differences; a remainder below the tolerance counts as rounding.
     """
     step = 0.0
     for gap in np.diff(values):

@@ -1,4 +1,4 @@
-"""Patterns that do not lie where the description says: effects on the scene."""
+"""Patterns that do not lie where the recording's description says: effects on the scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moves import in_scans
+from probewise.effects.motion import in_scans
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product
 from probewise.recordings.patterns import HalfPlane, Ramp, Stripes
@@ -23,7 +23,7 @@ __all__ = ["EdgeMisplacement", "ScanMisplacement"]
 
 @dataclass(frozen=True)
 class EdgeMisplacement(NamedEffect[SceneView]):
-    """Every pattern lies offset_mm further along its edge's normal, or along X where it has more than one edge."""
+    """Every pattern is shifted by offset_mm along its edge's normal, or along X where it has no single normal."""
 
     typical_mm: float = 0.3
 
@@ -35,20 +35,20 @@ class EdgeMisplacement(NamedEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take three thousandths of the longest scan as typical."""
+        """Set the typical offset to 0.3 % of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
     @cached_property
     def prior(self) -> Product:
-        """How far, to either side."""
+        """Offset, of either sign."""
         return Product({"offset_mm": HeavyTailed(self.typical_mm)})
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Move the patterns."""
+        """Shift the patterns."""
         return _moved(value, theta * np.ones(len(plan)), plan)
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the offset."""
+        """One entry: the change is linear in the offset."""
         return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -58,9 +58,9 @@ class EdgeMisplacement(NamedEffect[SceneView]):
 
 @dataclass(frozen=True)
 class ScanMisplacement(NamedEffect[SceneView]):
-    """The same in one scan: its pattern lies offset_mm further along its edge's normal, or along X.
+    """In one scan the pattern is shifted by offset_mm along its edge's normal, or along X where it has none.
 
-    `scans` names that scan, `choices` are all that it might be.
+    `scans` holds that scan; `choices` are the candidates.
     """
 
     typical_mm: float = 0.3
@@ -75,25 +75,25 @@ class ScanMisplacement(NamedEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take three thousandths of the longest scan as typical, where there is more than one."""
+        """Set the typical offset to 0.3 % of the longest scan; None for a single scan."""
         names = tuple(dict.fromkeys(extent.plan.scan_names))
         return cls(0.003 * extent.length_mm, (), tuple((name,) for name in names)) if len(names) > 1 else None
 
     @cached_property
     def prior(self) -> Product:
-        """How far, to either side."""
+        """Offset, of either sign."""
         return Product({"offset_mm": HeavyTailed(self.typical_mm)})
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Move the patterns under that scan."""
+        """Shift the pattern under that scan."""
         return _moved(value, theta * in_scans(plan, self.scans), plan)
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the scan."""
+        """One variant for each scan."""
         return tuple(replace(self, scans=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the offset."""
+        """One entry: the change is linear in the offset."""
         return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -105,7 +105,7 @@ class ScanMisplacement(NamedEffect[SceneView]):
 
 
 def _moved(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
-    """Move each reading's pattern by so much, (n_samples, n_points)."""
+    """Shift each reading's pattern by `by_mm`, (n_samples, n_points)."""
     angle = np.zeros(len(plan))
     for name, rows in plan.rows_by_pattern():
         pattern = plan.patterns.get(name)

@@ -1,4 +1,4 @@
-"""How readings scatter: effects on the noise."""
+"""Effects on the noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import LogHeavyTailed
-from probewise.effects.noise_law import NoiseRows
+from probewise.effects.noise_distribution import NoiseRows
 from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -22,7 +22,7 @@ __all__ = ["CorrelatedNoise", "DriftingNoise", "NoisePerRun", "RandomWalk", "Sig
 
 @dataclass(frozen=True)
 class CorrelatedNoise(NoiseEffect):
-    """Noise with a memory, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
+    """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
 
     lowest: float = -0.5
     highest: float = 0.95
@@ -32,24 +32,24 @@ class CorrelatedNoise(NoiseEffect):
     units: ClassVar[tuple[str, ...]] = ("1",)
     covariates: ClassVar[tuple[str, ...]] = ("scan",)
     amplitudes: ClassVar[tuple[int, ...]] = (0,)
-    n_nodes: ClassVar[int] = 28  # close enough to integrate over a posterior of a thousand readings
+    n_nodes: ClassVar[int] = 28  # dense enough to integrate the posterior of a thousand readings
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: a correlation is a pure number."""
+        """Keep the default scale: a correlation is a pure number."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """The correlation of neighbours, even over its range."""
+        """The correlation of neighbouring readings, uniform over its range."""
         return Product({"rho": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the correlation; the sd of one reading stays."""
+        """Set the correlation; the sd of a single reading does not change."""
         return replace(value, rho=theta[:, :1])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how alike neighbours are."""
+        """Say how strongly neighbouring readings correlate."""
         return (
             f"the noise of neighbouring readings correlates by {give_or_take(mean[0], sd[0])}: "
             "readings repeat each other's errors"
@@ -71,20 +71,20 @@ class SignalDependentNoise(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: a ratio is a pure number."""
+        """Keep the default scale: a ratio is a pure number."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """How much more variance on white, over its orders of magnitude."""
+        """Relative increase of the variance on white, log-uniform."""
         return Product({"ratio": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Widen the noise of each reading by what it sees."""
+        """Scale the noise sd of each reading by its seen fraction."""
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much louder the highest level is than the lowest."""
+        """Say how much larger the variance is at the highest level than at the lowest."""
         return (
             f"the noise grows with the level: its variance at the highest is {give_or_take(1 + mean[0], sd[0])} times "
             "that at the lowest"
@@ -93,9 +93,9 @@ class SignalDependentNoise(NoiseEffect):
 
 @dataclass(frozen=True)
 class DriftingNoise(NoiseEffect):
-    """Noise that grows or calms down in time: sd x growth^(time / duration), evenly on a logarithmic scale.
+    """Noise whose sd grows or shrinks exponentially in time: sd x growth^(time / duration - 1/2).
 
-    No physics of the sensor, and no name of the vocabulary's: it keeps tests of the mean honest.
+    It is outside the vocabulary: a nuisance that keeps the tests of the mean valid.
     """
 
     least: float = 0.2
@@ -109,12 +109,12 @@ class DriftingNoise(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: a growth is a pure number."""
+        """Keep the default scale: a growth factor is a pure number."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """The sd at the end over that at the start, over its orders of magnitude."""
+        """The sd at the end over that at the start, log-uniform."""
         return Product({"growth": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
@@ -129,9 +129,9 @@ class DriftingNoise(NoiseEffect):
 
 @dataclass(frozen=True)
 class RandomWalk(NoiseEffect):
-    """An offset that walks: from each row to the next, over runs too, it gains a normal step.
+    """A random walk of the offset: a normal step from each row to the next, across runs too.
 
-    `n_before` rows were walked before those of a table that is to be predicted: those that taught the model.
+    `n_before` is the number of steps taken before the first row of the plan: the rows of the training data.
     """
 
     n_before: int = 0
@@ -147,39 +147,39 @@ class RandomWalk(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: the step is in units of the noise."""
+        """Keep the default scale: the step is in units of the noise sd."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """Sd of a step in sds of the noise, over its orders of magnitude."""
+        """Sd of a step in noise sds, log-uniform."""
         return Product({"sd_per_row": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the step; the sd of one reading about the walk stays."""
+        """Set the step; the sd of a reading about the walk does not change."""
         return replace(
             value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far it walks."""
+        """Say how large the steps are."""
         return f"the offset walks at random, by {give_or_take(mean[0], sd[0])} noise sds from each row to the next"
 
 
-_SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # sds of the logarithm of a run's sd that are believed alike
+_SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
 _NEWTON_STEPS = 40
 
 
 @dataclass(frozen=True)
 class NoisePerRun(NoiseEffect):
-    """Noise of another sd in each run: sd x value of the run; the logarithms of the values scatter normally about 0.
+    """Another noise sd in each run: sd x value of the run; the logarithms of the values are normal about 0.
 
     Parameters
     ----------
     runs
         Names of the runs.
     n_rows
-        Readings of each that taught its value; () where that is not asked.
+        Number of readings from which each run's value was estimated; () where it is not needed.
     """
 
     runs: tuple[str, ...] = ()
@@ -191,7 +191,7 @@ class NoisePerRun(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take the runs of a recording; None where there is but one."""
+        """Take the runs of a recording; None where there is only one."""
         plan = extent.plan
         names = tuple(plan.scan_names)
         return cls(names, tuple(np.bincount(plan.scan, minlength=len(names)).tolist())) if len(names) > 1 else None
@@ -203,25 +203,25 @@ class NoisePerRun(NoiseEffect):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """None: at 1 they do nothing."""
+        """No amplitudes: the values are factors, which do nothing at 1."""
         return ()
 
     @property
     def nothing(self) -> dict[int, float]:
-        """All runs alike."""
+        """Factor 1 in every run."""
         return dict.fromkeys(range(len(self.runs)), 1.0)
 
     @cached_property
     def prior(self) -> Product:
-        """The value of each run by itself."""
+        """Independent priors of the runs' values."""
         return Product({f"values[{run}]": LogHeavyTailed(0.3) for run in self.runs})
 
     def bank(self) -> FloatArray:
-        """All runs alike: what differs is found about a fit."""
+        """One entry, 1 in every run: `weighed_nodes` finds the values from a fit's residuals."""
         return np.ones((1, 1, len(self.runs)))
 
     def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
-        """Give for each scatter of the runs the most probable values, and what Laplace makes of those about them."""
+        """Return for each between-run sd the most probable values and the log of their Laplace weight."""
         n_runs = len(self.runs)
         counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
         squares: FloatArray = np.bincount(rows.run, residuals**2, minlength=n_runs).astype(np.float64)
@@ -231,7 +231,7 @@ class NoisePerRun(NoiseEffect):
         for spread in _SPREADS:
             logs = _most_likely_logs(counts, squares, spread)
             curvature = 2 * counts + spread**-2
-            # The overall sd is integrated elsewhere, at these values: what that misses is that it moves with them.
+            # The overall sd is integrated elsewhere, at fixed values: `beside` corrects for its coupling to them.
             beside = float(np.sum(2 * counts * spread**-2 / curvature)) / float(2 * counts.sum())
             log_prior = -0.5 * float(np.sum((logs / spread) ** 2)) - n_runs * np.log(spread)
             log_weights.append(log_prior - 0.5 * float(np.log(curvature).sum() + np.log(beside)))
@@ -239,19 +239,19 @@ class NoisePerRun(NoiseEffect):
         return np.array(values), np.array(log_weights) - np.log(len(_SPREADS))
 
     def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
-        """Draw each run's value as exactly as its readings tell it."""
+        """Draw each run's value about its node, with relative sd 1 / sqrt(2 n_rows)."""
         widths = 1 / np.sqrt(2 * np.maximum(np.array(self.n_rows or (1,) * len(self.runs)), 1))
         return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Scale the noise of each reading by its run; a run of no known value stays as it is."""
+        """Scale the noise of each reading by its run's value; 1 for a run that is not listed."""
         known = {name: k for k, name in enumerate(self.runs)}
         at = np.array([known.get(name, len(self.runs)) for name in plan.scan_names])
         values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
         return replace(value, sd=value.sd * values[:, at[plan.scan]])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say which runs are the calmest and the loudest."""
+        """Say which runs have the least and the most noise."""
         low, high = int(np.argmin(mean)), int(np.argmax(mean))
         return (
             f"the noise differs from run to run: {give_or_take(mean[high], sd[high])} times its typical sd in run "
@@ -260,14 +260,14 @@ class NoisePerRun(NoiseEffect):
 
 
 def _most_likely_logs(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
-    """Find the logarithms of the runs' sds, the overall sd at its best: (n_runs,) of readings and sums of squares."""
+    """Maximise over the logs of the runs' sds, the overall sd profiled out; counts, squared residuals: (n_runs,)."""
     logs = np.zeros(len(counts))
     for _ in range(_NEWTON_STEPS):
         weighed = squares * np.exp(-2 * logs)
         share = weighed * counts.sum() / weighed.sum()  # sums of squares in units of the best overall variance
         slope = share - counts - logs / spread**2
         curvature = 2 * share + spread**-2
-        # The overall sd moves along: the Hessian less a product of rank one, inverted by Sherman and Morrison.
+        # Profiling out the overall sd takes a rank-one term from the Hessian: Sherman-Morrison inverts it.
         along, turned = 2 * share / curvature, slope / curvature
         step = turned - along * float(np.sum(2 * share * turned)) / (-float(2 * share.sum()) + float(2 * share @ along))
         logs = logs + np.clip(step, -1.0, 1.0)

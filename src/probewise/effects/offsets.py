@@ -1,4 +1,4 @@
-"""What adds to the reading whatever lies under the sensor: effects on the offset."""
+"""Effects on the offset: they add to the reading whatever lies under the sensor."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moments import SinceAMoment, moments_of
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
@@ -34,7 +34,7 @@ class AmbientGradient(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the readings' range over the longest scan as typical, where the place changes at all."""
+        """Set the typical slope to 1 % of the readings' range over the longest scan; None where nothing moves."""
         if np.ptp(extent.plan.x_mm) == np.ptp(extent.plan.y_mm) == 0:
             return None
         return cls(typical_per_mm=0.01 * extent.span / extent.length_mm)
@@ -50,7 +50,7 @@ class AmbientGradient(NamedEffect[FloatArray]):
         return np.asarray(value + theta[:, :1] * plan.x_mm + theta[:, 1:2] * plan.y_mm)
 
     def bank(self) -> FloatArray:
-        """One setting of two columns: linear in both slopes."""
+        """One entry of two columns: linear in both slopes."""
         return self.typical_per_mm * np.eye(2)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -75,12 +75,12 @@ class OffsetDrift(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the readings' range over the whole recording as typical."""
+        """Set the typical drift to 1 % of the readings' range over the recording."""
         return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600))
 
     @cached_property
     def prior(self) -> Product:
-        """Rise an hour, of either sign."""
+        """Change per hour, of either sign."""
         return Product({"per_hour": HeavyTailed(self.typical_per_hour)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -88,7 +88,7 @@ class OffsetDrift(NamedEffect[FloatArray]):
         return np.asarray(value + theta[:, :1] * (plan.time_s / 3600))
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the drift."""
+        """One entry: linear in the drift."""
         return np.full((1, 1, 1), self.typical_per_hour)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -101,7 +101,7 @@ class OffsetDrift(NamedEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class AmbientStep(SinceAMoment[FloatArray]):
+class AmbientStep(ChangePointEffect[FloatArray]):
     """Light switched on or off in the room: reading + amp 1(t > at_s)."""
 
     typical: float = 0.5
@@ -114,13 +114,13 @@ class AmbientStep(SinceAMoment[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the readings' range as typical; look between any two readings of the recording."""
-        moments = moments_of(extent)
-        return None if moments is None else cls(moments, typical=0.01 * extent.span)
+        """Set the typical step to 1 % of the readings' range; None where all readings share one time."""
+        times = change_point_times(extent)
+        return None if times is None else cls(times, typical=0.01 * extent.span)
 
     @cached_property
     def prior(self) -> Product:
-        """Size, of either sign, and time: even over the recording, or between two readings where that is chosen."""
+        """Size, of either sign, and time: uniform over the recording, or between two chosen readings."""
         return Product({"amp": HeavyTailed(self.typical), "at_s": Uniform(*self.open_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -128,11 +128,11 @@ class AmbientStep(SinceAMoment[FloatArray]):
         return np.asarray(value + theta[:, :1] * self.since(theta, plan))
 
     def bank(self) -> FloatArray:
-        """One setting, in the middle of the time left open."""
+        """One entry, its time in the middle of the open interval."""
         return np.array([[[self.typical, sum(self.open_s) / 2]]])
 
     def coarse(self) -> Self:
-        """Look between any two readings: it is the step that is told from all others by its moment."""
+        """Keep all intervals: the time of the step is what identifies it."""
         return self
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

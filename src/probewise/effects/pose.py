@@ -1,4 +1,4 @@
-"""Where the sensor really stands: effects on the pose."""
+"""Effects on the pose: where the sensor stands instead of where it was sent."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ class Backlash(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take half a percent of the longest scan as typical."""
+        """Set the typical width to 0.5 % of the longest scan."""
         return cls(typical_mm=0.005 * extent.length_mm)
 
     @cached_property
     def prior(self) -> Product:
-        """Width, greater than zero: an arm cannot arrive before it has moved."""
+        """Width, positive: the arm lags behind the motion, never ahead."""
         return Product({"width_mm": HeavyTailed(self.typical_mm, positive=True)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the poses against the direction of the last commanded move."""
+        """Shift the poses against the direction of the last commanded motion."""
         half_mm = theta[:, :1] / 2
         return replace(
             value,
@@ -51,7 +51,7 @@ class Backlash(NamedEffect[Poses]):
         )
 
     def bank(self) -> FloatArray:
-        """One setting: the shift is linear in the width."""
+        """One entry: the shift is linear in the width."""
         return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -67,7 +67,7 @@ _LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
 
 @dataclass(frozen=True)
 class PositionScale(NamedEffect[Poses]):
-    """Steps that are not as long as they should be: X (1 + x), Y (1 + y)."""
+    """Motor steps of the wrong length: X (1 + x), Y (1 + y)."""
 
     typical: float = 0.01
 
@@ -79,21 +79,21 @@ class PositionScale(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: a hundredth is typical, a wheel that is taken for another makes tenths."""
+        """Keep the default scale: an error of 1 % is typical; a wrong wheel size makes tens of percent."""
         return cls()
 
     @cached_property
     def prior(self) -> Product:
-        """Share too long, along X and along Y."""
+        """Relative error of the scale, along X and along Y."""
         share = HeavyTailed(self.typical)
         return Product({"x": share, "y": share})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Stretch the places about the origin of the lab frame."""
+        """Stretch the positions about the origin of the lab frame."""
         return replace(value, x_mm=value.x_mm * (1 + theta[:, :1]), y_mm=value.y_mm * (1 + theta[:, 1:2]))
 
     def bank(self) -> FloatArray:
-        """List settings of two columns: a small one, which the SSF's width may take up, and large ones."""
+        """Entries of two columns: one small, which the SSF's width may absorb, and four large."""
         return np.array([self.typical, *_LARGE_SCALES])[:, None, None] * np.eye(2)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""What posterior samples predict of new readings: mean, sd, and the density of what was read."""
+"""The posterior predictive distribution of readings: mean, sd, and log density of the measured values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.effects.noise_law import log_density, variance
+from probewise.effects.noise_distribution import log_density, variance
 from probewise.sensor.stages import NoiseLevel
 
 __all__ = ["PredictiveMixture"]
@@ -16,16 +16,16 @@ __all__ = ["PredictiveMixture"]
 
 @dataclass(eq=False)
 class PredictiveMixture:
-    """Gather the predictions of posterior samples, some at a time: their mixture is the law of a new reading.
+    """Accumulate the predictions of posterior samples, block by block: their mixture is the predictive distribution.
 
     Parameters
     ----------
     readings
-        What was read, (n_points,).
+        Measured readings, (n_points,).
     scored
-        Which readings are scored, (n_points,).
+        Which readings get a log density, (n_points,).
     step
-        What readings are rounded to, where that was declared.
+        The declared rounding step, if any.
     """
 
     readings: FloatArray
@@ -42,19 +42,19 @@ class PredictiveMixture:
     def add(self, mean: FloatArray, level: NoiseLevel) -> None:
         """Add noise-free predictions, (n_samples, n_points), and the noise about them."""
         if self._center is None:
-            self._center = mean.mean(axis=0)  # Sums about a nearby value keep their digits.
+            self._center = mean.mean(axis=0)  # sums about a nearby value keep their precision
         self.n_samples += len(mean)
         self._total += (mean - self._center).sum(axis=0)
         self._squares += ((mean - self._center) ** 2).sum(axis=0)
         self._of_noise += np.broadcast_to(variance(level), mean.shape).sum(axis=0)
-        if self.step is not None:  # the pooled sd holds what a declared rounding adds
+        if self.step is not None:  # `variance` above leaves it out: the pooled sd includes a declared rounding
             level = replace(level, step=np.full((1, 1), self.step))
         if self._log_sum.size:
             log_p = log_density(_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
 
     def finished(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Give mean, sd and log density of each reading, (n_points,); the density is NaN where none is scored."""
+        """Return mean, sd and log density of each reading, (n_points,); NaN for the density of readings not scored."""
         n = self.n_samples
         shift = self._total / n
         spread = np.maximum(self._squares / n - shift**2, 0.0)
@@ -65,7 +65,7 @@ class PredictiveMixture:
 
 
 def _of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
-    """Keep the noise of some rows."""
+    """Select the noise of some rows."""
     if level.sd.shape[-1] == 1:
         return level
     return replace(level, sd=level.sd[:, rows])

@@ -1,4 +1,4 @@
-"""An arm whose rails are not straight or whose teeth are not all there: effects on the place without a name."""
+"""Bent rails and missing rack teeth: effects on the position that are outside the vocabulary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_PLACES = 160
 
 @dataclass(frozen=True)
 class BentRails(NamedEffect[Poses]):
-    """Each axis errs by a square and a cube of itself: X + x2_mm (X / 10 mm)^2 + x3_mm (X / 10 mm)^3, likewise Y."""
+    """Quadratic and cubic position error of each axis: X + x2_mm (X / 10 mm)^2 + x3_mm (X / 10 mm)^3, likewise Y."""
 
     typical_mm: float = 0.1
 
@@ -37,17 +37,17 @@ class BentRails(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take an error of a two-hundredth of the longest scan at its end as typical."""
+        """Set the typical quadratic error to 0.5 % of the longest scan at half its length."""
         return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
 
     @cached_property
     def prior(self) -> Product:
-        """Error at 10 mm from the origin of the lab frame."""
+        """Each term's error at 10 mm from the origin of the lab frame."""
         error = HeavyTailed(self.typical_mm)
         return Product({"x2_mm": error, "x3_mm": error, "y2_mm": error, "y3_mm": error})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Bend both axes."""
+        """Add the position errors to both axes."""
         x, y = plan.x_mm / _UNIT_MM, plan.y_mm / _UNIT_MM
         return replace(
             value,
@@ -56,20 +56,21 @@ class BentRails(NamedEffect[Poses]):
         )
 
     def bank(self) -> FloatArray:
-        """One setting of four columns: linear in all."""
+        """One entry of four columns: linear in all."""
         return self.typical_mm * np.eye(4)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far off the places are at 10 mm."""
+        """Say how large the position errors are at 10 mm."""
         of_x, of_y = (give_or_take(mean[k] + mean[k + 1], float(np.hypot(sd[k], sd[k + 1]))) for k in (0, 2))
         return f"the rails are bent: 10 mm from the origin the arm is off by {of_x} mm along X and {of_y} mm along Y"
 
 
 @dataclass(frozen=True)
 class MissingTooth(NamedEffect[Poses]):
-    """Beyond a place of one axis all places are amp_mm off: X + amp_mm 1(X > at_mm), or along Y.
+    """A jump at one place of an axis: beyond it all positions are off, X + amp_mm 1(X > at_mm), or along Y.
 
-    `places_mm` are the places, by axis, between which a jump is told from the next one; `along` is 0 for X.
+    `places_mm` are the recorded positions of each axis: between which two the jump lies (`between_mm`) is a discrete
+    choice. `along` is 0 for X, 1 for Y.
     """
 
     typical_mm: float = 0.3
@@ -85,31 +86,31 @@ class MissingTooth(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take half a percent of the longest scan as typical; look between the places of the recording."""
+        """Set the typical jump to 0.5 % of the longest scan; None where no axis takes more than two positions."""
         places = tuple(_some(axis) for axis in (extent.plan.x_mm, extent.plan.y_mm))
         return cls(0.005 * extent.length_mm, (places[0], places[1])) if any(len(own) > 2 for own in places) else None
 
     @cached_property
     def prior(self) -> Product:
-        """Jump of either sign, its place, and its axis: 0 along X, 1 along Y."""
+        """Jump, of either sign, its place, and its axis: 0 for X, 1 for Y."""
         axis = Uniform(self.along - 0.5, self.along + 0.5)
         return Product({"amp_mm": HeavyTailed(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift what lies beyond the place."""
+        """Shift the positions beyond the jump."""
         along_y = theta[:, 2:3] > 0.5
         beyond = np.where(along_y, plan.y_mm, plan.x_mm) > theta[:, 1:2]
         jump = theta[:, :1] * beyond
         return replace(value, x_mm=value.x_mm + jump * ~along_y, y_mm=value.y_mm + jump * along_y)
 
     def variants(self) -> tuple[Self, ...]:
-        """Choose the axis and the two places between which it is."""
+        """One variant for each axis and pair of neighbouring positions."""
         return tuple(
             replace(self, along=axis, between_mm=pair) for axis in (0, 1) for pair in pairwise(self.places_mm[axis])
         )
 
     def bank(self) -> FloatArray:
-        """One setting, half way between the two places."""
+        """One entry, half way between the two positions."""
         return np.array([[[self.typical_mm, sum(self.between_mm) / 2, float(self.along)]]])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -122,7 +123,7 @@ class MissingTooth(NamedEffect[Poses]):
 
 
 def _some(axis_mm: FloatArray) -> tuple[float, ...]:
-    """List distinct places of one axis, at most about 48."""
+    """List distinct positions of one axis, thinned to at most 160."""
     places = np.unique(np.round(axis_mm, 6))
     stride = -(-len(places) // _MOST_PLACES)
     return tuple(places[::stride].tolist())

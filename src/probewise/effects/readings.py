@@ -1,4 +1,4 @@
-"""What the readings themselves remember: effects of the way and the time between one and the next."""
+"""Memory in the readings: hysteresis in the direction of motion, and a time lag."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.moves import moves_in_more_than_one_way, sign_of_move
+from probewise.effects.motion import direction_varies, sign_of_motion
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -23,7 +23,7 @@ __all__ = ["Hysteresis", "Lag"]
 
 @dataclass(frozen=True)
 class Hysteresis(NamedEffect[FloatArray]):
-    """A reading that depends on the way: reading + amp d, d the sign of the move along X, or along Y."""
+    """A reading that depends on the direction of motion: reading + amp d, d the sign of motion along X, or along Y."""
 
     typical: float = 0.5
 
@@ -35,24 +35,24 @@ class Hysteresis(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the readings' range as typical, where moves differ, be it some from none."""
-        return cls(typical=0.01 * extent.span) if moves_in_more_than_one_way(extent.plan) else None
+        """Set the typical amplitude to 1 % of the readings' range; None where the direction never changes."""
+        return cls(typical=0.01 * extent.span) if direction_varies(extent.plan) else None
 
     @cached_property
     def prior(self) -> Product:
-        """Half the difference between the ways, of either sign."""
+        """Half the difference between the two directions, of either sign."""
         return Product({"amp": HeavyTailed(self.typical)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add it to the readings, (n_samples, n_points)."""
-        return np.asarray(value + theta[:, :1] * sign_of_move(plan))
+        """Add the hysteresis to the readings, (n_samples, n_points)."""
+        return np.asarray(value + theta[:, :1] * sign_of_motion(plan))
 
     def bank(self) -> FloatArray:
-        """One setting: linear in the amplitude."""
+        """One entry: linear in the amplitude."""
         return np.full((1, 1, 1), self.typical)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how much the two ways differ."""
+        """Say by how much the two directions differ."""
         way = "higher" if mean[0] > 0 else "lower"
         return (
             f"readings on the way forth are {give_or_take(abs(mean[0]), sd[0], factor=2)} {way} than on the way back, "
@@ -62,9 +62,9 @@ class Hysteresis(NamedEffect[FloatArray]):
 
 @dataclass(frozen=True)
 class Lag(NamedEffect[FloatArray]):
-    """Electronics that follow slowly: v_k = a v_(k-1) + (1 - a) y_k with a = exp(-(t_k - t_(k-1)) / tau_s).
+    """First-order lag of the electronics: v_k = a v_(k-1) + (1 - a) y_k with a = exp(-(t_k - t_(k-1)) / tau_s).
 
-    The first reading of a scan is not held back.
+    The first reading of a scan has no lag.
     """
 
     shortest_s: float = 0.2
@@ -78,24 +78,24 @@ class Lag(NamedEffect[FloatArray]):
 
     @property
     def nothing(self) -> Mapping[int, float]:
-        """No time at all."""
+        """A time constant of 0."""
         return {0: 0.0}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look from a sixth of the time between readings, which keeps a four-hundredth, to thirty times it."""
+        """Search time constants from a sixth of the time between readings (a = 1/400) to thirty times it."""
         return cls(shortest_s=extent.gap_s / 6, longest_s=30 * extent.gap_s)
 
     @cached_property
     def prior(self) -> Product:
-        """The time constant, over its orders of magnitude."""
+        """The time constant, log-uniform."""
         return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Hold the readings back, (n_samples, n_points).
+        """Filter the readings, (n_samples, n_points).
 
-        Each reading maps the one before affinely; maps are joined in pairs, then pairs of pairs, until
-        each holds its whole scan up to there.
+        Each lagged reading is an affine map of the one before. A parallel prefix scan composes the maps in pairs, then
+        pairs of pairs, until each reading's map starts at the beginning of its scan.
         """
         same = np.diff(plan.scan, prepend=-1) == 0
         waited = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
@@ -110,11 +110,11 @@ class Lag(NamedEffect[FloatArray]):
         return held
 
     def bank(self) -> FloatArray:
-        """One column each for seven time constants."""
+        """Seven entries of one column, one for each time constant."""
         return np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7)[:, None, None]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how long the sensor takes to follow."""
+        """Say how slow the sensor is."""
         return (
             f"each reading still holds some of the one before, with a time constant of {give_or_take(mean[0], sd[0])} "
             "s: the electronics lag behind"

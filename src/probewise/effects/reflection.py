@@ -1,4 +1,4 @@
-"""A second image beside the first: light that comes back from a plate or a lens."""
+"""A ghost image: light reflected by a plate or a lens."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ANGLES = 8
 
 @dataclass(frozen=True)
 class Reflection(NamedEffect[Footprint]):
-    """A share of the footprint looks (dx_mm, dy_mm) beside it, in the lab frame."""
+    """A share of the light comes from a copy of the footprint displaced by (dx_mm, dy_mm) in the lab frame."""
 
     typical: float = 0.02
     farthest_mm: float = 20.0
@@ -37,7 +37,7 @@ class Reflection(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look as far as half the longest scan."""
+        """Search displacements up to half the longest scan."""
         return cls(farthest_mm=0.5 * extent.length_mm)
 
     @cached_property
@@ -47,7 +47,7 @@ class Reflection(NamedEffect[Footprint]):
         return Product({"share": HeavyTailed(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Set a fainter copy of each Gaussian beside it."""
+        """Add a fainter, displaced copy of each Gaussian."""
         share = np.clip(theta[:, :1, None], 0.0, 1.0)
         turn = plan.orientation_rad[None, :, None]
         dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
@@ -64,7 +64,7 @@ class Reflection(NamedEffect[Footprint]):
         )
 
     def bank(self) -> FloatArray:
-        """Three distances in eight directions."""
+        """Entries of one column: three distances in eight directions."""
         angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
         far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
         dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()

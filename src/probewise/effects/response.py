@@ -1,4 +1,4 @@
-"""How the seen white fraction becomes a signal: effects on the response curve."""
+"""Effects on the response curve, which turns the seen white fraction into a signal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Nonlinearity"]
 
 @dataclass(frozen=True)
 class Nonlinearity(NamedEffect[FloatArray]):
-    """A bent response curve: u -> u^gamma, u the seen white fraction held within 0 and 1."""
+    """A bent response curve: u -> u^gamma, u the seen white fraction clipped to 0..1."""
 
     typical_log: float = 0.1
 
@@ -39,7 +39,7 @@ class Nonlinearity(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Need no scale: the exponent is a pure number."""
+        """Keep the default scale: the exponent is a pure number."""
         return cls()
 
     @cached_property
@@ -48,11 +48,11 @@ class Nonlinearity(NamedEffect[FloatArray]):
         return Product({"gamma": LogHeavyTailed(self.typical_log)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Bend the seen fraction, (n_samples, n_points)."""
+        """Raise the seen fraction to the power gamma, (n_samples, n_points)."""
         return np.asarray(np.clip(value, 0.0, 1.0) ** theta[:, :1])
 
     def bank(self) -> FloatArray:
-        """One setting on each side of the straight line."""
+        """Two entries, one on each side of the straight line."""
         return np.exp(self.typical_log * np.array([-1.0, 1.0]))[:, None, None]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""Where the electronics run out of range: effects on the finished reading."""
+"""Saturation of the electronics: an effect on the finished reading."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Saturation"]
 
 @dataclass(frozen=True)
 class Saturation(NamedEffect[FloatArray]):
-    """Run out of range: reading = level - softness log(1 + exp((level - reading) / softness)).
+    """A soft upper limit: reading -> level - softness log(1 + exp((level - reading) / softness)).
 
     As the softness goes to zero this is min(reading, level).
     """
@@ -39,12 +39,12 @@ class Saturation(NamedEffect[FloatArray]):
 
     @property
     def nothing(self) -> Mapping[int, float]:
-        """A level out of reach, of whatever softness."""
+        """A level out of reach, at any softness."""
         return {0: self.highest + 100 * self.softest}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look among the levels that were reached; a soft limit may lie some way above them."""
+        """Search limits from 20 % of the readings' range to 30 % above it: a soft limit acts below its level."""
         return cls(
             lowest=extent.low + 0.2 * extent.span,
             highest=extent.high + 0.3 * extent.span,
@@ -54,7 +54,7 @@ class Saturation(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        """Level, even over the range where it would bite, and softness over its orders of magnitude."""
+        """Level, uniform over the range where it would act, and softness, log-uniform."""
         return Product(
             {"level": Uniform(self.lowest, self.highest), "softness": LogUniform(self.sharpest, self.softest)}
         )
@@ -65,7 +65,7 @@ class Saturation(NamedEffect[FloatArray]):
         return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
     def bank(self) -> FloatArray:
-        """One column each for sharp limits, closer together near the top, and for soft ones."""
+        """Entries of one column: sharp limits, denser near the top, and soft limits."""
         span = (self.highest - self.lowest) / 1.1
         top = self.highest - 0.3 * span
         sharp = [(top - share * 0.8 * span, self.sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]

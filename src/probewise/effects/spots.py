@@ -1,8 +1,8 @@
-"""What sits at one place: a bell-shaped spot beside a line that was scanned, and how large it may be.
+"""Local effects: a bell-shaped spot on or beside a scanned line, and its prior.
 
-From one line nobody can tell a bright spot beside it from a faint one on it. So the prior is laid out
-by what the line shows: the spot's height where the line passes it, its place along the line, how many
-radii it lies beside the line, and its radius; the first and the last two make the spot's own height.
+One scan cannot distinguish a bright spot beside its line from a faint one on it. So the prior is over what
+the scan shows: the height on the line, the place along it, the distance from it in radii, and the radius.
+The spot's own height follows from the height on the line and the distance in radii.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["ALONG_X", "Line", "SpotPrior", "bell", "scanned_lines", "spot_bank"]
+__all__ = ["ALONG_X", "ScanLine", "SpotPrior", "bell", "scanned_lines", "spot_bank"]
 
-_RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; their prior reaches twice as far
+_RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; the prior reaches twice as far either way
 _MARGIN = 0.1  # of the line's length: a spot may lie beyond its ends
-_STRAIGHT = 0.02  # of a scan's length: how far it may stray from its line
+_STRAIGHT = 0.02  # of a scan's length: the largest deviation from a straight line
 _LEAST_PLACES = 8
 
 
 def bell(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
-    """exp(-d^2 / 2 r^2); both broadcast."""
+    """exp(-d^2 / 2 r^2); the arrays broadcast."""
     return np.exp(-0.5 * squared_distance / radius**2)
 
 
 @dataclass(frozen=True)
-class Line:
-    """Places s t + offset_mm n for s from low_mm to high_mm, with t at `angle_rad` to X and n a quarter turn on."""
+class ScanLine:
+    """Places s t + offset_mm n, s from low_mm to high_mm; t at `angle_rad` to X, n a quarter turn further."""
 
     angle_rad: float
     offset_mm: float
@@ -42,11 +42,11 @@ class Line:
 
     @property
     def length_mm(self) -> float:
-        """From end to end."""
+        """Length of the line."""
         return self.high_mm - self.low_mm
 
     def place(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """X and Y of places so far along the line and beside it."""
+        """X and Y of places given by their position along the line and distance from it."""
         c, s, n = np.cos(self.angle_rad), np.sin(self.angle_rad), self.offset_mm + beside_mm
         return c * along_mm - s * n, s * along_mm + c * n
 
@@ -56,26 +56,26 @@ class Line:
         return c * x_mm + s * y_mm, c * y_mm - s * x_mm - self.offset_mm
 
 
-ALONG_X = Line(0.0, 0.0, -50.0, 50.0)
+ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
 """The X axis, 50 mm to either side."""
 
 
-def scanned_lines(plan: Plan) -> tuple[Line, ...]:
-    """List the lines along which straight scans went, each once."""
-    found: dict[tuple[float, float], Line] = {}
+def scanned_lines(plan: Plan) -> tuple[ScanLine, ...]:
+    """List the distinct lines of the straight scans."""
+    found: dict[tuple[float, float], ScanLine] = {}
     for rows in plan.rows_by_scan():
         places = np.unique(np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1), axis=0)
         if len(places) < _LEAST_PLACES:
             continue
         t = places[-1] - places[0]  # sorted by X, then Y: never against X
         angle = float(np.arctan2(t[1], t[0]))
-        along, across = Line(angle, 0.0, 0.0, 1.0).coordinates(*places.T)
+        along, across = ScanLine(angle, 0.0, 0.0, 1.0).coordinates(*places.T)
         if np.ptp(across) > _STRAIGHT * np.ptp(along):
             continue
-        line = Line(angle, float(across.mean()), float(along.min()), float(along.max()))
+        line = ScanLine(angle, float(across.mean()), float(along.min()), float(along.max()))
         key = (round(angle, 3), round(line.offset_mm / (_STRAIGHT * line.length_mm)))
         other = found.get(key, line)
-        found[key] = Line(
+        found[key] = ScanLine(
             other.angle_rad, other.offset_mm, min(line.low_mm, other.low_mm), max(line.high_mm, other.high_mm)
         )
     return tuple(found.values())
@@ -83,13 +83,13 @@ def scanned_lines(plan: Plan) -> tuple[Line, ...]:
 
 @dataclass(frozen=True)
 class SpotPrior:
-    """Believe in a spot of either sign on or beside a line; parameters: its height (named `size`), x, y, r."""
+    """Prior of a spot of either sign on or beside a line; parameters: its height (named `size`), x, y, r."""
 
     size: str
     typical: float
-    line: Line
+    line: ScanLine
 
-    BESIDE: ClassVar[Normal] = Normal(0.0, 0.7)  # radii beside the line
+    BESIDE: ClassVar[Normal] = Normal(0.0, 0.7)  # distance from the line in radii
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,7 +98,7 @@ class SpotPrior:
 
     @cached_property
     def _by_line(self) -> Product:
-        """What the line shows: height on it, place along it, radii beside it, radius."""
+        """Prior over what the scan shows: height on the line, place along it, distance in radii, radius."""
         line, length = self.line, self.line.length_mm
         return Product(
             {
@@ -110,7 +110,7 @@ class SpotPrior:
         )
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map coordinates to height, x, y, r, (n_samples, 4) both ways."""
+        """Map unit-cube coordinates to height, x, y, r; both (n_samples, 4)."""
         on_line, along, beside, r = self._by_line.from_unit_cube(u).T
         x, y = self.line.place(along, beside * r)
         return np.stack([on_line * np.exp(0.5 * beside**2), x, y, r], axis=-1)
@@ -132,8 +132,8 @@ class SpotPrior:
         return np.stack([height * np.exp(-0.5 * beside**2), along, beside, r], axis=-1)
 
 
-def spot_bank(typical: float, line: Line) -> FloatArray:
-    """Spots of three radii, a radius apart, on the line: (n_bank, 1, 4)."""
+def spot_bank(typical: float, line: ScanLine) -> FloatArray:
+    """List spots on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
     spots = []
     for share in _RADII:
         r = share * line.length_mm

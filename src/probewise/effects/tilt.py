@@ -1,4 +1,4 @@
-"""A sensor that does not look straight down: an effect on the place it looks at."""
+"""A sensor that does not look straight down: an effect on the pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["SensorTilt"]
 
 @dataclass(frozen=True)
 class SensorTilt(NamedEffect[Poses]):
-    """A tilt fixed in the lab: the footprint shifts by (dx_mm, dy_mm) = h tan(tilt), however the sensor is turned."""
+    """A tilt fixed in the lab frame: the footprint shifts by (dx_mm, dy_mm) = h tan(tilt) at any orientation."""
 
     typical_mm: float = 0.3
 
@@ -33,7 +33,7 @@ class SensorTilt(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take three thousandths of the longest scan as typical."""
+        """Set the typical shift to 0.3 % of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
     @cached_property
@@ -43,15 +43,15 @@ class SensorTilt(NamedEffect[Poses]):
         return Product({"dx_mm": shift, "dy_mm": shift})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the place that is looked at."""
+        """Shift every pose."""
         return replace(value, x_mm=value.x_mm + theta[:, :1], y_mm=value.y_mm + theta[:, 1:2])
 
     def bank(self) -> FloatArray:
-        """One setting of two columns: linear in both shifts."""
+        """One entry of two columns: linear in both shifts."""
         return self.typical_mm * np.eye(2)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far beside itself the sensor looks."""
+        """Say how far the sensor looks from where it should."""
         return (
             f"the sensor looks {give_or_take(mean[0], sd[0])} mm along X and {give_or_take(mean[1], sd[1])} mm along Y "
             "beside where it should, however it is turned: it hangs at a tilt"

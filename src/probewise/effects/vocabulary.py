@@ -1,4 +1,4 @@
-"""What every named effect offers besides its function."""
+"""The protocol of a named effect: what the diagnosis needs besides its formula."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_law import NoiseRows
+from probewise.effects.noise_distribution import NoiseRows
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseLevel
 
@@ -21,10 +21,10 @@ V = TypeVar("V")
 
 @dataclass(frozen=True, eq=False)
 class Gates:
-    """Where variants act that differ in nothing else, one bank entry each.
+    """Masks of variants that differ only in the readings they act on: one prediction serves all of them.
 
-    `always` are the columns of an entry that acts on all readings, (n_columns, n_params); `opened`
-    (n_variants, n_points) are the readings that each variant acts on.
+    `always` is a bank entry that acts on all readings, (n_columns, n_params); `opened`
+    (n_variants, n_points) marks the readings that each variant acts on.
     """
 
     always: FloatArray
@@ -32,7 +32,7 @@ class Gates:
 
 
 class NamedEffect(Effect[V], Protocol[V]):
-    """An effect of the vocabulary: what the diagnosis needs to look for it and to speak of it.
+    """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict.
 
     A new effect is one class of this kind and one line in `VOCABULARY`.
     """
@@ -44,96 +44,96 @@ class NamedEffect(Effect[V], Protocol[V]):
 
     @property
     def covariates(self) -> tuple[str, ...]:
-        """Covariates in which its residual shows."""
+        """Covariates against which its residuals show a trend."""
         ...
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Columns of a plan that it reads beside place, time and scan; by default none."""
+        """Columns of a plan that it reads besides place, time and scan; by default none."""
         return ()
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """Which parameters are amplitudes: the readings change in proportion to first order, 0 means absent."""
+        """Indices of the amplitudes: the readings change in proportion to first order, and 0 means no effect."""
         ...
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
-        """Values of parameters, by number, at which it does nothing; None where no setting says that.
+        """Values of parameters, by index, at which it has no effect; None where there are none.
 
-        By default all amplitudes 0.
+        By default all amplitudes are 0.
         """
         return dict.fromkeys(self.amplitudes, 0.0) or None
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Build it with a prior fit for a recording of this extent; None where it could not show there.
+        """Build the effect with a prior at the recording's scales; None where the recording cannot show it.
 
-        An effect of the battery needs the battery's voltage, one of the direction a scan that turns back.
+        An effect of the battery needs its voltage, one of the direction of motion needs a scan that turns back.
         """
         ...
 
     def is_of_the_ssf(self, plan: Plan) -> bool:
-        """Tell whether an SSF of which nothing is known takes it up whole, by this plan: then it is no effect.
+        """Whether a free SSF absorbs the effect completely under this plan, so that it cannot be identified.
 
-        By default it does not.
+        By default False.
         """
         return False
 
     def bank(self) -> FloatArray:
-        """Lay out settings to look for it with, shape (n_bank, n_columns, n_params).
+        """Return the template bank, parameter vectors of shape (n_bank, n_columns, n_params).
 
-        Each entry spans, by its columns, the readings' change to first order; entries differ in
-        what is not linear. Effects on the noise: equally weighted nodes of the prior.
+        The columns of an entry span the change of the readings to first order; entries differ in
+        the nonlinear parameters. Effects on the noise: equally weighted nodes of the prior.
         """
         ...
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say in plain words what it does, with its numbers, each of shape (n_params,)."""
+        """Describe the effect in plain words; posterior mean and sd of the parameters, (n_params,) each."""
         ...
 
     @property
     def n_peaks(self) -> int:
-        """Number of settings apart from each other, all in the prior, that do the same; a fit finds one of them."""
+        """Number of equivalent posterior modes within the prior; a fit finds one of them."""
         return 1
 
     @property
     def scans(self) -> tuple[str, ...]:
-        """Names of the scans that it is bound to; () where it acts in all."""
+        """Names of the scans it is restricted to; () for all."""
         return ()
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """Names of the patterns that it is bound to; () where it acts on all."""
+        """Names of the patterns it is restricted to; () for all."""
         return ()
 
     def variants(self) -> tuple[Self, ...]:
-        """List the discrete choices that it leaves open, all as probable: itself with each of them made.
+        """List the effect with each of its discrete choices made, all equally probable a priori.
 
-        Which scan, which mounting, between which two readings: what no fit finds by small steps.
-        Variants differ in their `scans` or `patterns`, or in their priors alone.
+        A choice is a scan, a mounting or an interval between readings, which no gradient-based fit can find.
+        Variants differ in their `scans` or `patterns`, or only in their priors.
         """
         return (self,)
 
     def gates(self, plan: Plan) -> Gates | None:
-        """Where its variants differ only in the readings that they act on: one prediction does for all of them."""
+        """Return masks where the variants differ only in the readings they act on; None otherwise."""
         return None
 
     def coarse(self) -> Self:
-        """Leave fewer choices open, enough to see whether the effect is there at all; by default all of them."""
+        """Return the effect with fewer variants, enough to detect it; by default with all of them."""
         return self
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Spread samples of one variant's parameters, (n_samples, n_params), over all variants by their weight.
+        """Redraw the parameter that names the variant from all variants by weight, theta (n_samples, n_params).
 
-        As they are, unless a parameter says which variant it is.
+        By default theta is returned as it is.
         """
         return theta
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Turn an entry of the bank (n_columns, n_params) and its columns' fitted amounts into a setting (n_params,).
+        """Turn a bank entry (n_columns, n_params) and its columns' fitted amounts into a starting point (n_params,).
 
-        Amplitudes scale with the amounts; what is no amplitude (a level, an exponent) stays as in the bank.
+        Amplitudes scale with the amounts; other parameters (a level, an exponent) keep the entry's values.
         """
         setting = entry[0].copy()
         for k in self.amplitudes:
@@ -142,36 +142,36 @@ class NamedEffect(Effect[V], Protocol[V]):
 
 
 class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
-    """An effect on the noise: nothing of it is seen in the mean of the readings."""
+    """An effect on the noise: the mean of the readings does not change."""
 
     n_nodes: ClassVar[int] = 10
-    """Nodes of its prior, for an effect of one parameter."""
+    """Number of nodes of its prior, for an effect of one parameter."""
 
     def bank(self) -> FloatArray:
-        """Lay out equally weighted nodes of the prior of its one parameter, (n_nodes, 1, 1)."""
+        """Return equally weighted nodes of the prior of its one parameter, (n_nodes, 1, 1)."""
         return self.prior.from_unit_cube((np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes)[:, None, :]
 
     def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Lay out equally weighted nodes of the prior about a fit, (n_nodes, n_params); none where it cannot be.
+        """Return equally weighted nodes of the prior given a fit, (n_nodes, n_params); none where the fit excludes it.
 
         `residuals` (n_points,) are in units of the noise sd.
         """
         return self.bank()[:, 0, :]
 
     def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
-        """Lay out nodes about a fit with the log of the prior that each stands for, (n_nodes, n_params), (n_nodes,)."""
+        """Return nodes given a fit and the log of each one's prior weight, (n_nodes, n_params) and (n_nodes,)."""
         nodes = self.nodes(residuals, rows)
         return nodes, np.full(len(nodes), -np.log(max(len(nodes), 1)))
 
     def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
-        """Draw parameters about nodes drawn, (n_samples, n_params) both; None where nodes lie as close as need be."""
+        """Draw parameters about sampled nodes, both (n_samples, n_params); None where the nodes are dense enough."""
         return None
 
 
 def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:
-    """Write mean ± sd with as many digits as the sd deserves."""
+    """Write mean ± sd, rounded to two significant digits of the sd."""
     mean, sd = factor * mean, factor * sd
     if not (np.isfinite(sd) and sd > 0):
         return f"{mean:.4g}"
     digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))
-    return f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # what rounds to zero has no sign
+    return f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # "z": no minus sign on a rounded zero

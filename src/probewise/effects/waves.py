@@ -1,4 +1,4 @@
-"""What comes back again and again: sine waves in time and in place, and a slide that sticks."""
+"""Periodic effects: flicker in time, periodic position error, and stick-slip."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from probewise.sensor.stages import Poses, Stage
 
 __all__ = ["Flicker", "PeriodicPositionError", "StickSlip"]
 
-# Two turns: whatever the phase, one of its names lies far from both ends.
+# Two full turns: every phase has an equivalent far from both ends.
 _PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 _MOST_FREQUENCIES = 1024
-_ORDERS = np.arange(1, 7)  # of a sawtooth's waves; the slip takes a sixth of the period
-_SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # of each, damped lest the sum overshoot
+_ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of the period
+_SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
 
 
 @dataclass(frozen=True)
 class Flicker(NamedEffect[FloatArray]):
     """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase).
 
-    The mains as the sampling shows them, or a slow lamp: any frequency up to half the rate of readings.
+    The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
     """
 
     typical: float = 0.5
@@ -45,7 +45,7 @@ class Flicker(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look from 0.01 Hz to half the median rate, twice for each frequency that the duration tells apart."""
+        """Search from 0.01 Hz to half the median rate, with two frequencies per resolution width 1 / duration."""
         highest = 0.5 / extent.gap_s
         if highest <= cls.lowest_hz:
             return None
@@ -64,12 +64,12 @@ class Flicker(NamedEffect[FloatArray]):
         return np.asarray(value + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
-        """Sine and cosine at each frequency."""
+        """Entries of two columns: sine and cosine at each frequency."""
         frequencies = np.linspace(self.lowest_hz, self.highest_hz, self.n_frequencies + 2)[1:-1]
         return _sine_and_cosine(self.typical, frequencies)
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Join the amounts of sine and cosine into amplitude and phase."""
+        """Convert the amounts of sine and cosine to amplitude and phase."""
         return _joined(entry, amounts)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -97,13 +97,13 @@ class PeriodicPositionError(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look from three steps of X to twice its range, where X moves."""
+        """Search periods from three steps of X to twice its range; None where X does not move."""
         shortest, reach = _steps_and_range(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 2 * reach) if reach > 0 else None
 
     @cached_property
     def prior(self) -> Product:
-        """Amplitude, period over its orders of magnitude, and phase."""
+        """Amplitude, period (log-uniform) and phase."""
         amp = HeavyTailed(self.typical_mm, positive=True)
         return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": _PHASE})
 
@@ -113,18 +113,18 @@ class PeriodicPositionError(NamedEffect[Poses]):
         return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
-        """Sine and cosine of periods, evenly spaced in waves over the range, then in their logarithm."""
+        """Sine and cosine of periods evenly spaced in wave number up to the range, then in log period beyond it."""
         n_even = self.n_periods - 8
         waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
         return _sine_and_cosine(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Join the amounts of sine and cosine into amplitude and phase."""
+        """Convert the amounts of sine and cosine to amplitude and phase."""
         return _joined(entry, amounts)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far the arm is off, and after which way it repeats."""
+        """Say how large the position error is, and its period."""
         return (
             f"the arm swings by {give_or_take(mean[0], sd[0])} mm about the place it was sent to, again every "
             f"{give_or_take(mean[1], sd[1])} mm of X: a gear or lead screw that is not round"
@@ -133,7 +133,7 @@ class PeriodicPositionError(NamedEffect[Poses]):
 
 @dataclass(frozen=True)
 class StickSlip(NamedEffect[Poses]):
-    """A slide that sticks and jumps: X + amp_mm saw(X / period_mm + phase), a sawtooth from 1 to -1."""
+    """Stick-slip of the slide: X + amp_mm saw(X / period_mm + phase), a sawtooth from 1 to -1."""
 
     typical_mm: float = 0.3
     shortest_mm: float = 3.0
@@ -149,13 +149,13 @@ class StickSlip(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Look from three steps of X to a quarter of its range, where X moves."""
+        """Search periods from three steps of X to a quarter of its range; None where that is empty."""
         shortest, reach = _steps_and_range(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 0.25 * reach) if 0.25 * reach > shortest else None
 
     @cached_property
     def prior(self) -> Product:
-        """How far it is off at most, of either sign, period over its orders of magnitude, and phase in turns."""
+        """Amplitude, of either sign, period (log-uniform), and phase in turns."""
         period = LogUniform(self.shortest_mm, self.longest_mm)
         return Product({"amp_mm": HeavyTailed(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
 
@@ -166,14 +166,14 @@ class StickSlip(NamedEffect[Poses]):
         return replace(value, x_mm=value.x_mm + theta[:, :1] * saw)
 
     def bank(self) -> FloatArray:
-        """Every phase at periods evenly spaced in waves over the range, (n_periods n_phases, 1, 3)."""
+        """Every phase at periods evenly spaced in wave number, (n_periods n_phases, 1, 3)."""
         waves = np.linspace(1.0 / self.longest_mm, 1.0 / self.shortest_mm, self.n_periods + 2)[1:-1]
         periods, phases = np.meshgrid(1 / waves, np.arange(self.n_phases) / self.n_phases - 0.5, indexing="ij")
         amounts = np.full(periods.size, self.typical_mm)
         return np.stack([amounts, periods.ravel(), phases.ravel()], axis=-1)[:, None, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far the slide is off, and after which way it jumps."""
+        """Say how far the slide jumps, and how often."""
         return (
             f"the slide sticks and jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, again every "
             f"{give_or_take(mean[1], sd[1])} mm of X: it runs dry"
@@ -181,13 +181,13 @@ class StickSlip(NamedEffect[Poses]):
 
 
 def _steps_and_range(plan: Plan) -> tuple[float, float]:
-    """Measure three steps of X and its range, mm; 0 and 0 where X takes fewer than eight places."""
+    """Return three times the median step of X and the range of X, mm; 0 and 0 for fewer than eight positions."""
     x_mm = np.unique(plan.x_mm)
     return (3 * float(np.median(np.diff(x_mm))), float(np.ptp(x_mm))) if len(x_mm) >= 8 else (0.0, 0.0)
 
 
 def _sine_and_cosine(amplitude: float, rates: FloatArray) -> FloatArray:
-    """Lay out both phases at each rate, (n_rates, 2, 3)."""
+    """Return entries with phases 0 and pi/2 at each frequency or period, (n_rates, 2, 3)."""
     bank = np.empty((len(rates), 2, 3))
     bank[..., 0], bank[..., 1], bank[..., 2] = amplitude, rates[:, None], (0.0, np.pi / 2)
     return bank

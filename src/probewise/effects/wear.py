@@ -1,4 +1,4 @@
-"""A sensor that does not stay as it was: it turns in its holder, or sinks."""
+"""Slow changes of the mounting: the sensor turns in its holder, or sinks."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class SlowTurn(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take two degrees over the recording as typical."""
+        """Set the typical rate to two degrees over the recording."""
         return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600))
 
     @cached_property
     def prior(self) -> Product:
-        """Degrees an hour, of either sign."""
+        """Degrees per hour, of either sign."""
         return Product({"deg_per_hour": HeavyTailed(self.typical_deg_per_hour)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -48,7 +48,7 @@ class SlowTurn(NamedEffect[Poses]):
         return replace(value, orientation_rad=value.orientation_rad + turn)
 
     def bank(self) -> FloatArray:
-        """One setting: linear while the turn is small."""
+        """One entry: linear while the turn is small."""
         return np.full((1, 1, 1), self.typical_deg_per_hour)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -70,12 +70,12 @@ class SlowSinking(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take a hundredth of the height over the recording as typical."""
+        """Set the typical rate to 1 % of the height over the recording."""
         return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
 
     @cached_property
     def prior(self) -> Product:
-        """Share of the height an hour, of either sign."""
+        """Relative change of height per hour, of either sign."""
         return Product({"per_hour": HeavyTailed(self.typical_per_hour)})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -83,7 +83,7 @@ class SlowSinking(NamedEffect[Footprint]):
         return raised(value, 1 + theta[:, :1] * (plan.time_s / 3600))
 
     def bank(self) -> FloatArray:
-        """One setting: linear while the change is small."""
+        """One entry: linear while the change is small."""
         return np.full((1, 1, 1), self.typical_per_hour)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.effects import NamedEffect, sign_of_move
+from probewise.effects import NamedEffect, sign_of_motion
 from probewise.recordings.plan import Plan
 from probewise.scene import edge_distance, region_of
 
@@ -44,7 +44,7 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
         Predicted reading and its slope along the move, both (n_usable,).
     """
     everything = np.arange(len(usable))
-    sign = sign_of_move(plan)[usable]
+    sign = sign_of_motion(plan)[usable]
     moving = np.flatnonzero(sign != 0)
     scan = plan.scan[usable]
     degrees = np.asarray(np.round(np.degrees(plan.orientation_rad[usable]), 6), dtype=np.float64)
@@ -102,7 +102,7 @@ def covariate_of(
         Covariates of the recording.
     """
     pooled = {c.name: c for c in known if c.scan is None}
-    sign = sign_of_move(plan)
+    sign = sign_of_motion(plan)
     if "direction" not in pooled and np.ptp(sign) > 0:  # to stand still is no direction, but tells what a move does
         pooled["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
     name = next((name for name in effect.covariates if name in pooled), None)

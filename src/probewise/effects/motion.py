@@ -1,4 +1,4 @@
-"""Which way each reading was approached, and in which scans: what several effects ask of a plan."""
+"""Direction of motion, scans and mountings of a plan, for the effects that depend on them."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 
-__all__ = ["in_scans", "mountings", "moves_in_more_than_one_way", "sign_of_move"]
+__all__ = ["direction_varies", "in_scans", "mountings", "sign_of_motion"]
 
 
-def sign_of_move(plan: Plan) -> FloatArray:
-    """Give the sign of the last move along X, or along Y where X stands still, 0 where nothing moved, (n_points,)."""
+def sign_of_motion(plan: Plan) -> FloatArray:
+    """Sign of the last motion along X, or along Y where X did not move; 0 without motion, (n_points,)."""
     along_x, along_y = np.sign(plan.direction).T
     return np.asarray(np.where(along_x != 0, along_x, along_y))
 
 
-def moves_in_more_than_one_way(plan: Plan) -> bool:
-    """Tell whether moves differ in their sign: forth and back, or forth and not at all."""
-    return bool(np.ptp(sign_of_move(plan)) > 0)
+def direction_varies(plan: Plan) -> bool:
+    """Whether the signs of motion differ: forward and back, or moving and at rest."""
+    return bool(np.ptp(sign_of_motion(plan)) > 0)
 
 
 def in_scans(plan: Plan, names: tuple[str, ...]) -> FloatArray:
-    """Give 1 for the readings of these scans, 0 for the others, (n_points,)."""
+    """Return 1 for the readings of these scans, 0 for the others, (n_points,)."""
     member = np.array([name in names for name in plan.scan_names], dtype=np.float64)
     return np.asarray(member[plan.scan])
 
 
 def mountings(plan: Plan) -> tuple[tuple[str, ...], ...]:
-    """Names of the scans of each mounting (those that share an orientation), and of each scan by itself.
+    """List candidate groups of scans: each mounting (the scans that share an orientation) and each single scan.
 
-    A mounting that holds all scans is none: nothing is left to compare it with. A scan in which the
+    A group of all scans is left out, since nothing remains to compare it with. A scan in which the
     sensor turns belongs to no mounting.
     """
     by_angle: dict[float, list[str]] = {}

@@ -1,4 +1,4 @@
-"""The law of one reading's noise: its density, and draws from it, with all that effects on the noise may do to it."""
+"""The noise distribution of a reading, with all effects on the noise: its density, its variance, draws from it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,12 @@ from probewise.sensor.stages import NoiseLevel
 
 __all__ = ["NoiseRows", "draw_readings", "log_density", "variance"]
 
-_NARROW = 1e-3  # of the noise sd: how exactly a lost reading holds its value where nothing is rounded
+_NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseRows:
-    """What the nodes of an effect on the noise ask of a fit, all (n_points,) but the noise `sd`.
-
-    `predicted` readings, and the `run` (number of the scan) of each.
-    """
+    """A fit as noise effects need it: `predicted` readings and their `run` (scan number), (n_points,); noise `sd`."""
 
     predicted: FloatArray
     sd: float
@@ -28,14 +25,14 @@ class NoiseRows:
 
 
 def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Log density of each reading by itself, (n_samples, n_points), per unit of the reading.
+    """Natural log of each reading's marginal density, (n_samples, n_points), per unit of the reading.
 
     Parameters
     ----------
     level
         The noise.
     readings
-        What was read, (n_points,).
+        Measured readings, (n_points,).
     predicted
         Noise-free readings, (n_samples, n_points).
     """
@@ -52,21 +49,21 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
 
 
 def variance(level: NoiseLevel) -> FloatArray:
-    """Compute the variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
+    """Variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
     level = _with_walk(level)
     wide = 1 + level.wide_share * (level.wide_times**2 - 1)
     return np.asarray(level.sd**2 * wide + level.step**2 / 12)
 
 
 def _with_walk(level: NoiseLevel) -> NoiseLevel:
-    """Take what a random walk may have gained by each row, seen by itself, into the sd."""
+    """Add the random walk's marginal variance at each row to the noise sd."""
     if not np.any(level.walk):
         return level
     return replace(level, sd=level.sd * np.sqrt(1 + level.walk**2 * level.walked), walk=np.zeros((1, 1)))
 
 
 def _log_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
-    """Give the normal log density; where there is a step, the log of its mean over the reading's cell."""
+    """Return the normal log density; where there is a rounding step, the log of its mean over the reading's cell."""
     if not np.any(step):
         return log_gaussian_density(readings, mean, sd)
     width = np.where(step > 0, step, 1.0)
@@ -75,7 +72,7 @@ def _log_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: F
 
 
 def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw readings, (n_samples, n_points): noise with its memory and its walk, wide ones, lost ones, then rounding.
+    """Draw readings, (n_samples, n_points): AR(1) noise, outliers, random walk, lost readings, then rounding.
 
     Parameters
     ----------
@@ -84,7 +81,7 @@ def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, r
     predicted
         Noise-free readings, (n_samples, n_points).
     scan
-        Scan of each reading, in order of taking, (n_points,).
+        Scan number of each reading, in the order they were taken, (n_points,).
     rng
         Source of randomness.
     """

@@ -1,0 +1,73 @@
+"""Effects with a change point in time; between which two readings it lies is a discrete choice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.effects.extent import Extent
+from probewise.effects.vocabulary import Gates, NamedEffect, V
+from probewise.recordings.plan import Plan
+
+__all__ = ["ChangePointEffect", "change_point_times"]
+
+_MOST_TIMES = 512
+_FEW = 48  # intervals, enough to detect that something changed in one of them
+
+
+@dataclass(frozen=True)
+class ChangePointEffect(NamedEffect[V]):
+    """Base of effects that act on the readings taken after `at_s`, the last parameter.
+
+    `times_s` are the times of the readings. Between which two of them the change point lies is a discrete choice
+    (`between_s`); its position within that interval does not affect any reading.
+    """
+
+    times_s: tuple[float, ...] = (0.0, 1e5)
+    between_s: tuple[float, float] | None = None
+
+    @property
+    def open_s(self) -> tuple[float, float]:
+        """The interval in which the change point may lie, s."""
+        return self.between_s or (self.times_s[0], self.times_s[-1])
+
+    @staticmethod
+    def since(theta: FloatArray, plan: Plan) -> BoolArray:
+        """Mark the readings taken after the change point, (n_samples, n_points)."""
+        return np.asarray(plan.time_s > theta[:, -1:])
+
+    def variants(self) -> tuple[Self, ...]:
+        """One variant for each pair of consecutive readings."""
+        return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
+
+    def coarse(self) -> Self:
+        """Keep at most about 48 intervals."""
+        stride = -(-(len(self.times_s) - 1) // _FEW)
+        return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
+
+    def gates(self, plan: Plan) -> Gates:
+        """Mask of each interval: the readings after its middle."""
+        always = self.bank()[0]
+        always[:, -1] = -np.inf
+        middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]
+        return Gates(always, np.array([plan.time_s > at for at in middles]))
+
+    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw the time of change from all intervals by their weight."""
+        times = np.array(self.times_s)
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        at_s = times[chosen] + np.diff(times)[chosen] * rng.random(len(theta))
+        return np.concatenate([theta[:, :-1], at_s[:, None]], axis=1)
+
+
+def change_point_times(extent: Extent) -> tuple[float, ...] | None:
+    """List the times of a recording's readings, thinned to about 512; None where there is only one."""
+    times = np.unique(extent.plan.time_s)
+    if len(times) < 2:
+        return None
+    stride = -(-(len(times) - 1) // _MOST_TIMES)
+    return tuple(np.append(times[:-1:stride], times[-1]).tolist())

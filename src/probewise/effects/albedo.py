@@ -23,7 +23,7 @@ from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 from probewise.scene.regions import edge_distance
-from probewise.sensor.gaussian import Spot, seen_by_one
+from probewise.sensor.gaussian import LabGaussian, seen_by_one
 from probewise.sensor.stages import SceneView, Stage
 
 __all__ = ["AlbedoGradient", "AlbedoPatch", "GradedRegion", "PatchedRegion"]
@@ -146,19 +146,19 @@ class GradedRegion:
 
 
 @seen_by_one.register
-def _(region: GradedRegion, spot: Spot, n_nodes: int) -> FloatArray:
+def _(region: GradedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """By Stein's lemma: the field at the footprint's centre times the response, plus a central difference of it."""
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
-    x, y = a * spot.var_x + b * spot.cov_xy, a * spot.cov_xy + b * spot.var_y  # C t
+    x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
     rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
     x, y = x / rise * _STEP, y / rise * _STEP
 
     def shifted(sign: float) -> FloatArray:
-        moved = replace(spot, dx_mm=spot.dx_mm + sign * x, dy_mm=spot.dy_mm + sign * y)
+        moved = replace(gaussian, dx_mm=gaussian.dx_mm + sign * x, dy_mm=gaussian.dy_mm + sign * y)
         return seen_by_one(region.region, moved, n_nodes)
 
     ahead, behind = shifted(1.0), shifted(-1.0)
-    field = 1 + a * (spot.x_mm + spot.dx_mm) + b * (spot.y_mm + spot.dy_mm)
+    field = 1 + a * (gaussian.x_mm + gaussian.dx_mm) + b * (gaussian.y_mm + gaussian.dy_mm)
     return np.asarray(field * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
 
 
@@ -188,15 +188,15 @@ class PatchedRegion:
 
 
 @seen_by_one.register
-def _(region: PatchedRegion, spot: Spot, n_nodes: int) -> FloatArray:
+def _(region: PatchedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """By the convolution of two Gaussians: the patch under N(m, C) is a bell of covariance C + r^2."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
-    from_x, from_y = spot.x_mm + spot.dx_mm - x, spot.y_mm + spot.dy_mm - y
-    var_x, var_y = spot.var_x + r**2, spot.var_y + r**2
-    det = var_x * var_y - spot.cov_xy**2
-    distance = (var_y * from_x**2 + var_x * from_y**2 - 2 * spot.cov_xy * from_x * from_y) / det
+    from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
+    var_x, var_y = gaussian.var_x + r**2, gaussian.var_y + r**2
+    det = var_x * var_y - gaussian.cov_xy**2
+    distance = (var_y * from_x**2 + var_x * from_y**2 - 2 * gaussian.cov_xy * from_x * from_y) / det
     added = albedo * r**2 / np.sqrt(det) * np.exp(-0.5 * distance)
-    return seen_by_one(region.region, spot, n_nodes) + added
+    return seen_by_one(region.region, gaussian, n_nodes) + added
 
 
 def _under(view: SceneView, plan: Plan) -> Mapping[str, Region]:

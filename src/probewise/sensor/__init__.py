@@ -1,4 +1,4 @@
-"""From scene to reading: the SSF, what it sees of a scene, and the chain of stages to a number.
+"""From scene to reading: the SSF, its response to a scene, and the chain of stages to a reading.
 
 Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_max - I_min) R,
 (RwithSSF) and (discreteR) for R, (Ssf) for the mixture of Gaussians, and the naive sensor.

@@ -1,4 +1,4 @@
-"""The normal cumulative distribution, fast enough to be called a billion times."""
+"""The normal cumulative distribution from a table, fast enough for a billion calls."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from probewise._arrays import FloatArray
 
 __all__ = ["CENTRE", "PER_SD", "normal_cdf", "replace_by_cumulative"]
 
-_LIMIT = 8.5  # beyond it the cumulative is 0 or 1 within 1e-17
+_LIMIT = 8.5  # standard deviations: beyond, the cumulative is 0 or 1 within 1e-17
 _CELLS = 2**13
 PER_SD = _CELLS / (2 * _LIMIT)  # cells of the table per standard deviation
-CENTRE = _CELLS / 2  # where z = 0 lies, in cells
-_BLOCK = 2**14  # elements that stay in the cache with the table
+CENTRE = _CELLS / 2  # position of z = 0, in cells
+_BLOCK = 2**14  # elements that fit the cache together with the table
 
 
 def _values_and_slopes() -> tuple[FloatArray, FloatArray]:
-    """Cumulative and its derivative, per cell, at whole numbers of cells; flat at either end."""
+    """Tabulate the cumulative and its derivative per cell; the slope is 0 at both ends."""
     z = (np.arange(_CELLS + 1) - CENTRE) / PER_SD
     value, slope = ndtr(z), np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * PER_SD)
     value[0], value[-1] = 0.0, 1.0
@@ -31,10 +31,10 @@ _VALUE, _SLOPE = _values_and_slopes()
 
 
 def replace_by_cumulative(cells: FloatArray) -> None:
-    """Replace z PER_SD + CENTRE by the cumulative of z, in place; a block of contiguous float64.
+    """Replace z PER_SD + CENTRE by the cumulative of z, in place; `cells` is contiguous float64.
 
-    For callers that form z by a product anyway and can fold the table's scale into it. From the nearest entry z0 the
-    step t is taken by value + slope t (1 - z0 t / 2).
+    For callers that compute z as a product and can fold the table's scale into it. About the nearest entry z0
+    the cumulative is the parabola value + slope t (1 - z0 t / 2), t the distance from it.
     """
     entry, near = np.empty(cells.shape, dtype=np.intp), np.empty(cells.shape)
     np.clip(cells, 0.0, _CELLS, out=cells)
@@ -53,10 +53,10 @@ def replace_by_cumulative(cells: FloatArray) -> None:
 
 
 def normal_cdf(z: FloatArray) -> FloatArray:
-    """Cumulative of the standard normal, any shape, within 1e-10.
+    """Cumulative distribution of the standard normal, any shape, within 1e-10.
 
-    By a parabola about each of the table's entries: the third-order term is at most 0.4 (h / 2)^3 / 6 =
-    7.5e-11. Large arrays are taken in blocks that fit the cache.
+    A parabola about each of the table's entries: the third-order term is at most 0.4 (h / 2)^3 / 6 =
+    7.5e-11. Large arrays are processed in blocks that fit the cache.
     """
     z = np.asarray(z, dtype=np.float64)
     if z.size < 1000:  # the calls cost more than the function

@@ -1,9 +1,9 @@
-"""An SSF of any form, written as a mixture: one Gaussian, and small narrower ones of either sign about it.
+"""A free-form SSF: one Gaussian, and nineteen narrower ones of either sign that change its form.
 
 A real SSF (a ring, a shadow across the spot, a long tail) is no mixture of a few Gaussians. Here one Gaussian sets
-place and size, and nineteen more, which lie in its own metric, bend its form: readings are linear in their shares.
-Shares are taken in those directions alone that leave the first two moments as they are, so that mean and covariance of
-the whole are those of the one Gaussian, and nothing is said twice.
+place and size; the others lie on rings about it, in units of its sds, and readings are linear in their shares of the
+mass. The shares are restricted to the directions that keep the first and second moments, so the whole has the mean and
+covariance of the one Gaussian and no parameter is redundant.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["N_BENDS", "N_FREE_FORM", "bends_of", "free_form", "is_free_form"]
 
 
 def _rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
-    """Lay out places (n, 2) and widths (n,): of each ring radius, number, width, and its turn in steps."""
+    """Return places (n, 2) and widths (n,); each ring is (radius, number, width, rotation in steps)."""
     places = [
         (radius * np.cos(turn), radius * np.sin(turn))
         for radius, n, _, first in rings
@@ -25,12 +25,12 @@ def _rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatAr
     return np.array(places), np.repeat([width for _, _, width, _ in rings], [n for _, n, _, _ in rings])
 
 
-# In sds of the one Gaussian: about as far apart as they are wide, out to where a long tail still shows.
+# In sds of the one Gaussian: spaced by about their widths, out to where a long tail still shows.
 _PLACES, _WIDTHS = _rings((0.0, 1, 0.45, 0.0), (0.8, 6, 0.5, 0.0), (1.6, 8, 0.6, 0.0), (2.7, 4, 0.9, 0.5))
 
 
 def _directions() -> FloatArray:
-    """Find the shares that change neither mean nor covariance, as orthonormal columns (n_probes, n)."""
+    """Find an orthonormal basis of the shares that change neither mean nor covariance, (n_rings, n_bends)."""
     x, y = _PLACES.T
     moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
     return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)
@@ -39,21 +39,21 @@ def _directions() -> FloatArray:
 _DIRECTIONS = _directions()
 
 N_BENDS: int = _DIRECTIONS.shape[1]
-"""Free amounts that bend the form."""
+"""Number of free-form coefficients (bends)."""
 
 N_FREE_FORM = 1 + len(_WIDTHS)
-"""Gaussians that a free form is written with, the one first."""
+"""Number of Gaussians of a free form, the one that sets place and size first."""
 
 
 def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
-    """Bend Gaussians; mean and covariance stay what they are.
+    """Change the form of Gaussians but not their mean and covariance.
 
     Parameters
     ----------
     one
-        The paper's a, u, v, A, B, C of the Gaussian, a that of the whole mass, (n_samples, 6).
+        The paper's a, u, v, A, B, C of the Gaussian, with a for the whole mass, (n_samples, 6).
     bends
-        How much, as shares of the mass in each direction, of either sign, (n_samples, N_BENDS).
+        Coefficients of the basis, shares of the mass of either sign, (n_samples, N_BENDS).
 
     Returns
     -------
@@ -62,7 +62,7 @@ def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
     shares = bends @ _DIRECTIONS.T
     a, u, v, aa, bb, cc = (one[:, k, None] for k in range(6))
     det = aa * bb - cc**2
-    sd_u, rest_v = np.sqrt(bb / (2 * det)), np.sqrt(0.5 / bb)  # the covariance's lower root, with the next line
+    sd_u, rest_v = np.sqrt(bb / (2 * det)), np.sqrt(0.5 / bb)  # with the next line: the Cholesky factor
     slope = -cc / bb
     blocks = np.empty((len(one), N_FREE_FORM, 6))
     blocks[:, 0] = one
@@ -76,14 +76,14 @@ def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
 
 
 def bends_of(theta: FloatArray) -> FloatArray:
-    """Give the bends back, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
+    """Invert `free_form`: coefficients of mixtures, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
     blocks = theta.reshape(len(theta), N_FREE_FORM, 6)
     mass = blocks[..., 0] / np.sqrt(blocks[..., 3] * blocks[..., 4] - blocks[..., 5] ** 2)
     return np.asarray(mass[:, 1:] / mass.sum(axis=1, keepdims=True) @ _DIRECTIONS)
 
 
 def is_free_form(theta: FloatArray) -> bool:
-    """Tell whether mixtures, (n_samples, 6 n), are free forms: by their number, and the widths of all but the first."""
+    """Whether mixtures, (n_samples, 6 n), are free forms, judged by the number and relative widths of the Gaussians."""
     if theta.shape[1] != 6 * N_FREE_FORM:
         return False
     blocks = theta.reshape(len(theta), N_FREE_FORM, 6)

@@ -18,7 +18,7 @@ from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
 from probewise.sensor.commanded import height_ratio, is_commanded, light_of, raised_as_commanded
 from probewise.sensor.discrete import seen_discrete
-from probewise.sensor.gaussian import ACCURATE_NODES, Spot, seen_by_one, turned
+from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, seen_by_one, turned
 from probewise.sensor.ssf import FieldSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
@@ -43,10 +43,10 @@ __all__ = [
     "response",
 ]
 
-_MANY = 8  # Gaussians, from which hypotheses that share their geometry are looked for
-_MOST_NUMBERS = 2_000_000  # held at once of footprints that differ from reading to reading
-_SAME = 1e-9  # mm and mm^2: closer than that, rounding alone tells Gaussians apart
-_FEW = 8  # hypotheses, of which all Gaussians are seen at once even where no geometry is shared
+_MANY = 8  # Gaussians, from which on it pays to look for hypotheses that share their geometry
+_MOST_NUMBERS = 2_000_000  # held in memory at once of footprints that differ between readings
+_SAME = 1e-9  # mm and mm^2: smaller differences are rounding
+_FEW = 8  # hypotheses: up to so many are computed together even where they share no geometry
 
 
 class Levels(Protocol):
@@ -58,7 +58,7 @@ class Levels(Protocol):
         ...
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """I_min and I_max, each broadcasting to (n_samples, n_points)."""
+        """Return I_min and I_max, each broadcasting to (n_samples, n_points)."""
         ...
 
 
@@ -72,7 +72,7 @@ class FreeLevels:
         return ("I_min", "I_max")
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Columns of theta, each (n_samples, 1)."""
+        """Return the two columns of theta, each (n_samples, 1)."""
         return theta[:, :1], theta[:, 1:2]
 
 
@@ -95,7 +95,7 @@ class FixedLevels:
         return ()
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Give the two numbers, each (1, 1)."""
+        """Return the two numbers, each (1, 1)."""
         return np.array([[self.i_min]]), np.array([[self.i_max]])
 
 
@@ -114,13 +114,13 @@ def require_scene(scene: object, order: str) -> None:
 class Chain:
     """A sensor model: pose, scene, footprint, seen fraction, response curve, gain, offset, lag, saturation.
 
-    M = I_min + (I_max - I_min) R (paper, eq. modelI), with R what the SSF sees of the scene and
-    any number of effects, each one function at one stage. Effects are held in the order of the
-    stages, those of one stage by name, whatever the order in which they are given. Columns
-    of theta: the SSF's, the levels', the scene's, then the effects' as "effect.parameter".
+    M = I_min + (I_max - I_min) R (paper, eq. modelI), with R the SSF's response to the scene and
+    any number of effects, each one function at one stage. Effects are sorted by stage and, within
+    a stage, by name, whatever the order in which they are given. Columns of theta: the SSF's,
+    the levels', the scene's, then the effects' as "effect.parameter".
 
-    `n_nodes` is the number of quadrature nodes over curved edges (the default holds 1e-8 of the
-    span, `FAST_NODES` 1e-4).
+    `n_nodes` is the number of quadrature nodes over curved edges (the default is accurate to 1e-8 of
+    I_max - I_min, `FAST_NODES` to 1e-4).
     """
 
     ssf: SSFModel
@@ -144,7 +144,7 @@ class Chain:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters, one a column of theta."""
+        """Names of the free parameters, one per column of theta."""
         own = (f"{effect.name}.{name}" for effect in self.effects for name in effect.prior.names)
         return (*self.ssf.names, *self.levels.names, *self.scene.names, *own)
 
@@ -153,14 +153,14 @@ class Chain:
         return replace(self, effects=(*self.effects, *effects))
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings.
+        """Predict noise-free readings.
 
         Parameters
         ----------
         theta
             Hypotheses, shape (n_samples, n_params), columns as `names`.
         plan
-            Where, when and over what, n_points rows.
+            Pose, time and pattern of every reading, n_points rows.
 
         Returns
         -------
@@ -169,9 +169,9 @@ class Chain:
         Raises
         ------
         ShapeError
-            If theta has other columns than `names`.
+            If the columns of theta do not match `names`.
         ParameterError
-            If the plan has a pattern that the scene lacks, or theta names no proper SSF.
+            If the plan has a pattern that the scene lacks, or theta holds no valid SSF.
         """
         at_once = self._at_once(theta, plan)
         if at_once < len(theta):
@@ -182,15 +182,15 @@ class Chain:
         return self._scaled(view.seen, theta) if plain else self.read(view, theta, plan)
 
     def _at_once(self, theta: FloatArray, plan: Plan) -> int:
-        """Count the hypotheses whose footprints may be held at once where they can differ from reading to reading."""
+        """Return the number of hypotheses per block, limited by memory where footprints can differ between readings."""
         if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             return len(theta)
         return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
 
     def read(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Turn what is seen into readings, (n_samples, n_points): the way from SEEN on, as `predict` goes it.
+        """Turn a view into readings, (n_samples, n_points): the stages of `predict` from SEEN on.
 
-        `view` may be of one hypothesis, where all those of theta look alike and differ in what follows.
+        `view` may hold one hypothesis where those of theta differ only in these stages.
         """
         apply = self._applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
@@ -206,7 +206,7 @@ class Chain:
         return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
 
     def _scaled(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
-        """Turn R into readings where no effect acts, in place: `seen` is this call's own."""
+        """Turn R into readings where no effect acts; overwrites `seen`."""
         i_min, i_max = self._levels(theta)
         reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)
         reading *= i_max - i_min
@@ -214,11 +214,11 @@ class Chain:
         return reading
 
     def seen(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Seen white fraction R before any effect on it, shape (n_samples or 1, n_points)."""
+        """Return the seen white fraction R before any effect on it, shape (n_samples or 1, n_points)."""
         return self.look(theta, plan).seen
 
     def look(self, theta: FloatArray, plan: Plan) -> View:
-        """Look at the scene: the way up to SEEN, as `predict` goes it."""
+        """Compute the view of the scene: the stages of `predict` before SEEN."""
         require_columns(theta, self.names)
         layout = self._layout_of(theta, plan)
         if isinstance(self.ssf, FieldSSF):
@@ -236,7 +236,7 @@ class Chain:
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
     def _geometries(self, theta: FloatArray, footprint: Footprint) -> _Geometries | None:
-        """Find hypotheses that differ in the amounts of many Gaussians alone; None where there is no gain in that."""
+        """Group hypotheses that differ only in the weights of many Gaussians; None where grouping saves nothing."""
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
         if few or footprint.weight.shape[1] > 1:
             return None
@@ -251,12 +251,12 @@ class Chain:
         if 2 * len(numbers) > len(theta) > _FEW:
             return None
         first = np.unique(which, return_index=True)[1]
-        # An effect may set Gaussians by the amounts of others, as a skirt about their common centre.
+        # An effect may place a Gaussian by the weights of others, as a halo about their common centre.
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
         return None if len(first) < len(theta) and any(moved) else _Geometries(first, which)
 
     def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
-        """Lay out the scene under the poses; where no hypothesis changes either, once for a plan."""
+        """Place the scene under the poses; cached for the last plan where no hypothesis changes either."""
         fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
         known = self._last_layout.get(plan) if fixed else None
         if known is not None:
@@ -275,11 +275,11 @@ class Chain:
 
     @cached_property
     def _last_layout(self) -> dict[Plan, Layout]:
-        """Layout by plan, of the last plan alone."""
+        """The cache: the layout of the last plan."""
         return {}
 
     def noise_level(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseLevel:
-        """Noise of each reading: `sd` broadcasting to (n_samples, n_points), then the effects on it."""
+        """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), and the effects on it."""
         require_columns(theta, self.names)
         start = NoiseLevel(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
@@ -289,7 +289,7 @@ class Chain:
         return level
 
     def _applier(self, theta: FloatArray, plan: Plan) -> Callable[[Stage, Any], Any]:
-        """Give a function that applies the effects of one stage to that stage's value."""
+        """Return a function that applies the effects of one stage to that stage's value."""
 
         def apply(stage: Stage, value: Any) -> Any:
             for effect, columns in self._columns:
@@ -312,14 +312,14 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which region lies under which reading: what the response needs that no footprint changes.
+    """Which region lies under which reading: the part of the response that does not depend on the footprint.
 
     Parameters
     ----------
     regions
         Region by pattern name.
     poses
-        Where the sensor stands above the patterns as described, arrays broadcasting to (n_samples, n_points).
+        Poses relative to the patterns' described places, arrays broadcasting to (n_samples, n_points).
     plan
         Which pattern lies under each reading.
 
@@ -335,18 +335,18 @@ class Layout:
 
     @cached_property
     def n_samples(self) -> int:
-        """Hypotheses that the poses and regions tell apart, or 1."""
+        """Number of hypotheses over which the poses or regions vary, or 1."""
         place = (self.poses.x_mm, self.poses.y_mm, self.poses.orientation_rad)
         return max([1, *(len(a) for a in place), *(region.n_regions for _, region in self.parts)])
 
     @cached_property
     def parts(self) -> list[tuple[IntArray, Region]]:
-        """Readings and the region under them."""
+        """Rows of the readings over each region, and the region."""
         return [(rows, region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
 
     @cached_property
     def straight(self) -> tuple[StraightEdges | StraightCorners, ...]:
-        """Known straight edges and corners of all patterns, taken together: calibration lives on them."""
+        """Known straight edges and corners of all patterns, batched: the common case of calibration."""
         if self.poses.orientation_rad.shape[0] > 1:
             return ()
         known = [(rows, region) for rows, region in self.parts if region.n_regions == 1]
@@ -359,7 +359,7 @@ class Layout:
 
     @cached_property
     def others(self) -> list[tuple[IntArray, Region]]:
-        """Readings over anything else, in groups that share an orientation."""
+        """Readings over all other regions, in groups that share an orientation."""
         taken = np.concatenate([part.rows for part in self.straight]) if self.straight else np.empty(0, dtype=np.int64)
         return [
             (group, region)
@@ -370,7 +370,7 @@ class Layout:
 
 
 def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
-    """Integrate the footprint over each reading's pattern (paper, eq. R), by the closed forms.
+    """Integrate the footprint over each reading's pattern (paper, eq. R), by closed forms.
 
     Parameters
     ----------
@@ -383,7 +383,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
 
     Returns
     -------
-    R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
+    R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
     """
     out = np.zeros(
         (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
@@ -402,37 +402,37 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
             turn = turn[:, :1]
         for g in range(footprint.weight.shape[2]):
             one = (columns_of(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
-            seen = seen_by_one(region, Spot(x, y, *turned(turn, *one)), n_nodes)
+            seen = seen_by_one(region, LabGaussian(x, y, *turned(turn, *one)), n_nodes)
             out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * seen
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class _Geometries:
-    """Hypotheses that differ in the amounts of their Gaussians alone: what is seen is linear in those.
+    """Groups of hypotheses that differ only in the weights of their Gaussians, in which the response is linear.
 
-    `first` hypothesis of each geometry, (n_geometries,), and `which` is each hypothesis', (n_samples,).
+    `first` is the first hypothesis of each group, (n_geometries,); `which` the group of each, (n_samples,).
     """
 
     first: IntArray
     which: IntArray
 
     def response(self, layout: Layout, footprint: Footprint, *, n_nodes: int) -> FloatArray:
-        """Integrate as `response` does, each Gaussian of each geometry once, as a hypothesis of its own.
+        """Integrate as `response` does, but each Gaussian of each geometry only once.
 
         Parameters
         ----------
         layout
-            What lies under each of these: that of each geometry in turn, as many times as there are Gaussians.
+            Layout of each geometry, repeated n_gaussians times.
         footprint
-            Of all hypotheses, its weights the same at every reading.
+            Footprints of all hypotheses, with weights that are the same at every reading.
         n_nodes
             Nodes of the quadrature over curved edges.
         """
         n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
 
         def each(array: FloatArray) -> FloatArray:
-            """One Gaussian a hypothesis: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
+            """Make each Gaussian a row: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
             own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[self.first]
             return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
 
@@ -454,7 +454,7 @@ def _discrete_response(layout: Layout, ssf: FieldSSF) -> FloatArray:
 
 
 def region_named(regions: Mapping[str, Region], name: str) -> Region:
-    """Find a pattern's region, or raise ParameterError with what to do about one that is not described."""
+    """Find a pattern's region; raise ParameterError with the remedy where it is not described."""
     try:
         return regions[name]
     except KeyError:
@@ -464,7 +464,7 @@ def region_named(regions: Mapping[str, Region], name: str) -> Region:
 def _by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:
     """Split rows into groups that share an orientation, where that does not depend on the sample.
 
-    Moments of the footprint in the lab frame are then formed once a group, not once a reading.
+    Moments of the footprint in the lab frame are then computed once per group instead of once per reading.
     """
     if orientation_rad.shape[0] > 1 or orientation_rad.shape[1] == 1:
         return [rows]

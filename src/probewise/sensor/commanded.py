@@ -1,8 +1,7 @@
-"""What a recording says was commanded beside the place: the sensor's height and its LED.
+"""Commanded sensor height and LED: the plan's optional columns `height_mm` and `led`.
 
-A plan's columns `height_mm` and `led` (recording-format). A reading at another height than the one of the
-description is seen through a footprint scaled by h/h0, with a signal scaled by (h0/h)^2; without the LED
-there is no signal. Where a plan does not say (no column, NaN) the sensor is as it was calibrated.
+At height h instead of the description's h0 the footprint is scaled by h/h0 and the signal by (h0/h)^2; with
+the LED off there is no signal. Without a column, or at NaN, the sensor is as it was calibrated.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ COMMANDED = ("height_mm", "led")
 
 
 def is_commanded(plan: Plan) -> bool:
-    """Tell whether a plan asks for another height than the description's, or names the LED."""
+    """Whether a plan commands the LED or a height other than the description's."""
     return "led" in plan.covariates or height_ratio(plan) is not None
 
 
 def light_of(plan: Plan) -> FloatArray:
-    """Return the share of the LED's light, 0 or 1 a reading, (n_points,) or (1,)."""
+    """Return the LED's state at each reading, 0 or 1, (n_points,) or (1,)."""
     led = plan.covariates.get("led")
     return np.ones(1) if led is None else np.where(np.isfinite(led), led, 1.0)
 
 
 def height_ratio(plan: Plan) -> FloatArray | None:
-    """Return h/h0 a reading, (n_points,); None where the height is the description's throughout, or not known."""
+    """Return h/h0 of each reading, (n_points,); None where no height is known or all are the description's."""
     height_mm, usual_mm = plan.covariates.get("height_mm"), plan.instrumentation.height_mm
     if height_mm is None or usual_mm is None:
         return None
@@ -41,14 +40,14 @@ def height_ratio(plan: Plan) -> FloatArray | None:
 
 
 def raised_as_commanded(footprint: Footprint, plan: Plan) -> Footprint:
-    """Scale the footprint by the height that was commanded over the description's."""
+    """Scale the footprint by the commanded height over the description's."""
     ratio = height_ratio(plan)
     return footprint if ratio is None else raised(footprint, ratio[None, :])
 
 
 def raised(footprint: Footprint, ratio: FloatArray) -> Footprint:
-    """Scale the footprint by h/h0, (n_samples, n_points), and dim it by its square."""
-    # No arm drives its sensor into the table: what a fit tries there must only be finite.
+    """Scale the footprint by h/h0, (n_samples, n_points), and divide its brightness by the square."""
+    # A fit may try heights that no arm can take: the result only has to stay finite.
     ratio = np.clip(ratio, 0.1, 10.0)
     k = ratio[:, :, None]
     return replace(

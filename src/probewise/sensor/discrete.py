@@ -1,8 +1,8 @@
 """The paper's sum over a discrete SSF matrix (paper, eq. discrete R), for any field and any region.
 
-The second of the two independent routes to the response; it shares nothing with the closed
-forms of `probewise.sensor.gaussian` but the region's geometry. The albedo of a pixel is its
-covered share, so the error falls as the pixel squared.
+The second of the two independent routes to the response; it shares only the region's geometry with
+the closed forms of `probewise.sensor.gaussian`. The albedo of a pixel is its covered share, so the
+error falls as the square of the pixel size.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
 
     Returns
     -------
-    Response R, shape (n_samples, n_points); n_samples is 1 where nothing depends on the sample.
+    Response R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
     if n_poses not in (1, region.n_regions) and region.n_regions != 1:
         raise ShapeError(f"poses of {n_poses} hypotheses over {region.n_regions} regions; allowed: as many, or 1")
     if n_poses > 1:
-        # Poses of its own for each hypothesis: every (hypothesis, reading) pair is a place of its own.
+        # Each hypothesis has its own poses: evaluate one hypothesis at a time.
         out = np.empty((n_poses, n_points))
         for i in range(n_poses):
             one = Poses(x[i : i + 1], y[i : i + 1], turn[i : i + 1])

@@ -1,8 +1,8 @@
-"""What a Gaussian footprint sees of a region: closed forms and one-dimensional quadrature.
+"""Response of a Gaussian footprint to a region: closed forms and one-dimensional quadrature.
 
-This is the first of the two independent routes to the response R (paper, eq. R): exact
-integrals of each Gaussian of the SSF over the region. The other, the paper's sum over pixels,
-is `probewise.sensor.discrete`. A new kind of region may register its own closed form with
+The first of the two independent routes to the response R (paper, eq. R): exact integrals of each
+Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
+`probewise.sensor.discrete`. A new kind of region may register its closed form with
 `seen_by_one.register`; without one it is integrated numerically from its `coverage`.
 """
 
@@ -31,22 +31,31 @@ from probewise.scene.regions import (
 )
 from probewise.sensor._normal import normal_cdf
 
-__all__ = ["ACCURATE_NODES", "FAST_NODES", "Spot", "beyond_corner", "mass_in_quadrant", "seen", "seen_by_one", "turned"]
+__all__ = [
+    "ACCURATE_NODES",
+    "FAST_NODES",
+    "LabGaussian",
+    "beyond_corner",
+    "mass_in_quadrant",
+    "seen",
+    "seen_by_one",
+    "turned",
+]
 
 ACCURATE_NODES = 64
 FAST_NODES = 20
 
-_REACH = 8.0  # standard deviations beyond which an edge is not seen (Phi(-8) = 6e-16)
+_REACH = 8.0  # standard deviations beyond which an edge has no effect (Phi(-8) = 6e-16)
 
 
 @dataclass(frozen=True, eq=False)
-class Spot:
-    """One Gaussian footprint in the lab frame, at every pose.
+class LabGaussian:
+    """One Gaussian of the footprint in the lab frame, at every pose.
 
-    All arrays broadcast to (n_samples, n_points), mm and mm^2: the sensor's place `x_mm`,
-    `y_mm`; the Gaussian's centre relative to it, `dx_mm`, `dy_mm`; its covariance. Place and
-    centre are kept apart because the centre depends on the hypothesis and the place on the
-    reading: sums of small arrays are put off until they must be formed.
+    All arrays broadcast to (n_samples, n_points), mm and mm^2: the sensor's position `x_mm`,
+    `y_mm`; the Gaussian's centre relative to it, `dx_mm`, `dy_mm`; its covariance. Position and
+    centre are kept apart because one depends on the reading and the other on the hypothesis:
+    their sum, a larger array, is formed only where it is needed.
     """
 
     x_mm: FloatArray
@@ -57,9 +66,9 @@ class Spot:
     var_y: FloatArray
     cov_xy: FloatArray
 
-    def take(self, rows: IntArray) -> Spot:
-        """Keep these samples; arrays that do not depend on the sample stay as they are."""
-        return Spot(*(a[rows] if a.shape[0] != 1 else a for a in self._arrays()))
+    def take(self, rows: IntArray) -> LabGaussian:
+        """Select samples; arrays shared by all samples are kept as they are."""
+        return LabGaussian(*(a[rows] if a.shape[0] != 1 else a for a in self._arrays()))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -68,6 +77,10 @@ class Spot:
 
     def _arrays(self) -> tuple[FloatArray, ...]:
         return (self.x_mm, self.y_mm, self.dx_mm, self.dy_mm, self.var_x, self.var_y, self.cov_xy)
+
+
+Spot = LabGaussian
+"""The old name of `LabGaussian`."""
 
 
 def turned(
@@ -95,7 +108,7 @@ def seen(
     *,
     n_nodes: int = ACCURATE_NODES,
 ) -> FloatArray:
-    """Mean albedo that each Gaussian footprint sees (paper, eq. R for one Gaussian).
+    """Mean albedo under each Gaussian footprint (paper, eq. R for one Gaussian).
 
     Parameters
     ----------
@@ -117,18 +130,18 @@ def seen(
     layers = []
     for g in range(arrays[0].shape[2]):
         x, y, var1, var2, cov = (a[:, :, g] for a in arrays)
-        spot = Spot(x, y, zero, zero, var1, var2, cov)
+        gaussian = LabGaussian(x, y, zero, zero, var1, var2, cov)
         shape = np.broadcast_shapes(x.shape, (region.n_regions, 1))
-        layers.append(np.broadcast_to(seen_by_one(region, spot, n_nodes), shape))
+        layers.append(np.broadcast_to(seen_by_one(region, gaussian, n_nodes), shape))
     return np.stack(layers, axis=-1)
 
 
 @singledispatch
-def seen_by_one(region: Region, spot: Spot, n_nodes: int) -> FloatArray:
-    """Mean albedo that one Gaussian footprint sees: broadcasts to (n_samples, n_points).
+def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
 
-    A region of a kind without a closed form is summed over square pixels of a quarter of the
-    smaller standard deviation, each with its coverage; the error is about 1e-3, and a `SlowWarning` says so.
+    A region without a registered closed form is summed over square pixels, a quarter of the smaller
+    standard deviation wide, each with its coverage: error about 1e-3, and a `SlowWarning` is issued.
     """
     kind = type(region).__name__
     warnings.warn(
@@ -137,17 +150,23 @@ def seen_by_one(region: Region, spot: Spot, n_nodes: int) -> FloatArray:
         SlowWarning,
         stacklevel=2,
     )
-    shape = np.broadcast_shapes(spot.shape, (region.n_regions, 1))
+    shape = np.broadcast_shapes(gaussian.shape, (region.n_regions, 1))
     out = np.empty(shape)
-    x, y = np.broadcast_to(spot.x_mm + spot.dx_mm, shape), np.broadcast_to(spot.y_mm + spot.dy_mm, shape)
+    x, y = (
+        np.broadcast_to(gaussian.x_mm + gaussian.dx_mm, shape),
+        np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
+    )
     steps = np.arange(-26.0, 27.0) / 4
     for i, j in np.ndindex(*shape):
         cov = np.array(
-            [[_at(spot.var_x, i, j), _at(spot.cov_xy, i, j)], [_at(spot.cov_xy, i, j), _at(spot.var_y, i, j)]]
+            [
+                [_at(gaussian.var_x, i, j), _at(gaussian.cov_xy, i, j)],
+                [_at(gaussian.cov_xy, i, j), _at(gaussian.var_y, i, j)],
+            ]
         )
         variance, axes = np.linalg.eigh(cov)
         sd = np.sqrt(variance)
-        # Square pixels along the main axes: repeat the longer axis' steps.
+        # Square pixels along the principal axes, hence more of them along the longer one.
         n_long = int(np.ceil(6.5 * sd[1] / sd[0] * 4))
         long_steps = np.arange(-n_long, n_long + 1) * sd[0] / 4
         short_steps = steps * sd[0]
@@ -171,35 +190,39 @@ def _between(outside: float, inside: float, share: FloatArray) -> FloatArray:
 
 
 @seen_by_one.register
-def _(region: UniformRegion, spot: Spot, n_nodes: int) -> FloatArray:
+def _(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     return region.level[:, None]
 
 
 @seen_by_one.register
-def _(region: HalfPlaneRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By the cumulative of the Gaussian's projection on the normal."""
+def _(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Evaluate the cumulative of the Gaussian's projection on the normal."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
-    place = cosine * spot.x_mm + sine * spot.y_mm - region.offset_mm[:, None]
-    shift = cosine * spot.dx_mm + sine * spot.dy_mm
-    variance = cosine**2 * spot.var_x + sine**2 * spot.var_y + 2 * cosine * sine * spot.cov_xy
+    place = cosine * gaussian.x_mm + sine * gaussian.y_mm - region.offset_mm[:, None]
+    shift = cosine * gaussian.dx_mm + sine * gaussian.dy_mm
+    variance = cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + 2 * cosine * sine * gaussian.cov_xy
     per_sd = 1 / np.sqrt(variance)
     return _between(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
 
 
 @seen_by_one.register
-def _(region: RampRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By the mean: a linear field needs no more."""
+def _(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Evaluate the field at the Gaussian's mean, which is exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
-    return region.per_mm[:, None] * (cosine * (spot.x_mm + spot.dx_mm) + sine * (spot.y_mm + spot.dy_mm))
+    return region.per_mm[:, None] * (
+        cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm)
+    )
 
 
 @seen_by_one.register
-def _(region: StripesRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By a sum of cumulatives or, of stripes finer than the footprint, by their Fourier series."""
+def _(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Sum cumulatives or, for stripes finer than the footprint, their Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     period, duty = region.period_mm[:, None], region.duty[:, None]
-    along = cosine * (spot.x_mm + spot.dx_mm) + sine * (spot.y_mm + spot.dy_mm) - region.phase_mm[:, None]
-    sd = np.sqrt(cosine**2 * spot.var_x + sine**2 * spot.var_y + 2 * cosine * sine * spot.cov_xy)
+    along = (
+        cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm) - region.phase_mm[:, None]
+    )
+    sd = np.sqrt(cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + 2 * cosine * sine * gaussian.cov_xy)
     along, sd, period, duty = np.broadcast_arrays(along / period, sd / period, period, duty)  # in periods
     share = np.empty(along.shape)
     fine = sd > 0.4
@@ -221,19 +244,19 @@ def _(region: StripesRegion, spot: Spot, n_nodes: int) -> FloatArray:
     return _between(region.outside, region.inside, share)
 
 
-_FAR = 26.0  # nothing is left beyond; where its argument underflows exp is ten times as slow
-_TRIANGLE_NODES = 8  # of the positive half of a rule of twice as many: within 1e-12
+_FAR = 26.0  # sds: the mass beyond is 0, and exp is ten times slower where it underflows
+_TRIANGLE_NODES = 8  # positive half of a 16-node rule: accurate to 1e-12
 
 
 def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Probability that two standard normals of correlation `rho` exceed z1 and z2, z1, and z2; arrays broadcast.
 
-    The quadrant is what two rays from the corner and the angle between them hold, in the frame in which the Gaussian is
-    the unit one about the origin (Owen 1956). Side 1 goes from above down to the corner, its foot at distance z1 from
-    the origin; the corner lies `along` it from the foot. What a side cuts off is half a half-plane less the triangle
-    from foot to corner, V of Nicholson (1943): the integral over x from 0 to along/z1 of
-    (1 - exp(-z1^2 (1 + x^2) / 2)) / (2 pi (1 + x^2)), by Gauss and Legendre's rule. Its integrand is smooth up to
-    x = 1; where the corner lies further, V(h, k) is the mass of the rectangle less V(k, h).
+    In the frame in which the Gaussian is the unit one about the origin, the quadrant is the wedge between two rays from
+    the corner (Owen 1956). The line of side 1 passes the origin at distance z1; the corner lies `along` it from its
+    foot. The mass that a side cuts off is half a half-plane minus the triangle between origin, foot and corner, V of
+    Nicholson (1943): the integral over x from 0 to along/z1 of (1 - exp(-z1^2 (1 + x^2) / 2)) / (2 pi (1 + x^2)),
+    by Gauss-Legendre quadrature. The integrand is smooth up to x = 1; where the corner lies further, V(h, k) is
+    the mass of the rectangle minus V(k, h).
     """
     z = np.empty((2, *np.broadcast(z1, z2, rho).shape))
     z[0], z[1] = z1, z2
@@ -257,36 +280,36 @@ def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[Floa
 
 
 @seen_by_one.register
-def _(region: QuadrantRegion, spot: Spot, n_nodes: int) -> FloatArray:
+def _(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     corner, direction = region.corner_mm, region.direction
-    share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], spot)
+    share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
     return _between(region.outside, region.inside, share)
 
 
 def mass_in_quadrant(
-    corner_x: FloatArray, corner_y: FloatArray, dx: FloatArray, dy: FloatArray, spot: Spot
+    corner_x: FloatArray, corner_y: FloatArray, dx: FloatArray, dy: FloatArray, gaussian: LabGaussian
 ) -> FloatArray:
-    """Integrate Gaussians over quadrants: corner, directions and the spot's fields broadcast, whatever their shape.
+    """Integrate Gaussians over quadrants; corner, direction and the Gaussians' arrays broadcast to any shape.
 
-    By the bivariate normal, reflected so that the inside lies to the upper right.
+    The bivariate normal, reflected so that the inside lies to the upper right.
     """
-    sd_x, sd_y = np.sqrt(spot.var_x), np.sqrt(spot.var_y)
-    z1 = dx * (corner_x - spot.x_mm - spot.dx_mm) / sd_x
-    z2 = dy * (corner_y - spot.y_mm - spot.dy_mm) / sd_y
-    return beyond_corner(z1, z2, dx * dy * spot.cov_xy / (sd_x * sd_y))[0]
+    sd_x, sd_y = np.sqrt(gaussian.var_x), np.sqrt(gaussian.var_y)
+    z1 = dx * (corner_x - gaussian.x_mm - gaussian.dx_mm) / sd_x
+    z2 = dy * (corner_y - gaussian.y_mm - gaussian.dy_mm) / sd_y
+    return beyond_corner(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
 
 
 @seen_by_one.register
-def _(region: PolygonRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By Owen's function on every edge, in the frame in which the Gaussian is the unit one."""
-    sd_x = np.sqrt(spot.var_x)
-    slope = spot.cov_xy / spot.var_x
-    sd_free = np.sqrt(spot.var_y - slope * spot.cov_xy)
+def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Sum Owen's T over the edges, in the frame in which the Gaussian is the unit one."""
+    sd_x = np.sqrt(gaussian.var_x)
+    slope = gaussian.cov_xy / gaussian.var_x
+    sd_free = np.sqrt(gaussian.var_y - slope * gaussian.cov_xy)
 
     def whitened(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         return x / sd_x, (y - slope * x) / sd_free
 
-    mean_p, mean_q = whitened(spot.x_mm + spot.dx_mm, spot.y_mm + spot.dy_mm)
+    mean_p, mean_q = whitened(gaussian.x_mm + gaussian.dx_mm, gaussian.y_mm + gaussian.dy_mm)
     turning = np.zeros(np.broadcast_shapes(mean_p.shape, mean_q.shape, (region.n_regions, 1)))
     for k in range(region.edges_mm.shape[1]):
         p1, q1 = whitened(region.edges_mm[:, k, 0, :1], region.edges_mm[:, k, 0, 1:])
@@ -307,9 +330,9 @@ def _(region: PolygonRegion, spot: Spot, n_nodes: int) -> FloatArray:
 
 
 def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Mass of the unit Gaussian behind edges, (n_edges,), within the angle each spans: Owen's T from `start` to `end`.
+    """Mass of the unit Gaussian beyond edges, (n_edges,), within the angle each spans: Owen's T from start to end.
 
-    An end out of reach is as good as infinitely far, where T is half the mass beyond the edge's line.
+    An end out of reach counts as infinitely far, where T is half the mass beyond the edge's line.
     """
     half = 0.5 * ndtr(-np.abs(height))
     with np.errstate(over="ignore"):
@@ -331,24 +354,24 @@ def _legendre(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @seen_by_one.register
-def _(region: EllipseRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """By quadrature along the tangent of cumulatives along the normal, after a map to the unit disc."""
+def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Integrate cumulatives along the normal by quadrature along the tangent, after a map to the unit disc."""
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
     cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
     round_edge = bool((region.semi_axes_mm[:, 0] == region.semi_axes_mm[:, 1]).all())
     if round_edge:
         cosine, sine = np.ones_like(cosine), np.zeros_like(sine)
-    place_x = spot.x_mm - region.center_mm[:, :1] + spot.dx_mm
-    place_y = spot.y_mm - region.center_mm[:, 1:] + spot.dy_mm
+    place_x = gaussian.x_mm - region.center_mm[:, :1] + gaussian.dx_mm
+    place_y = gaussian.y_mm - region.center_mm[:, 1:] + gaussian.dy_mm
     if round_edge:
         p, q = place_x / a, place_y / b
-        var_p, var_q, cov_pq = spot.var_x / a**2, spot.var_y / b**2, spot.cov_xy / (a * b)
+        var_p, var_q, cov_pq = gaussian.var_x / a**2, gaussian.var_y / b**2, gaussian.cov_xy / (a * b)
     else:
         p, q = (cosine * place_x + sine * place_y) / a, (cosine * place_y - sine * place_x) / b
-        cross = 2 * cosine * sine * spot.cov_xy
-        var_p = (cosine**2 * spot.var_x + sine**2 * spot.var_y + cross) / a**2
-        var_q = (sine**2 * spot.var_x + cosine**2 * spot.var_y - cross) / b**2
-        twist = cosine * sine * (spot.var_y - spot.var_x) + (cosine**2 - sine**2) * spot.cov_xy
+        cross = 2 * cosine * sine * gaussian.cov_xy
+        var_p = (cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + cross) / a**2
+        var_q = (sine**2 * gaussian.var_x + cosine**2 * gaussian.var_y - cross) / b**2
+        twist = cosine * sine * (gaussian.var_y - gaussian.var_x) + (cosine**2 - sine**2) * gaussian.cov_xy
         cov_pq = twist / (a * b)
     return _between(region.outside, region.inside, _seen_of_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes))
 
@@ -358,10 +381,10 @@ def _seen_of_unit_disc(
 ) -> FloatArray:
     """Mass of Gaussians, arrays broadcasting to (n_samples, n_points), inside the unit circle.
 
-    Only the pairs whose edge is within reach are integrated. The frame of each is turned so that
-    the edge nearest to the mean is upright: y runs along the edge, and given y the rest is a
-    difference of two cumulatives. Where the footprint reaches round the disc, y = sin t takes
-    the root out of the chord's end.
+    Only the (sample, reading) pairs whose edge is within reach are integrated. Each frame is turned so
+    that y runs along the edge nearest to the mean; given y, the integral over x is a difference of two
+    cumulatives. Where the footprint covers most of the disc, y = sin t removes the square-root
+    singularity at the chord's end.
     """
     reach = _reach_of(n_nodes)
     largest = np.sqrt(0.5 * (var_p + var_q) + np.hypot(0.5 * (var_p - var_q), cov_pq))
@@ -387,8 +410,8 @@ def _seen_of_unit_disc(
     span = reach * sd_along
     found = np.empty(len(d))
     wraps = span > 0.95
-    # How many conditional sd the edge moves over one sd along it: footprints slanting to the
-    # edge, or far longer than the edge's radius, take more nodes.
+    # How many conditional sds the edge moves over one sd along it: footprints oblique to the
+    # edge, or much longer than its radius, need more nodes.
     wide = np.minimum(sd_along, 1.0)
     sharpness = wide * per_sd * (np.abs(slope) + wide)
     doublings = np.clip(np.ceil(np.log2(np.maximum(sharpness / _SHARP, 1.0))), 0, 5).astype(np.int64)
@@ -402,12 +425,12 @@ def _seen_of_unit_disc(
     return np.clip(share, 0.0, 1.0)
 
 
-_BLOCK = 2048  # pairs at a time, times nodes: stays in the cache
-_SHARP = 1.2  # the sharpness that n_nodes are good for
+_BLOCK = 2048  # pairs at a time: with their nodes they fit the cache
+_SHARP = 1.2  # the sharpness up to which n_nodes suffice
 
 
 def _reach_of(n_nodes: int) -> float:
-    """Choose how many standard deviations n_nodes cover, errors of tail and rule balanced."""
+    """Choose how many standard deviations n_nodes cover, so that truncation and quadrature errors balance."""
     return float(np.clip(4.0 + (n_nodes - 24) / 16, 4.0, 6.5))
 
 
@@ -421,7 +444,7 @@ def _strips(
     *,
     wrapped: bool,
 ) -> FloatArray:
-    """Integrate pairs, shape (n_pairs,), with the mean at (d, 0) in the frame of the unit disc."""
+    """Integrate Gaussians (n_pairs,), mean at (d, 0), over the unit disc."""
     node, weight = _legendre(n_nodes)
     if wrapped:
         t = 0.5 * np.pi * node
@@ -431,7 +454,7 @@ def _strips(
     else:
         y = (reach * node)[:, None] * sd_along
         x = np.sqrt(1 - y * y)
-        # Divided by the mass within reach, so that what is cut off is shared out, not lost.
+        # Dividing by the mass within reach redistributes the truncated tails.
         mass = 2 * ndtr(reach) - 1
         share = (reach / mass * weight * np.exp(-0.5 * (reach * node) ** 2))[:, None] * sd_along
     tilt = slope * y
@@ -449,23 +472,31 @@ def _strips(
 
 
 @seen_by_one.register
-def _(region: MixtureOfRegions, spot: Spot, n_nodes: int) -> FloatArray:
-    """Each hypothesis by the kind of its own region."""
-    out = np.empty(np.broadcast_shapes(spot.shape, (region.n_regions, 1)))
+def _(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Integrate each hypothesis by the rule for its kind of region."""
+    out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows():
-        out[rows] = seen_by_one(part, spot.take(rows), n_nodes)
+        out[rows] = seen_by_one(part, gaussian.take(rows), n_nodes)
     return out
 
 
 @seen_by_one.register
-def _(region: ImageRegion, spot: Spot, n_nodes: int) -> FloatArray:
+def _(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Exact along each row of pixels; Gauss-Legendre across it, panels within the footprint's scale."""
-    shape = spot.shape
+    shape = gaussian.shape
     out = np.empty(shape)
-    x, y = np.broadcast_to(spot.x_mm + spot.dx_mm, shape), np.broadcast_to(spot.y_mm + spot.dy_mm, shape)
+    x, y = (
+        np.broadcast_to(gaussian.x_mm + gaussian.dx_mm, shape),
+        np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
+    )
     for i, j in np.ndindex(*shape):
         out[i, j] = _seen_of_image(
-            region, float(x[i, j]), float(y[i, j]), _at(spot.var_x, i, j), _at(spot.var_y, i, j), _at(spot.cov_xy, i, j)
+            region,
+            float(x[i, j]),
+            float(y[i, j]),
+            _at(gaussian.var_x, i, j),
+            _at(gaussian.var_y, i, j),
+            _at(gaussian.cov_xy, i, j),
         )
     return out
 

@@ -1,4 +1,4 @@
-"""The paper's naive sensor: white or black by the point under its centre (paper, "The Naive Likelihood")."""
+"""The paper's naive sensor: it sees only the point under its centre (paper, "The Naive Likelihood")."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["NaiveSensor"]
 
 @dataclass(frozen=True)
 class NaiveSensor:
-    """Predict the bright level where the point under the sensor is white, the dark one elsewhere.
+    """Predict I_max where the point under the sensor is white, I_min elsewhere.
 
     White is an albedo of 0.5 or more. Columns of theta: the levels', then the scene's.
     """
@@ -36,7 +36,7 @@ class NaiveSensor:
         return (*self.levels.names, *self.scene.names)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        """Predict noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         require_columns(theta, self.names)
         n_levels = len(self.levels.names)
         i_min, i_max = self.levels.values(theta[:, :n_levels])

@@ -57,11 +57,11 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     Raises
     ------
     ParameterError
-        If AB - C^2 is not positive, or the whole mass is not. An amplitude may be negative: it takes from the others.
+        If AB - C^2 or the total mass is not positive. Single amplitudes may be negative.
     """
     if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:
         raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (n_samples, {6 * n_gaussians})")
-    # A row for each kind of parameter, (6, n_gaussians, n_samples): operations then run along memory.
+    # One contiguous row per parameter, (6, n_gaussians, n_samples), for speed.
     rows = np.ascontiguousarray(theta.reshape(len(theta), n_gaussians, 6).transpose(2, 1, 0))
     a, u, v, aa, bb, cc = rows
     determinant = aa * bb - cc * cc
@@ -76,7 +76,7 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
 
 
 class SSFModel(Protocol):
-    """An SSF as the chain takes it: named parameters and the footprint they make."""
+    """An SSF as the chain needs it: named parameters and their footprint."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -84,13 +84,13 @@ class SSFModel(Protocol):
         ...
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Mixture of Gaussians in the sensor frame, theta (n_samples, n_params)."""
+        """Return the mixture of Gaussians in the sensor frame, theta (n_samples, n_params)."""
         ...
 
 
 @dataclass(frozen=True)
 class FreeMixture:
-    """A mixture of `n_gaussians` whose parameters are to be estimated."""
+    """A mixture of `n_gaussians` with free parameters."""
 
     n_gaussians: int
 
@@ -109,7 +109,7 @@ class FreeMixture:
 
 @dataclass(frozen=True, eq=False)
 class FixedMixture:
-    """A mixture that is known: weights (n,), means (n, 2) mm, covariances (n, 2, 2) mm^2, sensor frame."""
+    """A known mixture: weights (n,), means (n, 2) mm, covariances (n, 2, 2) mm^2, sensor frame."""
 
     weights: FloatArray
     means_mm: FloatArray
@@ -157,7 +157,7 @@ class FixedMixture:
         return np.asarray(np.einsum("n,nij->ij", self.weights, self.covs_mm2 + off[:, :, None] * off[:, None, :]))
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Give the mixture, arrays (1, 1, n_gaussians); theta (n_samples, 0) plays no part."""
+        """Return the mixture, arrays (1, 1, n_gaussians); theta (n_samples, 0) is ignored."""
         return self._footprint
 
     @cached_property
@@ -171,11 +171,11 @@ class FixedMixture:
 
 @dataclass(frozen=True, eq=False)
 class SSFField(ShowsItself):
-    """An SSF on square pixels: any SSF field (paper, the discrete SSF matrix).
+    """A discrete SSF on square pixels (paper, the discrete SSF matrix).
 
-    `values` (n_y, n_x) are the share of each pixel, normalised to sum one on construction (not
-    necessarily positive); row 0 is the lowest v', column 0 the lowest u'. `origin_mm` is the
-    centre (u', v') of pixel [0, 0] in the sensor frame.
+    `values` (n_y, n_x) are the pixels' shares, of either sign, normalised to sum one on construction;
+    row 0 is the lowest v', column 0 the lowest u'. `origin_mm` is the centre (u', v') of pixel
+    [0, 0] in the sensor frame.
     """
 
     values: FloatArray
@@ -223,7 +223,7 @@ class SSFField(ShowsItself):
 
 @dataclass(frozen=True)
 class FieldSSF:
-    """A discrete SSF field as the chain's SSF: responses are the paper's sum over its pixels."""
+    """A discrete SSF for the chain: the response is the paper's sum over its pixels."""
 
     field: SSFField
 
@@ -233,14 +233,14 @@ class FieldSSF:
         return ()
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Give the single Gaussian with the field's mean and covariance."""
+        """Return the single Gaussian with the field's mean and covariance."""
         return mixture_of_field(self.field).footprint(theta)
 
 
 def field_of(
     footprint: Footprint, *, u_mm: FloatArray, v_mm: FloatArray, weights: FloatArray | None = None
 ) -> SSFField:
-    """Sample an SSF at pixel centres; average the fields over the samples (of fields, not of parameters).
+    """Evaluate sampled SSFs at pixel centres and average these fields (not the parameters) over the samples.
 
     Parameters
     ----------
@@ -268,11 +268,11 @@ def field_of(
     w, mu, mv, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
     w = w * np.repeat(shares, arrays[0].shape[2])
     total = np.zeros((len(v_mm), len(u_mm)))
-    own = np.empty_like(total)  # one Gaussian at a time, in place: fresh arrays of this size cost more than the sums
+    own = np.empty_like(total)  # reused for every Gaussian: allocating it costs more than the sums
     lightest_first = np.argsort(w)
     counts = np.cumsum(w[lightest_first]) > _NEGLIGIBLE * w.sum()  # of a nested run's dead points few carry weight
     for n in lightest_first[counts]:
-        # v given u, so that each Gaussian costs one exponential over the grid.
+        # Conditioning v on u leaves one exponential per Gaussian and pixel.
         slope = cov[n] / var_u[n]
         var_free = var_v[n] - slope * cov[n]
         off_u = u_mm - mu[n]
@@ -288,10 +288,10 @@ def field_of(
 
 
 def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1) -> FixedMixture:
-    """Summarise sampled mixtures, arrays (n_samples, 1, n), by one of `n_gaussians`.
+    """Summarise sampled mixtures, arrays (n_samples, 1, n), by one mixture of `n_gaussians`.
 
-    The mean over samples of mixtures is a large mixture; its components are merged by the law
-    of total covariance, so mean and covariance of the mean field are kept exactly.
+    The mean over the samples is a large mixture; its components are merged by the law of
+    total covariance, so mean and covariance of the mean field are exact.
     """
     arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
     n_samples, _, n = arrays[0].shape
@@ -302,10 +302,9 @@ def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_g
 
 
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
-    """Match a field by a mixture, so that closed forms can stand in for the sum over its pixels.
+    """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Mean and covariance are the field's. How far the two differ says `total_variation`: no
-    response differs by more.
+    `total_variation` of the two bounds the error of any response.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
@@ -314,9 +313,9 @@ def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
 
 
 def total_variation(mixture: FixedMixture, field: SSFField) -> float:
-    """Half the summed difference of a mixture and a field: the largest difference of any response.
+    """Total variation distance of a mixture and a field: the largest difference of any response.
 
-    Both are compared on the field's pixels; a mixture's share outside them counts in full.
+    Both are compared on the field's pixels; the mixture's mass outside them counts in full.
     """
     sampled = _density(mixture, field.centers_mm) * field.pixel_mm**2
     missing = max(0.0, 1.0 - float(sampled.sum()))
@@ -333,13 +332,13 @@ def _density(mixture: FixedMixture, points: FloatArray) -> FloatArray:
 
 
 def _quadratic(off: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Form off' matrix off for each row, off (n, 2)."""
+    """Compute the quadratic form off' matrix off of each row, off (n, 2)."""
     x, y = off[:, 0], off[:, 1]
     return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
 
 
 def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
-    """Merge weighted Gaussians (or points, covariance zero) to a few, by expectation-maximisation."""
+    """Merge weighted Gaussians (or points, covariance zero) into a few, by expectation-maximisation."""
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")
     w = w / w.sum()
@@ -355,7 +354,7 @@ def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int
     _, mean, cov = moments(w)
     if n_gaussians == 1:
         return FixedMixture(np.ones(1), mean[None], cov[None])
-    # Start from concentric Gaussians, narrow to wide, moved a little apart along the main axis.
+    # Start from Gaussians of increasing width, spread along the principal axis.
     main = np.linalg.eigh(cov)[1][:, 1] * np.sqrt(np.linalg.eigvalsh(cov)[1])
     spread = np.linspace(-1, 1, n_gaussians)
     weights = np.full(n_gaussians, 1 / n_gaussians)

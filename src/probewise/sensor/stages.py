@@ -1,8 +1,8 @@
-"""The stages a reading passes from pose to number, and the value that each one handles.
+"""The stages of the sensor chain from pose to reading, and the value that each one transforms.
 
-Order (the vocabulary's): pose, scene, footprint, seen fraction, response curve, gain, offset,
-lag, saturation, noise. An effect is one function at one stage; the chain applies the effects
-of each stage in the order of stages, whatever the order in which they were found.
+In order: pose, scene, footprint, seen fraction, response curve, gain, offset, lag, saturation,
+noise (INPUT, PARAMETER, RATE and BEND are stages of systems, not of the light sensor). An effect is one
+function at one stage; effects are applied in the order of their stages.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 
 
 class Stage(IntEnum):
-    """Where in the chain an effect acts."""
+    """The stage of the chain at which an effect acts."""
 
     INPUT = 0
     PARAMETER = 1
@@ -54,7 +54,7 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Where the sensor really stands: arrays that broadcast to (n_samples, n_points)."""
+    """True poses of the sensor: arrays that broadcast to (n_samples, n_points)."""
 
     x_mm: FloatArray
     y_mm: FloatArray
@@ -63,7 +63,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """What lies under it: region by pattern name, and how far each reading's pattern lies from where it should.
+    """The scene: region by pattern name, and each reading's displacement of its pattern from the described place.
 
     `dx_mm`, `dy_mm` broadcast to (n_samples, n_points).
     """
@@ -79,7 +79,7 @@ class Footprint:
 
     Arrays broadcast to (n_samples, n_points, n_gaussians): `weight` (sums to one over the
     last axis), mean `u_mm`, `v_mm`, covariance `var_u`, `var_v`, `cov_uv` in mm^2.
-    `brightness` (n_samples, n_points) is how strong the signal is of what it was calibrated at.
+    `brightness` (n_samples, n_points) is the signal strength relative to calibration.
     """
 
     weight: FloatArray
@@ -98,9 +98,9 @@ class Footprint:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What the sensor sees: white fraction `seen` (n_samples, n_points), from which place of which regions.
+    """The view: white fraction `seen` (n_samples, n_points), and the poses and regions it was computed from.
 
-    `poses` are relative to the patterns as they are described; `brightness` is the footprint's.
+    `poses` are relative to the patterns' described places; `brightness` is the footprint's.
     """
 
     seen: FloatArray
@@ -111,12 +111,12 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevel:
-    """Noise of one reading: `sd` broadcasts to (n_samples, n_points); the rest are (n_samples, 1).
+    """Noise of the readings: `sd` broadcasts to (n_samples, n_points); unless said, the rest are (n_samples, 1).
 
-    `rho` is AR(1) within a scan. A random walk of the offset gains `walk` sds from row to row, and has taken `walked`
-    (n_points,) steps by each row. With the share `wide_share` a reading's noise is `wide_times` as wide;
-    with the share `lost_share` a reading is lost to `lost_value`; what is left is rounded to `step`,
-    0 for none. `seen` (n_samples, n_points) is the white fraction that was seen, for what goes with it.
+    `rho` is the AR(1) correlation within a scan. A random walk of the offset has steps of `walk` sds from row to row
+    and has taken `walked` (n_points,) steps by each row. With probability `wide_share` a reading's noise is
+    `wide_times` as wide; with probability `lost_share` a reading is lost and reads `lost_value`. Readings are rounded
+    to `step`, 0 for none. `seen` (n_samples, n_points) is the white fraction, for noise that depends on the signal.
     """
 
     sd: FloatArray
@@ -154,11 +154,11 @@ class Effect(Protocol[V]):
 
     @property
     def prior(self) -> Prior:
-        """Prior of its parameters; names are the vocabulary's, without the effect's name."""
+        """Prior of its parameters, named without the effect's name."""
         ...
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
-        """Apply with parameters theta (n_samples, n_params of this effect)."""
+        """Apply the effect with parameters theta (n_samples, n_params of this effect)."""
         ...
 
 
@@ -170,11 +170,11 @@ class SensorModel(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters, one a column of theta."""
+        """Names of the free parameters, one per column of theta."""
         ...
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        """Predict noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         ...
 
 

@@ -1,7 +1,7 @@
-"""Known straight edges and corners under many readings: laid out once, seen by every hypothesis in one product.
+"""Fast responses to known straight edges and corners, for many hypotheses over the same readings.
 
-Calibration lives on them: the same few hundred readings, a million hypotheses. What depends on
-the readings alone (angles, distances, which of them are alike) is worked out when the layout is made.
+This is the case of calibration: a few hundred readings, a million hypotheses. Everything that depends
+only on the readings (angles, distances, duplicates) is computed once per layout.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
 from probewise.sensor._normal import CENTRE, PER_SD, replace_by_cumulative
-from probewise.sensor.gaussian import Spot, beyond_corner, mass_in_quadrant, turned
+from probewise.sensor.gaussian import LabGaussian, beyond_corner, mass_in_quadrant, turned
 from probewise.sensor.stages import Footprint, Poses
 
 __all__ = ["StraightCorners", "StraightEdges", "columns_of"]
 
-_BLOCK = 2**14  # elements at a time: stays in the cache
-_FEW_ANGLES = 16  # up to so many the product with zeros is cheaper than picking columns
-_SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # closer than that, rounding alone tells angles (radians) and places apart
+_BLOCK = 2**14  # elements at a time: they fit the cache
+_FEW_ANGLES = 16  # up to so many, a product with a mostly zero matrix is cheaper than indexing columns
+_SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # smaller differences of angles (radians) and places are rounding
 
 
 @dataclass(frozen=True, eq=False)
 class StraightEdges:
-    """Half-planes under the readings `rows`, each field (n_rows,) unless said.
+    """Half-planes under the readings `rows`; each field is (n_rows,) unless said.
 
     Parameters
     ----------
     rows
         Numbers of the readings.
     turn_rad
-        The edge's normal as the sensor sees it: the normal's angle less the sensor's orientation.
+        Angle of the edge's normal in the sensor frame.
     distance_mm
-        How far inside the edge the sensor stands, (1 or n_samples, n_rows).
+        Signed distance of the sensor from the edge, positive inside, (1 or n_samples, n_rows).
     inside, outside
         Albedo on either side.
     """
@@ -48,7 +48,7 @@ class StraightEdges:
 
     @classmethod
     def of(cls, parts: list[tuple[IntArray, HalfPlaneRegion]], poses: Poses) -> StraightEdges:
-        """Lay out regions of one hypothesis each, under sensors whose orientation no hypothesis changes."""
+        """Batch regions of one hypothesis each, for orientations that are the same for all hypotheses."""
         rows = np.concatenate([r for r, _ in parts])
 
         def each(values: list[float]) -> FloatArray:
@@ -71,12 +71,12 @@ class StraightEdges:
 
     @cached_property
     def _place(self) -> slice | None:
-        """The rows as a slice, where they are neighbours: a view of the result then takes the place of a copy."""
+        """The rows as a slice where they are contiguous, so that the result can be a view instead of a copy."""
         together = bool((np.diff(self.rows) == 1).all())
         return slice(int(self.rows[0]), int(self.rows[-1]) + 1) if together else None
 
     def see(self, footprint: Footprint, out: FloatArray) -> None:
-        """Write what each hypothesis' footprint sees into the columns `rows` of `out`, (n_samples, n_points)."""
+        """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
         seen = np.empty((len(out), len(self.rows))) if self._place is None else out[:, self._place]
         if len(self.distance_mm) == 1 and not _varies(footprint):
             self._views.see(footprint, seen)
@@ -88,7 +88,7 @@ class StraightEdges:
             out[:, self.rows] = seen
 
     def _see_each(self, footprint: Footprint, share: FloatArray) -> None:
-        """See from places that change with the hypothesis, or with a footprint that changes with the reading."""
+        """Compute responses where the position varies with the hypothesis or the footprint with the reading."""
         weight, *moments = (self._own(a) for a in (footprint.weight, *footprint.moments))
         varies = _varies(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
@@ -109,7 +109,7 @@ class StraightEdges:
                 share[block] += cells * _rows_of(weight, block)[:, :, g]
 
     def _own(self, array: FloatArray) -> FloatArray:
-        """Take the columns of these readings, as a view where they are neighbours."""
+        """Select the columns of these readings, as a view where they are contiguous."""
         if self._place is None or array.shape[1] == 1:
             return columns_of(array, self.rows)
         return array[:, self._place]
@@ -117,11 +117,11 @@ class StraightEdges:
 
 @dataclass(frozen=True, eq=False)
 class _EdgeViews:
-    """The views that readings have of straight edges, each once: scans out and back and from both sides share them.
+    """The distinct views of straight edges: scans out and back, and from both sides, share them.
 
-    An edge seen from its other side is the same view with black and white exchanged. `angle_rad` (n_angles,), from 0 to
-    pi; `hand_out` gives each view its angle's (1/sd, shift/sd); `which` angle and what `distance_mm` is each view's,
-    (n_views,); `view` of each reading, and the readings' `low` and `gain`: what they see of it, (n_rows,).
+    An edge seen from its other side is the same view with black and white exchanged. `angle_rad` (n_angles,) runs from
+    0 to pi; each view has an angle, by index `which`, and a `distance_mm`, (n_views,). Each reading has a `view`, by
+    index, and reads low + gain times its share, `low` and `gain` (n_rows,).
     """
 
     angle_rad: FloatArray
@@ -133,7 +133,7 @@ class _EdgeViews:
 
     @classmethod
     def of(cls, edges: StraightEdges) -> _EdgeViews:
-        """Find the views of edges whose distance no hypothesis changes."""
+        """Find the distinct views of edges whose distance is the same for all hypotheses."""
         n_half_turns = np.floor(edges.turn_rad / np.pi + _SAME_ANGLE)
         behind = n_half_turns % 2 == 1
         angle = np.round((edges.turn_rad - n_half_turns * np.pi) / _SAME_ANGLE) * _SAME_ANGLE
@@ -145,14 +145,14 @@ class _EdgeViews:
 
     @cached_property
     def _hand_out(self) -> FloatArray:
-        """Matrix that gives each view its angle's (1/sd, shift/sd), in cells of the table, (2 n_angles, n_views)."""
+        """Matrix from the angles' (1/sd, mean/sd) to the views' table positions, (2 n_angles, n_views)."""
         own = np.eye(len(self.angle_rad))[:, self.which]
         return np.concatenate([own * self.distance_mm, own])
 
     def see(self, footprint: Footprint, out: FloatArray) -> None:
-        """Write what the readings see with a footprint that none of them changes, (n_samples, n_rows).
+        """Write the responses to a footprint that is the same at all readings, (n_samples, n_rows).
 
-        Gaussians are projected once an angle and handed out in a product, a block of hypotheses at a time.
+        Gaussians are projected once per angle and mapped to the views by a matrix product, block by block.
         """
         weight, *moments = _samples_last(footprint)
         per_sd, shift = _projected(self.angle_rad[:, None, None], *moments)
@@ -191,7 +191,7 @@ class StraightCorners:
 
     @classmethod
     def of(cls, parts: list[tuple[IntArray, QuadrantRegion]], poses: Poses) -> StraightCorners:
-        """Lay out regions of one hypothesis each."""
+        """Batch regions of one hypothesis each."""
         rows = np.concatenate([r for r, _ in parts])
         of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
         return cls(
@@ -208,27 +208,29 @@ class StraightCorners:
         return _CornerViews.of(self)
 
     def see(self, footprint: Footprint, out: FloatArray) -> None:
-        """Write what each hypothesis' footprint sees into the columns `rows` of `out`, (n_samples, n_points)."""
+        """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
         poses = self.poses
         still = len(poses.x_mm) == len(poses.y_mm) == len(poses.orientation_rad) == 1
         if still and not _varies(footprint):
             out[:, self.rows] = self._views.see(footprint)
             return
         moved = turned(poses.orientation_rad[..., None], *(columns_of(a, self.rows) for a in footprint.moments))
-        spots = Spot(poses.x_mm[..., None], poses.y_mm[..., None], *moved)  # (n_samples, n_rows, n_gaussians)
+        gaussians = LabGaussian(
+            poses.x_mm[..., None], poses.y_mm[..., None], *moved
+        )  # (n_samples, n_rows, n_gaussians)
         (corner_x, corner_y), (to_x, to_y) = self.corner_mm.T[..., None], self.direction.T[..., None]
-        found = mass_in_quadrant(corner_x, corner_y, to_x, to_y, spots)
+        found = mass_in_quadrant(corner_x, corner_y, to_x, to_y, gaussians)
         share = (found * columns_of(footprint.weight, self.rows)).sum(axis=2)
         out[:, self.rows] = self.outside + (self.inside - self.outside) * share
 
 
 @dataclass(frozen=True, eq=False)
 class _CornerViews:
-    """The places from which readings see corners, each once: the four quadrants about one corner share it.
+    """The distinct views of corners: the four quadrants about one corner share them.
 
-    What lies beyond the corner along x, along y and along both makes up every quadrant. `turn_rad`: the sensor's
-    orientation, (n_views,) or the one of all; `x_mm`, `y_mm`: the corner from where it stands, (n_views,). `hand_out`
-    (3 n_views, n_rows) and `low` (n_rows,) turn the three shares into what the readings see.
+    The masses beyond the corner along x, along y and along both determine every quadrant. `turn_rad` is the sensor's
+    orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). `hand_out`
+    (3 n_views, n_rows) and `low` (n_rows,) turn the three masses into responses.
     """
 
     turn_rad: FloatArray
@@ -239,14 +241,14 @@ class _CornerViews:
 
     @classmethod
     def of(cls, corners: StraightCorners) -> _CornerViews:
-        """Find the views of corners where no hypothesis changes the sensor's place."""
+        """Find the distinct views of corners where the position is the same for all hypotheses."""
         poses = corners.poses
         x, y = corners.corner_mm[:, 0] - poses.x_mm[0], corners.corner_mm[:, 1] - poses.y_mm[0]
         turn = np.broadcast_to(poses.orientation_rad[0], x.shape)
         places = [np.round(a / same) * same for a, same in ((turn, _SAME_ANGLE), (x, _SAME_MM), (y, _SAME_MM))]
         views, view = np.unique(np.stack(places), axis=1, return_inverse=True)
         (to_x, to_y), gain = corners.direction.T, corners.inside - corners.outside
-        # Of the mass q beyond both, p beyond along x and s along y: q, s - q, p - q or 1 - p - s + q.
+        # With mass q beyond along both, p along x and s along y, a quadrant is q, s - q, p - q or 1 - p - s + q.
         parts = (to_x * to_y, np.where(to_y < 0, to_x, 0.0), np.where(to_x < 0, to_y, 0.0))
         own = np.eye(views.shape[1])[:, view.reshape(-1)] * gain
         low = corners.outside + np.where((to_x < 0) & (to_y < 0), gain, 0.0)
@@ -254,41 +256,41 @@ class _CornerViews:
         return cls(turns, views[1], views[2], np.concatenate([own * part for part in parts]), low)
 
     def see(self, footprint: Footprint) -> FloatArray:
-        """See with a footprint that no reading changes, (n_samples or 1, n_rows)."""
+        """Compute the responses to a footprint that is the same at all readings, (n_samples or 1, n_rows)."""
         weight, *moments = _samples_last(footprint)
         turn, x, y = (a[:, None, None] for a in (self.turn_rad, self.x_mm, self.y_mm))
         dx, dy, var_x, var_y, cov_xy = turned(turn, *moments)
         sd_x, sd_y = np.sqrt(var_x), np.sqrt(var_y)
         shares = beyond_corner((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
-        # From (n_views, n_gaussians, n_samples), the Gaussians summed up, to (3 n_views, n_samples).
+        # Sum over the Gaussians: (n_views, n_gaussians, n_samples) each -> (3 n_views, n_samples).
         beyond = np.concatenate([(share * weight).sum(axis=1) for share in shares])
         return np.asarray(beyond.T @ self.hand_out + self.low)
 
 
 def _varies(footprint: Footprint) -> bool:
-    """Whether its Gaussians, or what each holds of the light, change with the reading."""
+    """Whether the Gaussians or their weights change with the reading."""
     return any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
 
 
 def _samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
-    """Take weight and moments of a footprint that no reading changes, (n_gaussians, n_samples or 1) each."""
+    """Return weight and moments of a footprint that is the same at all readings, (n_gaussians, n_samples or 1) each."""
     return tuple(a[:, 0].T for a in (footprint.weight, *footprint.moments))
 
 
 def _projected(
     angle_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Project Gaussians on axes at these angles: 1/sd and mean; all broadcast."""
+    """Project Gaussians on axes at these angles; return 1/sd and mean; the arrays broadcast."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     variance = c * c * var_u + s * s * var_v + 2 * c * s * cov_uv
     return np.asarray(1 / np.sqrt(variance)), c * u_mm + s * v_mm
 
 
 def _rows_of(array: FloatArray, block: slice) -> FloatArray:
-    """Take a block of the hypotheses, of an array whose sample axis may be 1."""
+    """Select a block of hypotheses from an array whose sample axis may be 1."""
     return array if array.shape[0] == 1 else array[block]
 
 
 def columns_of(array: FloatArray, rows: IntArray) -> FloatArray:
-    """Take the columns of the readings `rows`, of an array whose point axis may be 1."""
+    """Select the columns of the readings `rows` from an array whose point axis may be 1."""
     return array if array.shape[1] == 1 else array[:, rows]

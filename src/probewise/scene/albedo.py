@@ -1,4 +1,4 @@
-"""The seams of what lies under the sensor: an area of albedo, a shape, a scene."""
+"""Protocols of what lies under the sensor: an albedo region, a shape, a scene."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["Region", "Scene", "Shape", "require_shape"]
 
 
 class Region(Protocol):
-    """An albedo field for each hypothesis: `n_regions` of them, 1 where it is the same for all.
+    """An albedo field for each hypothesis: `n_regions` of them, 1 where all share one.
 
-    Regions are small frozen values of batched geometry (scene/regions.py). The sensor
-    integrates them in closed form by their kind (sensor/gaussian.py) or, any region at all,
-    pixel by pixel through `coverage` (sensor/discrete.py).
+    Regions are small frozen values of batched geometry (scene/regions/). The sensor integrates
+    a region in closed form where its kind has one (sensor/gaussian.py), or pixel by pixel through
+    `coverage` (sensor/discrete.py).
     """
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         ...
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -35,11 +35,11 @@ class Region(Protocol):
 
 
 class Shape(Protocol):
-    """A hypothesis about what lies on the field: named parameters, a prior, and the region they make."""
+    """A hypothesis about what lies on the field: named parameters, their prior, and the region they define."""
 
     @property
     def prior(self) -> Prior:
-        """What is believed of its parameters before any reading; its names are the shape's parameters."""
+        """Prior of the shape's parameters, with their names."""
         ...
 
     def region(self, theta: FloatArray) -> Region:
@@ -48,7 +48,7 @@ class Shape(Protocol):
 
 
 class Scene(Protocol):
-    """All that lies under the sensor in one plan: a region for each pattern name."""
+    """What lies under the sensor in one plan: a region for each pattern name."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""From the pattern kinds of the recording format to regions."""
+"""Regions of the pattern kinds of the recording format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes: what lies under the sensor, known from a recording or hypothesised."""
+"""Scenes: what lies under the sensor, known from a recording's description or a hypothesis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["HypothesisScene", "KnownScene"]
 
 @dataclass(frozen=True)
 class KnownScene:
-    """Patterns that are known, by name: no free parameters."""
+    """Known patterns by name: no free parameters."""
 
     patterns: Mapping[str, Pattern]
 
@@ -39,7 +39,7 @@ class KnownScene:
         return Empty()
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Region by pattern name; theta (n_samples, 0) plays no part."""
+        """Region by pattern name; theta (n_samples, 0) is ignored."""
         return self._built
 
     @cached_property
@@ -49,7 +49,7 @@ class KnownScene:
 
 @dataclass(frozen=True)
 class HypothesisScene:
-    """One shape of unknown parameters under every reading, whatever its pattern's name."""
+    """One shape with unknown parameters under every reading, whatever the pattern's name."""
 
     shape: Shape
 
@@ -67,13 +67,13 @@ class HypothesisScene:
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Give the shape's region, theta (n_samples, n_params), under any pattern name."""
+        """Return the shape's region, theta (n_samples, n_params), under any pattern name."""
         return _SameForAll(self.shape.region(theta))
 
 
 @dataclass(frozen=True, eq=False)
 class _SameForAll(Mapping[str, Region]):
-    """A mapping that answers every name with one region; it lists the name "hypothesis"."""
+    """A mapping from every name to one region; it lists the name "hypothesis"."""
 
     region: Region
 

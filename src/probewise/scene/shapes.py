@@ -1,4 +1,4 @@
-"""Shapes that may lie on the field: each a prior over named parameters and the region they make.
+"""Shapes that may lie on the field: each a prior over named parameters and the region they define.
 
 A new shape is one short class: a frozen dataclass with `prior` and `region`.
 """
@@ -40,11 +40,11 @@ class Field:
 
 @dataclass(frozen=True)
 class Placed:
-    """Prior of a shape somewhere on a field: x_mm, y_mm, then the shape's own parameters.
+    """Prior of a shape anywhere on a field: x_mm, y_mm, then the shape's own parameters.
 
-    The own parameters follow `own`; the centre is spread evenly over the field or, given
+    The own parameters have the prior `own`. The centre is uniform over the field or, given
     `extent` (own parameters (n_samples, n_own) -> half width and half height (n_samples, 2)),
-    over those centres that leave the whole shape inside the field.
+    over the centres for which the whole shape lies inside the field.
     """
 
     field: Field
@@ -122,7 +122,7 @@ class Circle:
 
     @cached_property
     def prior(self) -> Placed:
-        """Even over centre and radius."""
+        """Uniform over centre and radius."""
         return Placed(
             self.field, Product({"radius_mm": Uniform(*self.radius_mm)}), _round_extent if self.inside else None
         )
@@ -134,7 +134,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class _EllipseOwn:
-    """Semi-major axis even, semi-minor even below it, angle even over half a turn."""
+    """Uniform semi-major axis, semi-minor axis uniform below it, angle uniform over half a turn."""
 
     bounds_mm: Bounds
 
@@ -182,7 +182,7 @@ class Ellipse:
 
     @cached_property
     def prior(self) -> Placed:
-        """Even over centre, major axis and angle; the minor axis even below the major."""
+        """Uniform over centre, major axis and angle; the minor axis uniform below the major."""
         return Placed(self.field, _EllipseOwn(self.semi_axes_mm), _ellipse_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> EllipseRegion:
@@ -200,7 +200,7 @@ def _rectangle_extent(own: FloatArray) -> FloatArray:
 class Rectangle:
     """A rectangle: x_mm, y_mm of its centre, width_mm, height_mm, angle_rad of its width, 0 to pi/2.
 
-    Width and height may each be the longer; a quarter of a turn then names every rectangle once.
+    Either side may be the longer, so that angles over a quarter turn describe every rectangle once.
     """
 
     field: Field = Field()
@@ -214,7 +214,7 @@ class Rectangle:
 
     @cached_property
     def prior(self) -> Placed:
-        """Even over all five parameters."""
+        """Uniform over all five parameters."""
         side = Uniform(*self.sides_mm)
         own = Product({"width_mm": side, "height_mm": side, "angle_rad": Uniform(0.0, np.pi / 2)})
         return Placed(self.field, own, _rectangle_extent if self.inside else None)
@@ -242,7 +242,7 @@ class RegularPolygon:
 
     @cached_property
     def prior(self) -> Placed:
-        """Even over centre, radius, and angle up to the polygon's symmetry."""
+        """Uniform over centre, radius, and angle within the polygon's symmetry."""
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
         return Placed(self.field, own, self._extent if self.inside else None)
 
@@ -256,13 +256,12 @@ class RegularPolygon:
         return np.stack([np.cos(t), np.sin(t)], axis=-1)
 
     def _extent(self, own: FloatArray) -> FloatArray:
-        # The circle round it: a polygon needs a little less on some sides, and the centre stays
-        # the middle of the room that is left.
+        # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
         return _round_extent(own)
 
 
 def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: FloatArray) -> PolygonRegion:
-    """Polygons with corners (n_samples, n_vertices, 2), anticlockwise about the centre."""
+    """Turn polygons with corners (n_samples, n_vertices, 2) anticlockwise about the centre."""
     cosine, sine = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
     x = center_mm[:, :1] + cosine * corners_mm[..., 0] - sine * corners_mm[..., 1]
     y = center_mm[:, 1:] + sine * corners_mm[..., 0] + cosine * corners_mm[..., 1]
@@ -276,15 +275,15 @@ SHAPES: Mapping[str, Callable[[Field], Shape]] = {
     "triangle": lambda field: RegularPolygon(3, field),
     "hexagon": lambda field: RegularPolygon(6, field),
 }
-"""What may be asked for by name, on any field."""
+"""Shapes by name, as the command line offers them; each takes the field it lies on."""
 
 
 @dataclass(frozen=True)
 class _AnyOfPrior:
-    """Product space: which shape, the shared centre, then the own parameters of every shape.
+    """Product-space prior: the shape's index, the shared centre, then the own parameters of every shape.
 
-    The parameters of the shapes that are not taken follow their own priors, so evidences and
-    the share of each shape stay right.
+    The parameters of the shapes not selected follow their own priors, so evidences and the
+    posterior probability of each shape are correct.
     """
 
     shapes: Mapping[str, Shape]
@@ -298,7 +297,7 @@ class _AnyOfPrior:
 
     @cached_property
     def columns(self) -> list[IntArray]:
-        """Columns of theta that hold the parameters of each shape, in the shape's order."""
+        """Columns of theta with the parameters of each shape, in the shape's order."""
         return [
             np.array([self.names.index(n if n in self.shared else f"{key}.{n}") for n in shape.prior.names], dtype=int)
             for key, shape in self.shapes.items()
@@ -313,7 +312,7 @@ class _AnyOfPrior:
         which = self.which(theta)
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
             values = shape.prior.from_unit_cube(u[:, columns])
-            # Every shape fills its own columns; the shared ones are filled by the shape that is taken.
+            # Every shape fills its own columns; the selected shape fills the shared ones.
             own = columns > len(self.shared)
             theta[:, columns[own]] = values[:, own]
             taken = which == k
@@ -345,18 +344,18 @@ class _AnyOfPrior:
         return total
 
     def which(self, theta: FloatArray) -> IntArray:
-        """Index of the shape that each hypothesis takes, (n_samples,)."""
+        """Index of each hypothesis' shape, (n_samples,)."""
         return np.clip(np.floor(theta[:, 0]), 0, len(self.shapes) - 1).astype(np.int64)
 
 
 @dataclass(frozen=True)
 class AnyOf:
-    """One of several shapes, which and where unknown (the paper's "set of shapes").
+    """One of several shapes, unknown which and where (the paper's "set of shapes").
 
-    Parameters: `shape`, whose floor is the index of the shape (continuous, so that a sampler
-    moves through it like any other: even over [k, k + 1) for shape k, with probability
-    `weights[k]`); x_mm, y_mm of the centre, shared where every shape has a `Placed` prior; then
-    each shape's own as "rectangle.width_mm".
+    Parameters: `shape`, whose floor is the index of the shape (continuous, so that a sampler can treat
+    it like any other: uniform over [k, k + 1) for shape k, which has prior probability `weights[k]`);
+    x_mm, y_mm of the centre, shared where every shape has a `Placed` prior; then each shape's own
+    parameters, as "rectangle.width_mm".
     """
 
     shapes: Mapping[str, Shape]
@@ -375,7 +374,7 @@ class AnyOf:
 
     @cached_property
     def prior(self) -> _AnyOfPrior:
-        """Product of which, where, and the parameters of every shape."""
+        """Prior of index, centre, and the parameters of every shape."""
         placed = all(isinstance(shape.prior, Placed) for shape in self.shapes.values())
         return _AnyOfPrior(self.shapes, self.weights, ("x_mm", "y_mm") if placed else ())
 
@@ -385,15 +384,15 @@ class AnyOf:
         return tuple(self.shapes)
 
     def which(self, theta: FloatArray) -> IntArray:
-        """Index of the shape of each hypothesis, (n_samples,)."""
+        """Index of each hypothesis' shape, (n_samples,)."""
         return self.prior.which(theta)
 
     def region(self, theta: FloatArray) -> MixtureOfRegions:
-        """Build for each hypothesis the region of the shape it takes."""
+        """Build the region of each hypothesis' shape."""
         which = self.which(theta)
         parts: list[Region] = []
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns, strict=True)):
             rows = np.flatnonzero(which == k)
-            # A shape that no hypothesis takes has no region; an empty field stands in its place.
+            # An empty field stands in for a shape that no hypothesis selects.
             parts.append(shape.region(theta[np.ix_(rows, columns)]) if rows.size else UniformRegion(np.zeros(1)))
         return MixtureOfRegions(which, tuple(parts))

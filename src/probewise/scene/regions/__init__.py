@@ -1,8 +1,8 @@
-"""Areas of albedo, one for each hypothesis: small frozen values of batched geometry, one kind a file.
+"""Albedo regions, one per hypothesis: small frozen values of batched geometry, one kind per file.
 
-A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. In the same file it may register how far
-its edge is (`edge_distance`) and, where that is closed, its trace (`outlines`); with a closed form registered at
-`sensor.gaussian.seen_by_one` a footprint over it costs microseconds in place of milliseconds.
+A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. In the same file it may register the
+distance to its edge (`edge_distance`) and, where that is closed, its outline (`outlines`); a closed form registered
+with `sensor.gaussian.seen_by_one` makes a footprint over it cost microseconds instead of milliseconds.
 """
 
 from probewise.scene.regions.ellipse import EllipseRegion, disc_region

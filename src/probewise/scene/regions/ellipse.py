@@ -1,4 +1,4 @@
-"""Ellipses, and discs among them (paper, eq. 1)."""
+"""Ellipses and discs (paper, eq. 1)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["EllipseRegion", "disc_region"]
 
 @dataclass(frozen=True, eq=False)
 class EllipseRegion:
-    """Inside an ellipse; a disc has equal semi-axes (paper, eq. 1).
+    """The inside of an ellipse; a disc has equal semi-axes (paper, eq. 1).
 
     `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis)
     (n_regions,).
@@ -34,7 +34,7 @@ class EllipseRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.angle_rad)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -43,11 +43,11 @@ class EllipseRegion:
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, the edge taken as its tangent: (n_regions, n_points)."""
+        """Mean albedo over turned square pixels, the edge approximated by its tangent: (n_regions, n_points)."""
         p, q = self._unit(centers_mm)
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         level = np.hypot(p, q)
-        # Gradient of the level sqrt(p^2 + q^2), zero only at the centre where no pixel sees the edge.
+        # Gradient of the level sqrt(p^2 + q^2); it is zero only at the centre, far from the edge.
         along, across = p / a, q / b
         steepness = np.hypot(along, across) / np.maximum(level, 1e-12)
         distance = (1 - level) / np.maximum(steepness, 1e-12)

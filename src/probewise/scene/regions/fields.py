@@ -1,4 +1,4 @@
-"""The fields of a batch of regions: checked, frozen, one length for all."""
+"""Checks of the fields of a batch of regions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["batch", "require_positive"]
 
 
 def batch(region: object, **shapes: tuple[int, ...]) -> None:
-    """Freeze the named fields to (n_regions, *shape), one n_regions for all."""
+    """Broadcast the named fields to (n_regions, *shape), check that they are finite, and freeze them."""
     arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
     lengths = set()
     for name, shape in shapes.items():

@@ -1,4 +1,4 @@
-"""What is asked of any region's geometry beside its albedo; a kind registers its answers in its own file."""
+"""Geometry of a region besides its albedo: generic functions that each kind registers in its own file."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ __all__ = ["edge_distance", "outlines"]
 
 @singledispatch
 def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
-    """Trace the closed edge of each hypothesis, for drawing, painting, and to know where it can be seen.
+    """Trace the closed edge of each hypothesis, for drawing, rasterising and culling.
 
     Parameters
     ----------
     region
-        Ellipses, polygons, a set of these, or any kind that registers its trace (`outlines.register`).
+        Ellipses, polygons, a mixture of these, or any kind that registers its outline (`outlines.register`).
     n_vertices
-        Vertices of the trace of a curved edge.
+        Number of vertices of a curved edge.
 
     Returns
     -------
-    One array (n, 2) a hypothesis, mm, the first vertex repeated at the end; pieces of a
+    One array (n, 2) per hypothesis, mm, the first vertex repeated at the end; pieces of a
     polygon that crosses itself are separated by NaN.
 
     Raises
@@ -44,13 +44,13 @@ def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatAr
     Parameters
     ----------
     region
-        Of n_regions hypotheses; infinitely far where its kind has no edge (uniform, a ramp, an image).
+        A region of n_regions hypotheses; the distance is infinite for kinds without edges (uniform, ramp, image).
     x_mm, y_mm
         Places, (n_samples or 1, n_points).
 
     Returns
     -------
-    Distances, (n_samples or n_regions or 1, n_points). Of an ellipse to first order in the distance; of
-    a disc exactly.
+    Distances, (n_samples or n_regions or 1, n_points): to first order in the distance for an ellipse,
+    exact for a disc.
     """
     return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)

@@ -1,4 +1,4 @@
-"""Two halves with a straight edge between them (paper, S_BW)."""
+"""Half-planes: black and white on either side of a straight edge (paper, S_BW)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["HalfPlaneRegion"]
 
 @dataclass(frozen=True, eq=False)
 class HalfPlaneRegion:
-    """Inside where x cos(normal) + y sin(normal) > offset (paper, S_BW); fields (n_regions,)."""
+    """The half-plane x cos(normal) + y sin(normal) > offset (paper, S_BW); fields (n_regions,)."""
 
     normal_rad: FloatArray
     offset_mm: FloatArray
@@ -28,7 +28,7 @@ class HalfPlaneRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.offset_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:

@@ -44,7 +44,7 @@ class ImageRegion:
         return self._at(points_mm[:, 0], points_mm[:, 1])[None]
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, in strips along x: exact where they are not turned."""
+        """Mean albedo over turned square pixels, summed in strips along x: exact for pixels that are not turned."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         steep, flat = np.maximum(np.abs(cosine), 1e-9), np.maximum(np.abs(sine), 1e-9)
         half = 0.5 * pixel_mm
@@ -54,7 +54,7 @@ class ImageRegion:
         for k in range(n_strips):
             low, high = (2 * k / n_strips - 1) * height, (2 * (k + 1) / n_strips - 1) * height
             y = 0.5 * (low + high)
-            # The square is where |c x + s y| and |c y - s x| are at most half a side.
+            # Inside the square |c x + s y| and |c y - s x| are at most half a side.
             middle_1, middle_2 = -sine * y * cosine / steep**2, cosine * y * sine / flat**2
             left = np.maximum(middle_1 - half / steep, middle_2 - half / flat)
             right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
@@ -67,13 +67,13 @@ class ImageRegion:
 
     @cached_property
     def _cumulative(self) -> FloatArray:
-        """Sums of all pixels to the lower left of each corner, (n_rows + 1, n_columns + 1), from below."""
+        """Summed-area table: sums of the pixels to the lower left of each corner, (n_rows + 1, n_columns + 1)."""
         padded = np.zeros((self.values.shape[0] + 1, self.values.shape[1] + 1))
         padded[1:, 1:] = self.values[::-1].cumsum(axis=0).cumsum(axis=1)
         return padded
 
     def _summed(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Integral of the albedo over all that lies to the lower left, mm^2."""
+        """Integral of the albedo over the quadrant to the lower left, mm^2."""
         n_rows, n_columns = self.values.shape
         u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
         v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)

@@ -1,4 +1,4 @@
-"""A region of another kind for each hypothesis."""
+"""Regions whose kind may differ between hypotheses."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["MixtureOfRegions"]
 
 @dataclass(frozen=True, eq=False)
 class MixtureOfRegions:
-    """A region of another kind for each hypothesis: a set of shapes.
+    """Regions whose kind may differ between hypotheses, as for a set of shapes.
 
-    `which`, shape (n_regions,), names the part that each hypothesis takes; part k holds, in
-    order, the regions of the hypotheses with which == k (its own n_regions of them).
+    `which`, shape (n_regions,), is the index of each hypothesis' part; part k holds, in
+    order, the regions of the hypotheses with which == k.
     """
 
     which: IntArray
@@ -33,15 +33,15 @@ class MixtureOfRegions:
             if wanted and part.n_regions != wanted:
                 raise ShapeError(f"part {k} holds {part.n_regions} regions; allowed: {wanted}, as which == {k}")
         if which.ndim != 1 or (which.size and (which.min() < 0 or which.max() >= len(self.parts))):
-            raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one a hypothesis")
+            raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one per hypothesis")
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds."""
+        """Number of hypotheses."""
         return len(self.which)
 
     def rows(self) -> list[tuple[IntArray, Region]]:
-        """Rows of the hypotheses of each kind that occurs, with their regions."""
+        """Pairs of the rows of the hypotheses of each part and their region, for the parts that occur."""
         pairs = [(np.flatnonzero(self.which == k), part) for k, part in enumerate(self.parts)]
         return [(rows, part) for rows, part in pairs if rows.size]
 

@@ -1,4 +1,4 @@
-"""Polygons, simple ones in batches or one that may cross itself."""
+"""Polygons: batches of simple ones, or a single one that may cross itself."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ __all__ = ["PolygonRegion"]
 
 @dataclass(frozen=True, eq=False)
 class PolygonRegion:
-    """Inside a polygon given by its directed edges, the inside on their left.
+    """The inside of a polygon, given by its directed edges, with the inside on their left.
 
-    `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it by `simple` from vertices of
-    polygons that do not cross themselves, or by `even_odd` from one polygon that may.
+    `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it with `simple` from the vertices of
+    polygons that do not cross themselves, or with `even_odd` from one polygon that may.
     """
 
     edges_mm: FloatArray
@@ -34,7 +34,7 @@ class PolygonRegion:
 
     @classmethod
     def simple(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
-        """Build from vertices (n_regions, n_vertices, 2), in either sense; edges must not cross."""
+        """Build from vertices (n_regions, n_vertices, 2), clockwise or anticlockwise; edges must not cross."""
         vertices = np.asarray(vertices_mm, dtype=np.float64)
         if vertices.ndim != 3 or vertices.shape[1] < 3 or vertices.shape[2] != 2:
             raise ShapeError(f"vertices_mm has shape {vertices.shape}; allowed: (n_regions, 3 or more, 2)")
@@ -46,10 +46,10 @@ class PolygonRegion:
 
     @classmethod
     def even_odd(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
-        """Build one region from vertices (n_vertices, 2) that may cross themselves.
+        """Build one region from the vertices (n_vertices, 2) of a polygon that may cross itself.
 
-        Edges are split where they meet; each piece that has the inside (even-odd rule) on one
-        side only is kept, and directed so that it lies on its left.
+        Edges are split where they meet; pieces with the inside (even-odd rule) on exactly one
+        side are kept, directed so that the inside is on their left.
         """
         vertices = np.asarray(vertices_mm, dtype=np.float64)
         if vertices.ndim != 2 or len(vertices) < 3 or vertices.shape[1] != 2:
@@ -59,7 +59,7 @@ class PolygonRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.edges_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -73,7 +73,7 @@ class PolygonRegion:
 
 
 def _crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArray:
-    """How many edges a ray to the right of each point crosses, (n_regions, n_points)."""
+    """Count the edges that a ray to the right of each point crosses, (n_regions, n_points)."""
     x, y = points_mm[:, 0], points_mm[:, 1]
     count = np.zeros((len(edges_mm), len(points_mm)), dtype=np.int64)
     for k in range(edges_mm.shape[1]):

@@ -1,4 +1,4 @@
-"""A corner of a quadrant (paper, S_a to S_d)."""
+"""Quadrants: a corner between two axis-parallel edges (paper, S_a to S_d)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["QuadrantRegion"]
 
 @dataclass(frozen=True, eq=False)
 class QuadrantRegion:
-    """Inside where (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
+    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
 
     `corner_mm` and `direction` (entries +1 or -1) have shape (n_regions, 2).
     """
@@ -34,7 +34,7 @@ class QuadrantRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.corner_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -57,5 +57,5 @@ class QuadrantRegion:
 def _(region: QuadrantRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     right = (x_mm - region.corner_mm[:, :1]) * region.direction[:, :1]
     above = (y_mm - region.corner_mm[:, 1:]) * region.direction[:, 1:]
-    # Two rays from the corner: to the right, and up.
+    # The edges are two rays from the corner: to the right, and up.
     return np.minimum(np.hypot(np.minimum(right, 0), above), np.hypot(right, np.minimum(above, 0)))

@@ -1,4 +1,4 @@
-"""An albedo that rises evenly along a line."""
+"""A linear gradient of albedo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["RampRegion"]
 
 @dataclass(frozen=True, eq=False)
 class RampRegion:
-    """Albedo per_mm (x . n), not bounded; fields (n_regions,)."""
+    """Albedo per_mm (x . n), unbounded; fields (n_regions,)."""
 
     normal_rad: FloatArray
     per_mm: FloatArray
@@ -24,7 +24,7 @@ class RampRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.per_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -33,5 +33,5 @@ class RampRegion:
         return self.per_mm[:, None] * (points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal))
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels: that of their centres, exactly."""
+        """Mean albedo over turned square pixels: exactly the value at their centres."""
         return self.albedo(centers_mm)

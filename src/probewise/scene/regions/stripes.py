@@ -18,7 +18,7 @@ __all__ = ["StripesRegion"]
 
 @dataclass(frozen=True, eq=False)
 class StripesRegion:
-    """Inside where frac((x . n - phase) / period) < duty; fields (n_regions,)."""
+    """Stripes where frac((x . n - phase) / period) < duty; fields (n_regions,)."""
 
     normal_rad: FloatArray
     period_mm: FloatArray
@@ -35,7 +35,7 @@ class StripesRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.period_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -50,7 +50,7 @@ class StripesRegion:
         along = along - period * np.floor(along / period)
         angle = self.normal_rad[:, None] - turn_rad
         share = np.zeros_like(along)
-        # Half a pixel's diagonal is 0.71 pixels: periods further away are seen whole or not at all.
+        # Half a pixel's diagonal is 0.71 pixels: edges further away do not cut the pixel.
         reach = 1 + math.ceil(0.75 * pixel_mm / float(self.period_mm.min()))
         for k in range(-reach, reach + 1):
             start = k * period

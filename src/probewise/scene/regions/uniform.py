@@ -1,4 +1,4 @@
-"""The same albedo everywhere."""
+"""Uniform albedo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["UniformRegion"]
 
 @dataclass(frozen=True, eq=False)
 class UniformRegion:
-    """The same albedo everywhere: `level`, shape (n_regions,)."""
+    """A uniform albedo `level`, shape (n_regions,)."""
 
     level: FloatArray
 
@@ -23,7 +23,7 @@ class UniformRegion:
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 where all share one region."""
         return len(self.level)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:

@@ -18,11 +18,11 @@ _SUFFIX = ".part"
 
 
 def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None:
-    """Replace the file at `path` by `content` in one step, so that no reader ever sees half of it.
+    """Replace the file at `path` by `content` atomically.
 
     The bytes go to a temporary file in the same folder (a rename across file systems is not
-    atomic), reach the disk, and then take the name. Temporary files that killed processes
-    left there under this name are removed.
+    atomic), are synced to disk, and the file is renamed. Temporary files of this name left by
+    killed processes are removed.
 
     Raises
     ------
@@ -42,13 +42,13 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
             ) from error
         try:
             with os.fdopen(handle, "wb", buffering=0) as file:
-                with contextlib.suppress(OSError):  # where there are no locks, others may take it for abandoned
+                with contextlib.suppress(OSError):  # a file system without locks: others may remove the file
                     try_lock(handle)
                 left_over = memoryview(content)
                 while left_over:
                     left_over = left_over[file.write(left_over) :]
                 os.fsync(handle)
-            # mkstemp makes the file private; a result is for everybody the folder's mask allows.
+            # mkstemp makes the file private; give it the permissions of an ordinary new file.
             mask = os.umask(0)
             os.umask(mask)
             os.chmod(temporary, 0o666 & ~mask)
@@ -61,7 +61,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
 
 
 def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:
-    """Replace the file at `path` by `text` in UTF-8, line ends as they stand, in one step.
+    """Replace the file at `path` by `text` in UTF-8 atomically, with line ends unchanged.
 
     Raises
     ------

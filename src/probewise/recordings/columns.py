@@ -1,4 +1,4 @@
-"""Columns as people hold them, arrays, lists, tables, turned into what a plan holds: codes, names, numbers."""
+"""Convert a user's columns (arrays, lists, tables) to a plan's numbers, codes and names."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
-_THE_ONLY = "pattern"  # its name, where none was given
+_THE_ONLY = "pattern"  # name of a single pattern that was given without one
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
 
 
@@ -47,7 +47,7 @@ class Table(Protocol):
 
 
 def columns_of(table: Table) -> dict[str, Any]:
-    """Take a table's columns by name.
+    """Return a table's columns by name.
 
     Raises
     ------
@@ -63,14 +63,14 @@ def columns_of(table: Table) -> dict[str, Any]:
 
 
 def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
-    """Take one number a reading, shape (n_points,); a single number stands for all where `n_points` is known.
+    """Check one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
 
     Raises
     ------
     ParameterError
-        If there is anything but numbers.
+        If a value is not a number.
     ShapeError
-        If there is not one a reading.
+        If the length is not n_points.
     """
     out = floats(values, name)
     if out.ndim == 0 and n_points is not None:
@@ -83,9 +83,9 @@ def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatAr
 
 
 def with_missing(values: ArrayLike) -> ArrayLike:
-    """Take texts in a column as a file has them: numbers, and "", "nan", "n/a" and the like where one is missing.
+    """Parse texts in a column as in a file: numbers, and "", "nan", "n/a" and the like for missing ones.
 
-    What holds no such text is handed back as it is, and so is what holds a text that is neither.
+    A column without texts, or with a text that is neither, is returned unchanged.
     """
     cells = values if isinstance(values, str) else np.asarray(values)
     if isinstance(cells, str) or cells.ndim != 1 or cells.dtype.kind not in "OUT":
@@ -104,7 +104,7 @@ def _number_or_missing(cell: Any) -> Any:
 
 
 def seconds(values: ArrayLike) -> ArrayLike:
-    """Turn dates into seconds since the first; numbers are handed back as they are."""
+    """Convert dates to seconds since the first; numbers are returned unchanged."""
     array = np.asarray(values)
     cells = array.tolist() if array.dtype == np.object_ and array.ndim == 1 else []
     if cells and all(isinstance(cell, datetime.datetime) for cell in cells):
@@ -115,7 +115,7 @@ def seconds(values: ArrayLike) -> ArrayLike:
 
 
 def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    """Keep the columns of numbers that a plan has no place for; also notes on those that are left out."""
+    """Return the numeric columns that are not a plan's own fields, and notes on the columns that are ignored."""
     out, notes = {}, []
     for name, values in columns.items():
         if name in _KNOWN:
@@ -128,7 +128,7 @@ def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArra
 
 
 def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
-    """Count scans up at every change of name, as files do: one that returns later is a new scan.
+    """Assign scan numbers: every change of name begins a new scan, even if the name occurred before.
 
     Returns
     -------
@@ -144,12 +144,12 @@ def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[Int
 
 
 def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
-    """Take patterns by name, or one that lies under every reading.
+    """Return patterns by name; a single pattern lies under every reading.
 
     Raises
     ------
     ParameterError
-        If there is none, or something else than a pattern.
+        If there is none, or one is not a pattern.
     """
     by_name = patterns if isinstance(patterns, Mapping) else {_THE_ONLY: patterns}
     if not by_name:
@@ -160,26 +160,26 @@ def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Patte
 
 
 def require_patterns(patterns: Mapping[str, Pattern]) -> None:
-    """Raise ParameterError where something is no pattern, such as the fields of one in a dict."""
+    """Raise ParameterError unless every value is a pattern; a dict of a pattern's fields is the usual mistake."""
     for name, pattern in patterns.items():
         if not isinstance(pattern, PATTERNS):
             raise ParameterError(f"patterns[{name!r}]", pattern, _A_PATTERN)
 
 
 def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:
-    """Give each reading the number of its pattern, (n_points,): its place in `patterns`.
+    """Return the index in `patterns` of each reading's pattern, (n_points,).
 
     Raises
     ------
     ParameterError
-        If a name is not described, or there are several patterns and nobody says which lay where.
+        If a name is not described, or there are several patterns and no names.
     """
     known = list(patterns)
     if names is None:
         if len(known) > 1:
             listed = ", ".join(map(repr, known))
             raise ParameterError(
-                "pattern", None, f"the name of each reading's pattern, for there are several: {listed}"
+                "pattern", None, f"the name of each reading's pattern, since there are several: {listed}"
             )
         return np.zeros(n_points, dtype=np.int64)
     cells = [names] * n_points if isinstance(names, str) else _texts("pattern", names, n_points)
@@ -191,14 +191,14 @@ def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, P
 
 
 def undescribed(name: str, known: Sequence[str]) -> str:
-    """Say what to do about a pattern that is named but not described."""
+    """Say, for an error message, what to do about a pattern that is named but not described."""
     listed = ", ".join(map(repr, known)) or "none"
     return f"one that is described ({listed}); {name!r} is named but not described: pass patterns={{{name!r}: ...}}"
 
 
 def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
     if not isinstance(values, Iterable):
-        raise ParameterError(name, values, "a text, or one a reading")
+        raise ParameterError(name, values, "a text, or one per reading")
     cells = list(values)
     if len(cells) != n_points:
         raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one per reading, or a single text")
@@ -209,5 +209,5 @@ def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
 
 
 def _is_missing(cell: object) -> bool:
-    """Tell None, NaN, and what a data frame has in their place."""
+    """Whether a cell is None, NaN, or a data frame's marker of a missing value."""
     return cell is None or (isinstance(cell, float) and math.isnan(cell)) or str(cell) in ("<NA>", "NaT")

@@ -1,4 +1,4 @@
-"""NAME.json: what the readings of NAME.csv are readings of."""
+"""The description of a recording, NAME.json: instrument, patterns and controls."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
 
 @dataclass(frozen=True)
 class Description:
-    """A description as read: the instrumentation, the patterns by name, what was not used."""
+    """A parsed description: instrumentation, patterns by name, and notes on fields that are ignored."""
 
     instrumentation: Instrumentation
     patterns: Mapping[str, Pattern]
@@ -45,10 +45,10 @@ class Description:
 
 
 def degrees_of(angle_rad: float) -> float:
-    """Convert to degrees such that reading them back gives the same radians, in the fewest digits.
+    """Convert to the degrees of fewest digits that convert back to exactly the same radians.
 
-    Radians are what the package works with and degrees what its files hold; a plain conversion
-    there and back can move an angle by a rounding error.
+    The package works in radians and its files hold degrees; a plain conversion there and back
+    can change an angle by a rounding error.
     """
     plain = math.degrees(angle_rad)
     candidates = [round(plain, digits) for digits in range(16)]
@@ -57,7 +57,7 @@ def degrees_of(angle_rad: float) -> float:
 
 
 class _Fields:
-    """One JSON object, its fields checked one by one; every message says where the field stands."""
+    """A JSON object whose fields are checked as they are read; messages give the field's path."""
 
     def __init__(self, path: Path, where: str, content: object) -> None:
         if not isinstance(content, dict):
@@ -158,11 +158,11 @@ def _ramp(f: _Fields) -> Pattern:
 
 def _image(f: _Fields) -> Pattern:
     name = f.text("file", "the name of a PNG or .npy file in the same folder")
-    # A recording must not make its reader open files anywhere else on the disk.
+    # Security: a recording may only refer to files in its own folder.
     if not name or name in (".", "..") or PurePosixPath(name).name != name or PureWindowsPath(name).name != name:
         raise f.fail("file", name, "the name of a PNG or .npy file in the same folder, without a path")
     picture = f.path.parent / name
-    if not picture.is_file():  # said of the JSON that asks for it, not of a file that nobody named
+    if not picture.is_file():  # the error names the JSON that refers to the picture
         raise f.fail("file", name, "the name of a PNG or .npy file that lies in the same folder")
     return Image(read_image(picture), f.positive("pixel_mm"), f.pair("origin_mm"), name)
 
@@ -195,7 +195,7 @@ def read_description(path: Path) -> Description:
     Raises
     ------
     FileError
-        If it is missing, does not parse, or a field is missing or not what it should be.
+        If it is missing, does not parse, or a field is missing or invalid.
     """
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     content = json_of(path, text, "strict JSON, each name once")
@@ -248,12 +248,12 @@ def _instrumentation(top: _Fields) -> Instrumentation:
 
 
 def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:
-    """Write NAME.json, numbers in full precision.
+    """Return the text of NAME.json, with numbers in full precision.
 
     Raises
     ------
     ParameterError
-        If a pattern is of a kind that the format does not have.
+        If the format does not have a pattern's kind.
     """
     inst = instrumentation
     reading = {"unit": inst.unit, "min": inst.min, "max": inst.max, "step": inst.step}
@@ -278,7 +278,7 @@ def _pattern_fields(pattern: Pattern) -> dict[str, object]:
     for field in fields(pattern):
         value = getattr(pattern, field.name)
         if isinstance(value, np.ndarray):
-            continue  # an image's pixels stand in their own file
+            continue  # an image's pixels are in their own file
         if field.name.endswith("_rad"):
             out[field.name.removesuffix("_rad") + "_deg"] = degrees_of(value)
         elif field.name not in ("inside", "outside") or value != field.default:

@@ -1,4 +1,4 @@
-"""Recordings and plans on disk: NAME.csv with the rows, NAME.json beside it with what they are readings of."""
+"""Files of recordings and plans: NAME.csv with the rows, NAME.json with their description."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recordin
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
-_FAR_AWAY = 100.0  # times as far as nine in ten of all places lie apart
+_FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
 
 
 def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
-    """Read a recording, NAME.csv with NAME.json beside it.
+    """Read a recording: NAME.csv, and NAME.json beside it.
 
     Missing readings become NaN, readings outside the declared range keep their value; both are
-    counted in the notes and not `usable`. `progress` is told as rows come in.
+    counted in the notes and are not `usable`. `progress` is called as rows are read.
 
     Raises
     ------
     FileError
-        If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
+        If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
     plan, readings, notes = _read(_named(path), progress)
     if readings is None:
@@ -55,35 +55,35 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
 
 
 def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
-    """Read a plan; a recording is accepted too, its readings play no part.
+    """Read a plan, or the plan of a recording.
 
     Raises
     ------
     FileError
-        If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
+        If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
     return _read(_named(path), progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
-    """Read a plan or a recording, whichever it is: the plan, and the readings (n_points,) or None.
+    """Read a plan or a recording: return the plan, and the readings (n_points,) or None.
 
     Raises
     ------
     FileError
-        If either file cannot be used; it names the file, row, column, what stood there and what is allowed.
+        If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
     plan, readings, _ = _read(_named(path), progress)
     return plan, readings
 
 
 def write_recording(recording: Recording, path: PathLike) -> None:
-    """Write NAME.csv and NAME.json (and the images it shows), each at once or not at all, in full precision.
+    """Write NAME.csv, NAME.json and the images of its patterns, each file atomically, in full precision.
 
     Raises
     ------
     ParameterError
-        If the recording holds what the format cannot say (an unknown pattern, a name with line ends).
+        If the format cannot hold the recording (an unknown pattern, a name with line ends).
     FileError
         If the files cannot be written.
     """
@@ -95,12 +95,12 @@ def write_recording(recording: Recording, path: PathLike) -> None:
 
 
 def write_plan(plan: Plan, path: PathLike) -> None:
-    """Write a plan as NAME.csv and NAME.json (and the images it shows), each at once or not at all.
+    """Write a plan as NAME.csv, NAME.json and the images of its patterns, each file atomically.
 
     Raises
     ------
     ParameterError
-        If the plan holds what the format cannot say (an unknown pattern, a name with line ends).
+        If the format cannot hold the plan (an unknown pattern, a name with line ends).
     FileError
         If the files cannot be written.
     """
@@ -109,12 +109,12 @@ def write_plan(plan: Plan, path: PathLike) -> None:
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
-    """Write out the rows of a plan as cells by column, in full precision.
+    """Format the rows of a plan as cells by column, in full precision.
 
     Raises
     ------
     ParameterError
-        If the plan holds what the format cannot say.
+        If the format cannot hold the plan.
     """
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         if name != name.strip() or not name.isprintable():
@@ -123,7 +123,9 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     if clash:
         raise ParameterError("covariate", clash[0], "a name that is no column of the format")
     if np.any(np.diff(plan.scan) < 0):
-        raise ParameterError("scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in order of taking")
+        raise ParameterError(
+            "scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in the order they were taken"
+        )
     names = _distinct_neighbours(plan)
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
@@ -137,7 +139,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
 
 
 def _named(path: object) -> Path:
-    """Take the name of a file; a table in memory is the usual mistake."""
+    """Return a file name as a Path; a table in memory is the usual mistake."""
     allowed = (
         "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"
     )
@@ -145,7 +147,7 @@ def _named(path: object) -> Path:
 
 
 def _in_degrees(angles_rad: FloatArray) -> list[str]:
-    distinct, which = np.unique(angles_rad, return_inverse=True)  # few, and each takes a search
+    distinct, which = np.unique(angles_rad, return_inverse=True)  # few: each conversion is a search
     cells = [number_text(degrees_of(angle)) for angle in distinct.tolist()]
     return [cells[k] for k in which.reshape(-1).tolist()]
 
@@ -158,7 +160,7 @@ def _cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]
 
 
 def _distinct_neighbours(plan: Plan) -> dict[int, str]:
-    """Name the scans that have rows so that two following one another never look like one."""
+    """Return the scans' names, made distinct where consecutive scans share one: a file would join them."""
     names: dict[int, str] = {}
     last = ""
     for k in np.unique(plan.scan):
@@ -179,7 +181,7 @@ def _write(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
     text = description_text(plan.instrumentation, plan.patterns)
     images = [p for p in plan.patterns.values() if isinstance(p, Image)]
     contents = [(path.parent / image.file, image_bytes(image.albedo, Path(image.file).suffix)) for image in images]
-    # The CSV comes last: where it stands, everything that it needs stands too.
+    # The CSV comes last: if it exists, everything it needs exists too.
     for image_path, content in contents:
         write_bytes_atomically(image_path, content)
     write_text_atomically(path.with_suffix(".json"), text)
@@ -192,7 +194,7 @@ def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list
     table = read_table(path, progress=progress)
     table.require("x_mm", "y_mm")
     if not len(table):
-        raise FileError(path, "there is no reading at all, only a header", "one row a reading")
+        raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))
     notes = list(description.notes)
     scan, scan_names = _scans(table)
@@ -220,7 +222,7 @@ def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list
 
 
 def _far_away(table: Table, name: str, places_mm: FloatArray) -> list[str]:
-    """Note a place that is so far from all others that it looks mistyped."""
+    """Return a note on a place so far from all others that it looks mistyped."""
     low, middle, high = np.quantile(places_mm, [0.05, 0.5, 0.95])
     k = int(np.argmax(np.abs(places_mm - middle)))
     if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
@@ -230,13 +232,13 @@ def _far_away(table: Table, name: str, places_mm: FloatArray) -> list[str]:
 
 def _readings(table: Table, description: Description) -> FloatArray:
     inst = description.instrumentation
-    # With a range declared, a huge number is merely outside it; without one it would spoil every sum.
+    # With a declared range a huge number is only unusable; without one it would spoil every sum.
     bounded = inst.min is not None and inst.max is not None
     return table.numbers("reading", missing=True, largest=None if bounded else LARGEST)
 
 
 def _scans(table: Table) -> tuple[IntArray, tuple[str, ...]]:
-    """Count scans up at every change of name: one that returns later is a new scan."""
+    """Assign scan numbers: every change of name begins a new scan, even if the name occurred before."""
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
     cells = table.cells("scan")
@@ -269,7 +271,7 @@ def _patterns(table: Table, description: Description) -> IntArray:
 
 
 def _covariates(table: Table, notes: list[str]) -> dict[str, FloatArray]:
-    """Keep every other numeric column; a column counts as numeric where most of what it holds are numbers."""
+    """Return every other numeric column; a column is numeric if most of its cells hold numbers."""
     out: dict[str, FloatArray] = {}
     for name in table.columns:
         if name in _KNOWN:

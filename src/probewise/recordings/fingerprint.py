@@ -1,4 +1,4 @@
-"""A recording's fingerprint: two files with the same content have the same one, however they are laid out."""
+"""Fingerprint of a recording: equal for files with the same content, whatever their layout."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["fingerprint"]
 
 
 def fingerprint(recording: Recording) -> str:
-    """Hash what the recording says: SHA-256, hexadecimal, of the files that would be written for it.
+    """Hash a recording's content: SHA-256, hexadecimal, of its files in a normal form.
 
-    The free-text description, file names, column order and line ends play no part; rows, readings,
-    scans, covariates, patterns and the instrument do.
+    Rows, readings, scans, covariates, patterns and the instrument count; the free-text description,
+    file names, column order and line ends do not.
     """
     plan = recording.plan
     columns = plan_columns(plan) | {"reading": [number_text(value) for value in recording.readings]}

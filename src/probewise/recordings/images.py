@@ -1,4 +1,4 @@
-"""Pictures as albedo: 8-bit PNG and .npy; headers are judged before anything is unpacked."""
+"""Images as albedo: 8-bit PNG and .npy; headers are checked before anything is unpacked."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
 _ALLOWED = "a PNG of 8 bits a channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
 _LARGEST_PIXELS = 100_000_000
-# By version; 3.0 is for arrays of records alone.
+# By version; 3.0 is only for structured arrays.
 _NPY_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 Bytes8 = NDArray[np.uint8]
 
 
 def read_image(path: Path) -> FloatArray:
-    """Read a picture as albedo 0 to 1, shape (n_rows, n_columns), first row on top.
+    """Read an image as albedo 0 to 1, shape (n_rows, n_columns), first row on top.
 
-    Grey values 0 to 255 are linear in albedo; colours count by the mean of their channels; what is
-    transparent reflects nothing, as outside the picture.
+    Grey values 0 to 255 are linear in albedo; colours are averaged over their channels; transparent
+    pixels have albedo 0, as outside the image.
 
     Raises
     ------
     FileError
-        If it is no such picture, damaged, or has values outside 0 to 255.
+        If it is not such an image, is damaged, or has values outside 0 to 255.
     """
     content = read_bytes(path, _ALLOWED)
     if path.suffix.lower() == ".npy":
@@ -52,7 +52,7 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     Raises
     ------
     ParameterError
-        If `suffix` is another, or '.png' is asked for and the albedo is not in steps of 1/255.
+        If `suffix` is another, or is '.png' and the albedo is not in steps of 1/255.
     """
     values = albedo * 255.0
     if suffix.lower() == ".npy":
@@ -81,7 +81,7 @@ def _from_npy(path: Path, content: bytes) -> FloatArray:
     file = io.BytesIO(content)
     try:
         shape, by_columns, dtype = _NPY_HEADERS[npy.read_magic(file)](file)
-    # numpy parses the header as Python; what a hostile one makes of that is any of a dozen exceptions.
+    # numpy parses the header as Python; a malicious one can raise almost any exception.
     except Exception as error:
         raise FileError(path, f"not readable as .npy ({error})", allowed) from error
     size = math.prod(shape)
@@ -108,7 +108,7 @@ def _from_png(path: Path, content: bytes) -> FloatArray:
     n_channels = _CHANNELS[colour]
     expected = height * (1 + width * n_channels)
     try:
-        # Never unpack more than the header announces: a small file can hold gigabytes.
+        # Never decompress more than the header announces: a small file can expand to gigabytes.
         raw = zlib.decompressobj().decompress(chunks.get(b"IDAT", b""), expected + 1)
     except zlib.error as error:
         raise FileError(path, f"the pixel data are damaged ({error})", _ALLOWED) from error
@@ -122,8 +122,8 @@ def _from_png(path: Path, content: bytes) -> FloatArray:
 
 
 def _decoded(packed: bytes, width: int, height: int, n_channels: int) -> Bytes8:
-    """Unpack the pixels and undo the filters of their lines, (height, width, n_channels)."""
-    from PIL import Image as Pillow  # here: most recordings show no picture
+    """Decompress the pixels and undo the line filters, (height, width, n_channels)."""
+    from PIL import Image as Pillow  # imported here: most recordings have no image
 
     mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[n_channels]
     decoded = Pillow.frombytes(mode, (width, height), packed, "zip", mode)

@@ -1,4 +1,4 @@
-"""Keep other processes away from a file while it is written to; the system lets go when a process dies."""
+"""Lock a file against other processes while it is written; the system releases the lock when a process dies."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from probewise.errors import FileError
 __all__ = ["locked", "remove_abandoned", "try_lock"]
 
 _BUSY = {errno.EACCES, errno.EAGAIN, errno.EDEADLK, errno.EWOULDBLOCK}
-_BEHIND = 1 << 20  # Windows locks bytes against reading too: one far behind the process id
+_BEHIND = 1 << 20  # Windows locks bytes against reading too: lock one far beyond the process id
 _RETRY_S = 0.05
 
 
 @contextlib.contextmanager
 def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator[None]:
-    """Hold a file or folder against every other process that asks for the same, by a lock on .NAME.lock beside it.
+    """Hold an exclusive lock on a file or folder, by way of a lock file .NAME.lock beside it.
 
-    The lock belongs to the open file, so that it ends with the process, whatever ends that. What a killed
-    process leaves behind is an unlocked file, which the next one takes over and removes.
+    The lock belongs to the open file and so ends with the process, however that ends. A killed process
+    leaves an unlocked lock file, which the next process takes over and removes.
 
     Parameters
     ----------
     path
-        What is held; it need not exist, its folder must.
+        The file or folder; it need not exist, but its folder must.
     patience_s
-        Wait so long for another process.
+        Wait at most this long for another process.
 
     Raises
     ------
     FileError
-        If another process, named where it is known, holds it; or if the file system has no locks.
+        If another process holds the lock (the message names it where known), or the file system has no locks.
     """
     path = Path(path)
     lock = path.with_name(f".{path.name}.lock")
@@ -46,7 +46,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
             raise FileError(path, f"{_holder(lock)} is writing to it", "one process at a time")
         time.sleep(_RETRY_S)
     try:
-        with contextlib.suppress(OSError):  # whose number is only for messages
+        with contextlib.suppress(OSError):  # the process id is only used in messages
             os.ftruncate(handle, 0)
             os.write(handle, b"%d" % os.getpid())
         yield
@@ -55,7 +55,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
 
 
 def _acquired(lock: Path, path: Path) -> int | None:
-    """Open and lock; None where another process has it."""
+    """Open and lock the lock file; None where another process holds it."""
     while True:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
@@ -67,7 +67,7 @@ def _acquired(lock: Path, path: Path) -> int | None:
             if not try_lock(handle):
                 os.close(handle)
                 return None
-            # Whoever held it before may have removed the file after it was opened here.
+            # The previous holder may have removed the file after it was opened here.
             if os.path.samestat(os.fstat(handle), os.stat(lock)):
                 return handle
         except FileNotFoundError:
@@ -79,7 +79,7 @@ def _acquired(lock: Path, path: Path) -> int | None:
 
 
 def try_lock(handle: int) -> bool:
-    """Lock an open file until it is closed; tell whether no other process has it locked."""
+    """Lock an open file until it is closed; return False if another process holds the lock."""
     try:
         _lock(handle)
     except OSError as error:
@@ -90,7 +90,7 @@ def try_lock(handle: int) -> bool:
 
 
 def remove_abandoned(path: Path) -> None:
-    """Remove a file that a process locks as long as it lives, unless it does."""
+    """Remove a file unless the process that locked it is alive."""
     with contextlib.suppress(OSError):
         if sys.platform == "win32":
             path.unlink()  # refused while another process has it open
@@ -112,7 +112,7 @@ if sys.platform == "win32":
         os.lseek(handle, 0, os.SEEK_SET)
 
     def _let_go(handle: int, lock: Path) -> None:
-        os.close(handle)  # an open file cannot be removed here; one that somebody else has opened stays
+        os.close(handle)  # Windows cannot remove an open file; one opened by another process stays
         with contextlib.suppress(OSError):
             os.unlink(lock)
 

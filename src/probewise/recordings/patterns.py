@@ -1,7 +1,7 @@
-"""What a recording says lay under the sensor: one value a pattern kind, numbers only.
+"""The patterns of the recording format: one class per kind, holding numbers only.
 
-These are the file format's kinds, not models: `scene` builds albedo fields from them and
-the independent `world` paints pixels from them, so the two share numbers and no code.
+They are data, not models: `scene` builds albedo fields from them and the independent `world`
+renders pixels from them, so the two share numbers but no code.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["PATTERNS", "Disc", "HalfPlane", "Image", "Pattern", "Polygon", "Quad
 
 
 class _Checked:
-    """Take numbers as floats and pairs as tuples, whatever they came as, and refuse everything else."""
+    """Base of the patterns: converts numbers to floats and pairs to tuples, and refuses everything else."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every pattern is a dataclass
@@ -39,14 +39,14 @@ class _Checked:
 
 @dataclass(frozen=True)
 class Uniform(_Checked):
-    """The same albedo everywhere."""
+    """Uniform albedo."""
 
     albedo: float
 
 
 @dataclass(frozen=True)
 class HalfPlane(_Checked):
-    """Inside where x cos(normal) + y sin(normal) > offset."""
+    """The half-plane x cos(normal) + y sin(normal) > offset."""
 
     normal_rad: float
     offset_mm: float
@@ -56,7 +56,7 @@ class HalfPlane(_Checked):
 
 @dataclass(frozen=True)
 class Quadrant(_Checked):
-    """Inside where both (x - cx) dx > 0 and (y - cy) dy > 0; direction holds dx, dy = +1 or -1."""
+    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0; direction is (dx, dy), each +1 or -1."""
 
     corner_mm: tuple[float, float]
     direction: tuple[int, int]
@@ -74,7 +74,7 @@ class Quadrant(_Checked):
 
 @dataclass(frozen=True)
 class Disc(_Checked):
-    """Inside a circle."""
+    """The inside of a circle."""
 
     center_mm: tuple[float, float]
     radius_mm: float
@@ -88,7 +88,7 @@ class Disc(_Checked):
 
 @dataclass(frozen=True)
 class Polygon(_Checked):
-    """Inside a polygon by the even-odd rule."""
+    """The inside of a polygon by the even-odd rule."""
 
     vertices_mm: tuple[tuple[float, float], ...]
     inside: float = 1.0
@@ -106,7 +106,7 @@ class Polygon(_Checked):
 
 @dataclass(frozen=True)
 class Stripes(_Checked):
-    """Inside where frac((x . n - phase) / period) < duty."""
+    """Stripes where frac((x . n - phase) / period) < duty."""
 
     normal_rad: float
     period_mm: float
@@ -124,7 +124,7 @@ class Stripes(_Checked):
 
 @dataclass(frozen=True)
 class Ramp(_Checked):
-    """Albedo per_mm (x . n), not bounded: an encoder reading a scale is a sensor reading a ramp."""
+    """A linear gradient, albedo per_mm (x . n), unbounded: an encoder on a scale is a sensor on a ramp."""
 
     normal_rad: float
     per_mm: float
@@ -132,7 +132,7 @@ class Ramp(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Image(_Checked):
-    """Pixels, first row on top, albedo 0 to 1, 0 outside; `origin_mm` is the lower left corner."""
+    """An image: albedo of pixels 0 to 1, first row on top, 0 outside; `origin_mm` is the lower left corner."""
 
     albedo: FloatArray
     pixel_mm: float
@@ -151,4 +151,4 @@ class Image(_Checked):
 Pattern: TypeAlias = Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes | Ramp | Image
 
 PATTERNS: tuple[type, ...] = (Uniform, HalfPlane, Quadrant, Disc, Polygon, Stripes, Ramp, Image)
-"""The kinds of pattern."""
+"""The classes of the patterns."""

@@ -1,4 +1,4 @@
-"""A plan says where, when and over what to read; a recording is a plan with its readings."""
+"""A plan: pose, time and pattern of every reading. A recording: a plan with its readings."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Instrumentation:
-    """What took the readings: unit and range of a reading, the sensor, what can be commanded."""
+    """The instrument: unit, range and step of a reading, the sensor, and what can be commanded."""
 
     unit: str = "LEGO"
     min: float | None = None
     max: float | None = None
-    step: float | None = None  # quantisation as declared; None = not declared
+    step: float | None = None  # declared quantisation; None if not declared
     sensor: str = ""
     height_mm: float | None = None
     controls: tuple[str, ...] = ()
@@ -70,15 +70,15 @@ class Instrumentation:
 
     @property
     def ends(self) -> tuple[float, ...]:
-        """Ends of the range, as far as they are declared."""
+        """The declared ends of the range."""
         return tuple(end for end in (self.min, self.max) if end is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Hold one row a reading, in the order of taking: order is information.
+    """Pose, time and pattern of every reading, in the order they are taken (the order matters for lag and backlash).
 
-    All arrays have shape (n_points,). `scan` numbers the scans from 0 in order of taking
+    All arrays have shape (n_points,). `scan` numbers the scans from 0 in the order they are taken
     (a name that returns later is a new scan); `pattern` indexes `pattern_names`. A pattern
     name may be missing from `patterns` only where a hypothesis takes its place.
     """
@@ -143,27 +143,27 @@ class Plan:
         height_mm: float | None = None,
         controls: tuple[str, ...] = (),
     ) -> Self:
-        """Lay out a plan from arrays, lists or columns of a table, one entry a reading in the order of taking.
+        """Make a plan from arrays, lists or columns of a table, with one entry per reading in the order they are taken.
 
         Parameters
         ----------
         x_mm, y_mm
-            Where the sensor is commanded to be, shape (n_points,); a single number stands for all readings.
+            Commanded position of the sensor, shape (n_points,); a single number holds for all readings.
         patterns
             What lies under the sensor: patterns by name, or one pattern under every reading.
         unit
             Unit of a reading, such as "V" or "LEGO".
         pattern
-            Name of the pattern under each reading, or of the one under all; needed where there are several.
+            Name of the pattern under each reading, or of the one under all; required if there are several.
         orientation_rad
-            Turn of the sensor about its vertical axis, anticlockwise from above, (n_points,) or one for all.
+            Rotation of the sensor about its vertical axis, anticlockwise from above, (n_points,) or one for all.
         time_s
-            When, shape (n_points,), in seconds, or dates, which become seconds since the first; by default a second
+            Times, shape (n_points,), in seconds, or dates, which become seconds since the first; by default one second
             apart.
         scan
-            Name or number of the scan of each reading; where it changes a new scan begins. By default all are one scan.
+            Name or number of the scan of each reading; a change begins a new scan. By default all are one scan.
         covariates
-            Other numbers by name, one a reading each, such as `battery_mv`.
+            Further numbers by name, one per reading each, such as `battery_mv`.
         min, max, step
             Range and quantisation of a reading, where they are known.
         sensor, height_mm, controls
@@ -172,9 +172,9 @@ class Plan:
         Raises
         ------
         ParameterError
-            If a pattern is named but not described, or something is not of its kind.
+            If a pattern is named but not described, or an argument has the wrong type.
         ShapeError
-            If there is not one entry a reading.
+            If the arguments differ in length.
 
         Examples
         --------
@@ -212,10 +212,10 @@ class Plan:
 
     @cached_property
     def direction(self) -> FloatArray:
-        """Unit vector of the last commanded move within the scan, shape (n_points, 2).
+        """Unit vector of the last commanded motion within the scan, shape (n_points, 2).
 
-        The first reading of a scan takes that of the next move; a repeat keeps the last
-        move's; a scan that stays at one place has (0, 0).
+        The first reading of a scan takes the direction of the next motion; a repeat keeps that
+        of the last; a scan that stays at one place has (0, 0).
         """
         out = np.zeros((len(self), 2))
         place = np.stack([self.x_mm, self.y_mm], axis=-1)
@@ -233,17 +233,17 @@ class Plan:
         return out
 
     def rows_by_scan(self) -> list[IntArray]:
-        """Row numbers of each scan, in order of taking."""
+        """Row numbers of each scan, in the order they were taken."""
         ends = np.cumsum(np.bincount(self.scan, minlength=len(self.scan_names)))
         return np.split(np.argsort(self.scan, kind="stable"), ends[:-1]) if len(ends) else []
 
     def rows_by_pattern(self) -> list[tuple[str, IntArray]]:
-        """Pattern names that occur, each with its row numbers."""
+        """Names of the patterns that occur, each with its row numbers."""
         pairs = [(name, np.flatnonzero(self.pattern == k)) for k, name in enumerate(self.pattern_names)]
         return [(name, rows) for name, rows in pairs if rows.size]
 
     def take(self, rows: IntArray | BoolArray) -> Plan:
-        """Keep these rows, in their order (scans and patterns keep their names)."""
+        """Select rows, in the given order (scans and patterns keep their names)."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == np.bool_ else np.asarray(rows, dtype=np.int64)
         kept = np.unique(self.scan[rows])
         return Plan(
@@ -263,14 +263,14 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Recording(ShowsItself):
-    """Hold a plan and what was read: `readings`, shape (n_points,), NaN where missing.
+    """A plan and its readings, shape (n_points,), NaN where missing.
 
     `usable` is False where a reading is missing or outside the declared range; such rows
     stay in the plan (lag and backlash need them) and are left out of every likelihood.
     """
 
     least_share_of_span: ClassVar[float] = 1e-3
-    """Of the span of the readings: no light sensor's noise is less."""
+    """Least noise sd of a light sensor, as a share of the range of its readings."""
 
     plan: Plan
     readings: FloatArray
@@ -289,7 +289,7 @@ class Recording(ShowsItself):
 
     @property
     def relative_sd(self) -> FloatArray:
-        """Declared sd of each reading relative to that of the others, (n_points,): here all are alike."""
+        """Declared relative sd of each reading, (n_points,): here 1 for all."""
         return np.ones(len(self.plan))
 
     @classmethod
@@ -314,14 +314,14 @@ class Recording(ShowsItself):
         controls: tuple[str, ...] = (),
         source: str = "",
     ) -> Self:
-        """Make a recording from arrays, lists or columns of a table, one entry a reading in the order of taking.
+        """Make a recording from arrays, lists or columns of a table, with one entry per reading in the order taken.
 
         Parameters
         ----------
         x_mm, y_mm
-            Where the sensor was commanded to be, shape (n_points,); a single number stands for all readings.
+            Commanded position of the sensor, shape (n_points,); a single number holds for all readings.
         readings
-            What was read, in `unit`, shape (n_points,); NaN, None or a text such as "n/a" where a reading is missing.
+            Readings in `unit`, shape (n_points,); NaN, None or a text such as "n/a" where one is missing.
         patterns
             What lay under the sensor: patterns by name, or one pattern under every reading.
         unit
@@ -329,14 +329,14 @@ class Recording(ShowsItself):
         pattern, orientation_rad, time_s, scan, covariates, min, max, step, sensor, height_mm, controls
             As in `Plan.from_arrays`.
         source
-            Where the readings come from, for reports.
+            Origin of the readings, for reports.
 
         Raises
         ------
         ParameterError
-            If a pattern is named but not described, something is not of its kind, or no reading is usable.
+            If a pattern is named but not described, an argument has the wrong type, or no reading is usable.
         ShapeError
-            If there is not one entry a reading.
+            If the arguments differ in length.
 
         Examples
         --------
@@ -388,20 +388,20 @@ class Recording(ShowsItself):
         controls: tuple[str, ...] = (),
         source: str = "",
     ) -> Self:
-        """Make a recording from a data frame or a dict of columns that are named as in a recording's CSV file.
+        """Make a recording from a data frame or a dict of columns, named as in a recording's CSV file.
 
         Parameters
         ----------
         table
-            Columns `reading`, `x_mm` and `y_mm`; as far as they are there `orientation_deg` (or `orientation_rad`),
-            `scan`, `pattern` and `time_s`. Every other column of numbers is a covariate; others are left out.
+            Columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
+            `scan`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are ignored.
         patterns, unit, min, max, step, sensor, height_mm, controls, source
             As in `Recording.from_arrays`.
 
         Raises
         ------
         ParameterError
-            If a column is missing, a pattern is named but not described, or something is not of its kind.
+            If a column is missing, a pattern is named but not described, or an argument has the wrong type.
         ShapeError
             If the columns differ in length.
 
@@ -460,7 +460,7 @@ class Recording(ShowsItself):
         return ok
 
     def notes_on_what_is_left_out(self) -> tuple[str, ...]:
-        """Say how many readings are missing, and how many outside the declared range: neither is usable."""
+        """Say how many readings are unusable: missing, or outside the declared range."""
         inst = self.plan.instrumentation
         n_missing = int(np.isnan(self.readings).sum())
         n_outside = len(self) - n_missing - int(self.usable.sum())
@@ -468,7 +468,7 @@ class Recording(ShowsItself):
         return tuple(f"{n} reading{'s' if n > 1 else ''} {reason}, left out" for reason, n in why.items() if n)
 
     def summary(self) -> str:
-        """Say in one line how many readings there are, and what is to be noted of them."""
+        """Summarise the recording in one line: numbers of readings, and notes."""
         n_usable, unit = int(self.usable.sum()), self.plan.instrumentation.unit
         first = (
             f"{len(self)} readings in {unit}, {n_usable} usable" if unit else f"{len(self)} readings, {n_usable} usable"
@@ -476,27 +476,27 @@ class Recording(ShowsItself):
         return "; ".join([first, *self.notes])
 
     def with_readings(self, readings: FloatArray) -> Self:
-        """Take other readings of the same plan, (n_points,), NaN where one is left out."""
+        """Return a recording of the same plan with other readings, (n_points,), NaN where one is left out."""
         return replace(self, readings=readings, notes=())
 
     def unlimited(self) -> Self:
-        """Declare no range: what was calculated without noise may lie beyond it by a little, and counts too."""
+        """Return the recording without its declared range, since noise-free readings may exceed it slightly."""
         instrumentation = replace(self.plan.instrumentation, min=None, max=None)
         return replace(self, plan=replace(self.plan, instrumentation=instrumentation), notes=())
 
     def take(self, rows: IntArray | BoolArray) -> Self:
-        """Keep these rows, in their order."""
+        """Select rows, in the given order."""
         return replace(self, plan=self.plan.take(rows), readings=self.readings[rows])
 
 
 def require_plan(plan: object) -> None:
-    """Raise ParameterError unless `plan` is a Plan, saying how to come by one."""
+    """Raise ParameterError unless `plan` is a Plan; the message says how to make one."""
     allowed = "a Plan: read_plan('NAME.csv') or Plan.from_arrays(...), of probewise.recordings; a Recording has a .plan"
     require_kind("plan", plan, Plan, allowed)
 
 
 def require_recording(recording: object) -> None:
-    """Raise ParameterError unless `recording` is a Recording, saying how to come by one."""
+    """Raise ParameterError unless `recording` is a Recording; the message says how to make one."""
     allowed = "a Recording: read_recording('NAME.csv'), Recording.from_arrays(...) or Recording.from_table(table, ...)"
     require_kind("recording", recording, Recording, f"{allowed}, of probewise.recordings")
 
@@ -509,7 +509,7 @@ def require_described(plan: Plan) -> None:
 
 
 def range_in_words(low: float | None, high: float | None) -> str:
-    """Say a declared range."""
+    """Describe a declared range."""
     if low is None and high is None:
         return "any range"
     if low is None:

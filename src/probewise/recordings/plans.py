@@ -1,4 +1,4 @@
-"""Plans ready to carry out: the paper's calibration plan and a two-way plan that sees more of what can be wrong."""
+"""Ready-made plans: the paper's calibration plan, and a two-way plan that detects more effects."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _FULL_BATTERY_MV, _DRAIN_MV_PER_S = 8300.0, 0.12
 
 @dataclass(frozen=True)
 class _Scan:
-    """One scan: places (n, 2), the patterns (one, or one a reading), orientation, seconds a reading, seconds before."""
+    """One scan: places (n, 2), patterns (one, or one per reading), seconds per reading, seconds before the scan."""
 
     name: str
     places_mm: FloatArray
@@ -51,7 +51,7 @@ class _Scan:
 
 
 def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
-    """Lay out the paper's 408 readings (section "Data Collection for SSF Estimation").
+    """Return the plan of the paper's 408 readings (section "Data Collection for SSF Estimation").
 
     Four scans across the black-and-white boundary from -50 to 50 mm in steps of 1 mm with the sensor
     at 0, 90, 180 and 270 degrees, `edge_0` to `edge_270`, then one reading on each of the four
@@ -60,7 +60,7 @@ def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
     Parameters
     ----------
     reading_s
-        Seconds from one reading to the next, the paper's arm: about 1.2.
+        Seconds from one reading to the next; about 1.2 for the paper's arm.
     break_s
         Seconds to turn the sensor between scans, or to change the pattern.
     """
@@ -71,7 +71,7 @@ def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
 
 
 def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
-    """Lay out 961 readings that tell lag from backlash and gain from offset.
+    """Return a plan of 961 readings that distinguishes lag from backlash and gain from offset.
 
     For each orientation: the boundary out and back (the way back at double speed for 180 and 270
     degrees, since lag depends on speed and backlash does not), plain white and plain black every 8 mm.
@@ -101,14 +101,14 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
 
 
 def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
-    """Take the plan's times as an arm does, never quite on the beat, and its battery as a meter shows it.
+    """Make a plan's times and battery voltages realistic: jittered intervals, and measurement noise on the voltage.
 
     Parameters
     ----------
     plan
         A plan in order of time.
     rng
-        Where the randomness comes from.
+        Source of randomness.
     share
         Every interval changes by up to this share of it, 0 to 1.
 
@@ -143,7 +143,7 @@ def _plan(scans: Sequence[_Scan]) -> Plan:
     time_s = np.round(np.cumsum(np.concatenate(intervals)), 3)
     places = np.concatenate([s.places_mm for s in scans])
     counts = [len(s.places_mm) for s in scans]
-    # A scan over one pattern names it once.
+    # A scan over one pattern lists it once.
     named = [
         name
         for scan, n in zip(scans, counts, strict=True)

@@ -1,4 +1,4 @@
-"""Predictions of a plan or a recording, and their file."""
+"""Predicted readings of a plan or recording, and their file."""
 
 from __future__ import annotations
 
@@ -21,12 +21,11 @@ __all__ = ["Prediction", "read_prediction", "said_of_prediction", "write_predict
 
 @dataclass(frozen=True, eq=False)
 class Prediction(ShowsItself):
-    """What each row's reading is expected to be; all arrays have shape (n_points,).
+    """Predictive mean and sd of each row's reading; all arrays have shape (n_points,).
 
-    `sd` is that of one new reading, noise and parameter uncertainty included. `log_density` is the
-    natural logarithm of the predictive density of that row's reading alone, per unit of the reading;
-    NaN where the reading is missing or out of range, and everywhere for a plan. `readings` are those that
-    were scored, NaN where there is none.
+    `sd` includes noise and parameter uncertainty. `log_density` is the natural log of the marginal
+    predictive density of that row's reading, per unit of the reading; NaN where the reading is missing
+    or out of range, and everywhere for a plan. `readings` are the scored readings, NaN where there is none.
     """
 
     plan: Plan
@@ -58,12 +57,12 @@ class Prediction(ShowsItself):
         return len(self.plan)
 
     def summary(self) -> str:
-        """Say how many readings were predicted and, of those that were recorded, how well they were expected."""
+        """Summarise: number of predictions, and for recorded readings chi-square and log density per reading."""
         return said_of_prediction(self.readings, self.mean, self.sd, self.log_density)
 
 
 def said_of_prediction(readings: FloatArray, mean: FloatArray, sd: FloatArray, log_density: FloatArray) -> str:
-    """Say how many readings were predicted and how well those that were recorded were expected; all (n_points,)."""
+    """Summarise predictions, and for recorded readings chi-square and log density per reading; all (n_points,)."""
     lines = [f"{len(mean)} readings predicted"]
     scored = np.isfinite(log_density) & np.isfinite(readings)
     if scored.any():
@@ -78,7 +77,7 @@ def said_of_prediction(readings: FloatArray, mean: FloatArray, sd: FloatArray, l
 
 
 def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:
-    """Write the plan's rows in their order, none dropped, with `mean`, `sd` and `log_density`, in full precision.
+    """Write all rows of the plan in order, with `mean`, `sd` and `log_density`, in full precision.
 
     Raises
     ------
@@ -92,12 +91,12 @@ def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> No
 
 
 def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read back `mean`, `sd` and `log_density` (NaN where empty), each of shape (n_points,).
+    """Read `mean`, `sd` and `log_density` (NaN where empty), each of shape (n_points,).
 
     Raises
     ------
     FileError
-        If the file is missing, or a cell is not such a number.
+        If the file is missing, or a cell is not a valid number.
     """
     table = read_table(require_path("path", path))
     table.require("mean", "sd", "log_density")

@@ -1,4 +1,4 @@
-"""A person's Python file, run so that what goes wrong in it is told in one line."""
+"""Run a user's Python file, with errors in it reported in one line."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _LONGEST = 200
 
 
 def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
-    """Run a person's file as `import` would, and give the names that it defines.
+    """Run a user's file as `import` would, and return the names that it defines.
 
-    Its folder is searched for modules from then on, as if it had been started by `python FILE.py`.
+    Its folder is added to the module search path, as by `python FILE.py`.
 
     Parameters
     ----------
     path
         The file.
     what
-        What it should be, for messages.
+        What the file should be, for messages.
 
     Raises
     ------
     FileError
-        If it cannot be read or run; it names the line where there is one.
+        If it cannot be read or run; the error names the line if there is one.
     """
     path = require_path("path", path, what)
     text = read_text(path, what)
@@ -42,7 +42,7 @@ def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any
     except (SyntaxError, ValueError) as error:
         found = f"is no Python: {_briefly(error)}"
         raise FileError(path, found, "a file that Python can run", row=getattr(error, "lineno", None)) from error
-    module = ModuleType(f"probewise_file_{path.stem}")  # not the stem alone, lest serial.py hide the package serial
+    module = ModuleType(f"probewise_file_{path.stem}")  # a prefix, so that serial.py cannot hide the package serial
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # dataclasses look their module up
     folder = str(path.absolute().parent)

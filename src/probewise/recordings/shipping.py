@@ -1,4 +1,4 @@
-"""The recordings that come with the package."""
+"""Recordings shipped with the package."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ SHIPPED = ("paper", "concealed")
 
 
 def shipped(name: str) -> Path:
-    """Find a recording that comes with the package, its JSON beside it.
+    """Return the path of a recording shipped with the package, with its JSON beside it.
 
     `paper`: the paper's 404 readings over the black-and-white boundary and four over the quadrants.
-    `concealed`: 961 readings, scans out and back, with one effect that a plain sensor model leaves out;
-    the effect was drawn from a seed, and the name does not give it away.
-    Both are simulated (world/shipped.py).
+    `concealed`: 961 readings, scans out and back, with one effect that the plain sensor model leaves out,
+    drawn from a seed. Both are simulated (world/shipped.py).
 
     Raises
     ------

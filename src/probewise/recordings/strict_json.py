@@ -1,4 +1,4 @@
-"""JSON as the formats mean it: no NaN, no Infinity, no number that no float can hold, each name once."""
+"""Strict JSON: no NaN, no Infinity, no number beyond the floats, no repeated names."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from probewise.errors import FileError, shown
 
 __all__ = ["json_of", "strict_json"]
 
-_MOST_DIGITS = 400  # more than any finite float has before its point
+_MOST_DIGITS = 400  # more digits than any finite float has before the point
 
 
 def json_of(path: str | os.PathLike[str], text: str | bytes, allowed: str, *, row: int | None = None) -> Any:
-    """Parse a JSON text, or UTF-8 bytes, that stood in a file.
+    """Parse a JSON text, or UTF-8 bytes, from a file.
 
     Parameters
     ----------
     path, row
-        Where it stood; without a row, that of the fault within the text is told.
+        Its place, for messages; without `row`, the row of the error within the text.
     text
         The text.
     allowed
-        What should have stood there.
+        What the file should contain, for messages.
 
     Raises
     ------
@@ -41,23 +41,22 @@ def json_of(path: str | os.PathLike[str], text: str | bytes, allowed: str, *, ro
 
 
 def strict_json(text: str | bytes) -> Any:
-    """Parse a JSON text, or UTF-8 bytes; a byte-order mark is passed over.
+    """Parse a JSON text, or UTF-8 bytes; a byte-order mark is skipped.
 
     Raises
     ------
     json.JSONDecodeError
         If it does not parse.
     ValueError
-        If it is nested deeper than Python can follow, bytes are not UTF-8, half of a character is escaped, a number
-        stands for none (NaN, Infinity) or is beyond every float, or a name comes twice in one object: which of the two
-        is meant nobody can say.
+        If it is nested too deep, bytes are not UTF-8, a lone surrogate is escaped, a number is NaN, infinite or
+        beyond the floats, or an object repeats a name.
     """
     text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
     try:
         value = json.loads(
             text, object_pairs_hook=_once, parse_constant=_no_constant, parse_int=_whole, parse_float=_number
         )
-        if "\\u" in text:  # half of an escaped character could be written into no file
+        if "\\u" in text:  # an escaped lone surrogate could not be written to a file
             json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
         raise ValueError("half of an escaped character, a surrogate, stands alone") from error
@@ -79,7 +78,7 @@ def _no_constant(name: str) -> float:
 
 
 def _whole(digits: str) -> int:
-    # Python turns no text of thousands of digits into a number, nor such a number into a float.
+    # Python refuses to convert texts of thousands of digits.
     if len(digits) > _MOST_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits, beyond every float")
     _number(digits)

@@ -1,4 +1,4 @@
-"""A CSV file as a checked table of texts and numbers, rows counted as a person counts them."""
+"""A CSV file as a checked table of texts and numbers; rows are numbered from 1, the header."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from probewise.recordings.text import read_text
 __all__ = ["LARGEST", "MISSING", "Table", "count_numbers", "csv_text", "number_text", "read_table"]
 
 LARGEST = 1e15
-"""Largest magnitude of a number in a file: beyond it squares and differences lose their meaning."""
+"""Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
 
 _WORDS = ("nan", "na", "n/a")
 _SPELT = (map("".join, itertools.product(*zip(word, word.upper(), strict=True))) for word in _WORDS)
 MISSING = frozenset(itertools.chain([""], *_SPELT))
-"""What stands in a cell whose number is missing."""
+"""Texts that mark a missing number."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-# Of these characters float() takes what _NUMBER does, and nothing else ('infinity' and '1_000' have others).
+# On texts of these characters float() accepts exactly what _NUMBER does ('infinity' and '1_000' have others).
 _OF_NUMBERS = re.compile(r"[-+.0-9eE]*", re.ASCII)
-_CHUNK = 2_000  # rows that are read at a time: few enough to stay in the processor's memory
+_CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Cells by column, stripped of surrounding blanks; `rows` numbers each record (header = row 1), (n_rows,).
+    """Cells by column, stripped of blanks; `rows` holds the row number of each record (header = 1), (n_rows,).
 
-    Each column is one text, its cells joined by a character that the file does not hold: a million small texts take
-    ten times the memory.
+    Each column is one text, its cells joined by a character that does not occur in the file: a million separate texts
+    would take ten times the memory.
     """
 
     path: Path
@@ -52,11 +52,11 @@ class Table:
         return len(self.rows)
 
     def cells(self, name: str) -> list[str]:
-        """Give the cells of a column."""
+        """Return the cells of a column."""
         return self.columns[name].split(self.separator) if len(self) else []
 
     def row(self, k: int) -> int:
-        """Give the number of a record as a person counts it."""
+        """Return the row number of a record, the header being row 1."""
         return int(self.rows[k])
 
     def require(self, *names: str) -> None:
@@ -107,7 +107,7 @@ class Table:
 
 
 def _parsed(cells: Sequence[str]) -> FloatArray | None:
-    """Turn cells into numbers, all at once; None where one of them is no plain decimal number."""
+    """Convert cells to numbers in one pass; None if one of them is not a plain decimal number."""
     if _OF_NUMBERS.fullmatch("".join(cells)) is None:
         return None
     try:
@@ -121,7 +121,7 @@ def _is_number(cell: str) -> bool:
 
 
 def count_numbers(cells: Sequence[str]) -> int:
-    """Count the cells that hold a plain decimal number (float() would take 'infinity' and '1_000' too)."""
+    """Count the cells that hold a plain decimal number (float() would accept 'infinity' and '1_000' too)."""
     if _parsed(cells) is not None:
         return len(cells)
     return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
@@ -132,12 +132,12 @@ def _described(cell: str) -> str:
 
 
 def read_table(path: Path, *, progress: Progress = silent) -> Table:
-    """Read a CSV file with one header row; lines without anything are passed over.
+    """Read a CSV file with one header row; blank lines are skipped.
 
     Raises
     ------
     FileError
-        If there is no header, a column comes twice, a row is short or long, or quotes do not close.
+        If there is no header, a column is repeated, a row is too short or too long, or quotes do not close.
     """
     text = read_text(path, "a CSV file")
     n_lines = text.count("\n")
@@ -169,14 +169,14 @@ def read_table(path: Path, *, progress: Progress = silent) -> Table:
             raise FileError(path, found, "comma-separated cells, quotes closed", row=n_read + 1) from failed
         progress(f"reading {path.name}", n_read, max(n_lines, n_read))
     if header is None:
-        raise FileError(path, "the file is empty", "a header row and one row a reading")
+        raise FileError(path, "the file is empty", "a header row and one row per reading")
     joined = {name: separator.join(column) for name, column in zip(header, columns, strict=True)}
     return Table(path, joined, separator, np.concatenate(rows))
 
 
 def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | None]]:
-    """Yield records, some at a time, and with the last of them what is wrong with the next."""
-    # Not StringIO, which takes four bytes a character.
+    """Yield chunks of records, each with the error that ended it, if any."""
+    # Not StringIO, which takes four bytes per character.
     lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8", newline="")
     reader = csv.reader(lines, strict=True)
     failed = None
@@ -202,7 +202,7 @@ def _check_header(path: Path, header: Sequence[str], row: int) -> None:
 
 
 def number_text(value: float) -> str:
-    """Write a number in full precision, whole ones without a point, NaN as an empty cell."""
+    """Format a number in full precision, integers without a point, NaN as an empty cell."""
     if math.isnan(value):
         return ""
     value = float(value)
@@ -210,7 +210,7 @@ def number_text(value: float) -> str:
 
 
 def csv_text(columns: dict[str, Sequence[str]]) -> str:
-    """Write columns of cells, equally long, as CSV with a header row and LF line ends."""
+    """Format columns of cells of equal length as CSV with a header row and LF line ends."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)

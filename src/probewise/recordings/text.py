@@ -1,4 +1,4 @@
-"""Files as bytes and as UTF-8 text."""
+"""Read files as bytes and as UTF-8 text."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["read_bytes", "read_text"]
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Read a file whole.
+    """Read a whole file.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """Read a UTF-8 file whole, without its byte-order mark.
+    """Read a whole UTF-8 file, without its byte-order mark.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Likelihoods, and the problem that joins one with a prior, a sensor model and a recording.
+"""Likelihoods, and the inference problem: a prior, a sensor model, a likelihood and a recording.
 
-The paper's naive likelihood and its Student-t likelihood (sigma integrated out, one for each
-data set), Gaussian ones beside them; any sensor model goes with any of them.
+The paper's naive likelihood and its Student-t likelihood (sigma of each data set integrated
+out), and Gaussian likelihoods; any sensor model works with any of them.
 """
 
 from probewise.inference.gaussian import GaussianInferred, GaussianKnown

@@ -1,4 +1,4 @@
-"""Readings less predictions, with their shapes checked once for every likelihood."""
+"""Residuals, readings minus predictions, with the shapes checked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Score readings with Gaussian noise whose sd is known, or one of the parameters."""
+"""Gaussian likelihoods: the sd of the noise is known, or a parameter."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LOG_2PI = math.log(2 * math.pi)
 
 @dataclass(frozen=True, eq=False)
 class GaussianKnown:
-    """Score readings with independent Gaussian noise of known sd.
+    """Likelihood of independent Gaussian noise of known sd.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class GaussianKnown:
         object.__setattr__(self, "sd", sd)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,), all constants kept."""
+        """Log likelihood of each hypothesis, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         sd = np.asarray(self.sd)
         if sd.ndim == 1 and sd.size != readings.size:
@@ -54,7 +54,7 @@ class GaussianKnown:
 
 @dataclass(frozen=True, eq=False)
 class GaussianInferred:
-    """Weigh hypotheses whose last column is the noise's sd: a `Problem`, like `SensorProblem`.
+    """An inference problem whose last parameter is the sd of the Gaussian noise; see `SensorProblem`.
 
     Parameters
     ----------
@@ -78,11 +78,11 @@ class GaussianInferred:
 
     @cached_property
     def prior(self) -> Prior:
-        """The sensor's prior with the sd's behind it."""
+        """The sensor's prior, then the sd's."""
         return Joint((self.sensor_prior, Product({self.sd_name: self.sd_prior})))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Weigh the usable readings, (n_samples, n_params) -> (n_samples,)."""
+        """Log likelihood of the usable readings, (n_samples, n_params) -> (n_samples,)."""
         usable = self.recording.usable
         predicted = self.model.predict(theta[:, :-1], self.recording.plan)[:, usable]
         readings = self.recording.readings[usable]
@@ -90,7 +90,7 @@ class GaussianInferred:
 
 
 def log_prob_gaussian(readings: FloatArray, predicted: FloatArray, sd: FloatArray) -> FloatArray:
-    """Score hypotheses of their own sd each, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
+    """Log likelihood with one sd per hypothesis, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
     residual = residuals(readings, predicted)
     square = np.einsum("ij,ij->i", residual, residual)
     return np.asarray(-0.5 * square / sd**2 - readings.size * (np.log(sd) + 0.5 * _LOG_2PI))

@@ -1,4 +1,4 @@
-"""Score readings as the naive sensor does: one level over black, another over white (paper, eq. naive).
+"""The naive likelihood: one level over black, another over white (paper, eq. naive).
 
 The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal density has
 (2 pi sigma^2)^(-1/2) and a negative one.
@@ -22,7 +22,7 @@ __all__ = ["Naive"]
 
 @dataclass(frozen=True)
 class Naive:
-    """Expect one of two readings, each with its own sd.
+    """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ class Naive:
 
     @classmethod
     def estimated(cls, black: ArrayLike, white: ArrayLike, *, sd_floor: float) -> Naive:
-        """Take mean and sd from readings over known black and known white, two or more of each.
+        """Estimate means and sds from readings over known black and known white, two or more of each.
 
-        `sd_floor`, for instance `step / sqrt(12)`, keeps equal readings from claiming perfection.
+        `sd_floor`, for instance `step / sqrt(12)`, bounds the sd where all readings are equal.
         """
         values: list[float] = []
         for name, readings in (("black", black), ("white", white)):
@@ -59,9 +59,9 @@ class Naive:
         return cls(*values)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,).
+        """Log likelihood of every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,).
 
-        A prediction says white where it lies nearer `mu_white` than `mu_black`.
+        A prediction counts as white where it is nearer to `mu_white` than to `mu_black`.
         """
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         residuals(readings, predicted)

@@ -1,4 +1,4 @@
-"""Bound the sd of a recording's noise, so that its prior is proper."""
+"""Bounds of a recording's noise sd, which make its prior proper."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_floor(recording: Recording) -> float:
-    """Least sd a reading can have: that of rounding to the declared step, or a share of the span.
+    """Lower bound of the noise sd: the sd of rounding to the declared step, or a share of the readings' range.
 
-    Where no step is declared, that of the lattice on which all readings lie: without it, levels that happen to be on
-    the lattice too would leave no residual, and a law with a tail would take that for the noise.
+    Where no step is declared, the step of the lattice on which all readings lie is used: otherwise readings at levels
+    on that lattice would have residual zero, which a heavy-tailed noise model would take for the noise.
     """
     step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
     return max(step / math.sqrt(12.0), recording.least_share_of_span * reading_span(recording))
 
 
 def sd_ceiling(recording: Recording) -> float:
-    """Greatest sd worth believing in: the span of the readings, and ten times the floor at least."""
+    """Upper bound of the noise sd: the range of the readings, but at least ten times the floor."""
     return max(reading_span(recording), 10.0 * sd_floor(recording))
 
 
@@ -47,9 +47,9 @@ def student_t(recording: Recording, groups: IntArray | None = None) -> StudentT:
     Parameters
     ----------
     recording
-        What was read.
+        The recording.
     groups
-        Data set of each row of the plan, (n_points,); default one for every scan.
+        Data set of each row of the plan, (n_points,); by default each scan is one.
     """
     rows = recording.plan.scan if groups is None else np.asarray(groups)
     return StudentT(rows[recording.usable], sd_floor(recording), sd_ceiling(recording))

@@ -1,4 +1,4 @@
-"""One inference: a prior, a model that predicts readings, a likelihood that weighs them."""
+"""An inference problem: a prior, a model that predicts readings, and a likelihood."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from probewise.sensor.stages import SensorModel
 
 __all__ = ["Likelihood", "Problem", "SensorProblem", "require_likelihood", "require_model"]
 
-_MOST_NUMBERS = 1_000_000  # predicted at once
+_MOST_NUMBERS = 1_000_000  # predicted at a time, to bound memory
 
 
 class Likelihood(Protocol):
-    """Score readings against predictions."""
+    """A likelihood of readings given predictions."""
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood with all constants, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         ...
 
 
 class Problem(Protocol):
-    """What nested sampling works on."""
+    """A prior and a likelihood, as nested sampling needs them."""
 
     @property
     def prior(self) -> Prior:
@@ -47,14 +47,14 @@ def require_model(model: object) -> None:
 
 
 def require_likelihood(likelihood: object) -> None:
-    """Raise ParameterError unless `likelihood` scores readings; a noise sd is the usual mistake."""
+    """Raise ParameterError unless `likelihood` has `log_prob`; a noise sd is the usual mistake."""
     allowed = "a likelihood such as GaussianKnown(sd), with log_prob(readings, predicted)"
     require_like("likelihood", likelihood, ("log_prob",), allowed)
 
 
 @dataclass(frozen=True, eq=False)
 class SensorProblem:
-    """Weigh hypotheses about sensor, scene or both against a recording's usable readings."""
+    """The problem of inferring sensor, scene or both from a recording's usable readings."""
 
     prior: Prior
     model: SensorModel
@@ -70,9 +70,9 @@ class SensorProblem:
             raise ParameterError("prior.names", self.prior.names, f"the model's names {self.model.names}")
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Predict the whole plan (lag and backlash need every row), weigh the usable readings.
+        """Log likelihood of the usable readings; the whole plan is predicted, as lag and backlash need every row.
 
-        Of very many readings a few hypotheses at a time, so that memory does not grow with their product.
+        Hypotheses are processed in blocks to bound the memory.
         """
         at_once = max(_MOST_NUMBERS // max(len(self.recording), 1), 1)
         if len(theta) > at_once:

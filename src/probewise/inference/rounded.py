@@ -1,4 +1,4 @@
-"""Score readings that the sensor rounds to whole steps and keeps within its scale."""
+"""Likelihood of readings that the sensor rounds to steps and clips to its scale."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from probewise.inference._residuals import residuals
 
 __all__ = ["Rounded"]
 
-_FAR = 200.0  # sds from the prediction that the table goes to
-_PER_SD = 50.0  # its entries a sd: a line between them is off by less than 1e-4
+_FAR = 200.0  # sds from the prediction that the table covers
+_PER_SD = 50.0  # table entries per sd: linear interpolation errs by less than 1e-4
 
 
 @dataclass(frozen=True)
 class Rounded:
-    """Give each reading the probability of its cell: Gaussian noise of known sd, then rounding, then the scale's ends.
+    """Probability of a reading's rounding cell: Gaussian noise of known sd, then rounding, then clipping.
 
-    Where the noise is not much wider than a step, a density of the rounded reading claims more than was
-    read.
+    Where the noise is not much wider than a step, a density at the rounded reading would overstate its
+    information.
 
     Parameters
     ----------
     sd
         Sd of the noise before rounding, in units of the reading.
     step
-        What readings are whole multiples of.
+        Rounding step: readings are whole multiples of it.
     low, high
-        Ends of the scale: a reading there may stand for anything beyond.
+        Ends of the scale: a reading there covers everything beyond.
     """
 
     sd: float
@@ -52,7 +52,7 @@ class Rounded:
             raise ParameterError("(low, high)", (self.low, self.high), "low < high")
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Natural log of the readings' probability, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = (readings >= self.high) | (readings <= self.low)
@@ -62,7 +62,7 @@ class Rounded:
         return np.asarray(self._log_cell(away).sum(axis=1))
 
     def _log_cell(self, away: FloatArray) -> FloatArray:
-        """Log of a cell's probability by its distance from the prediction in sds, from a table of it."""
+        """Tabulated log probability of a cell, by its distance from the prediction in sds."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)
         below = self._table[entry]
@@ -73,7 +73,7 @@ class Rounded:
         return np.asarray(out)
 
     def _log_end(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log probability of everything beyond the end of the scale that was read."""
+        """Log probability of a clipped reading: everything beyond that end of the scale."""
         inward = np.where(readings >= self.high, predicted - readings, readings - predicted)
         return np.asarray(log_ndtr((inward + 0.5 * self.step) / self.sd))
 
@@ -83,6 +83,6 @@ class Rounded:
 
 
 def _log_between(away: FloatArray, half: float) -> FloatArray:
-    """Log probability that a standard normal is within `half` of `away`, by the upper tail, which keeps its digits."""
+    """Log probability that a standard normal is within `half` of `away`, from upper tails, for precision."""
     upper, lower = log_ndtr(half - away), log_ndtr(-half - away)
     return np.asarray(upper + np.log1p(-np.exp(lower - upper)))

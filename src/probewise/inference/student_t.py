@@ -1,9 +1,9 @@
-"""Score residuals whose noise level is unknown: the paper's Student-t likelihood, made proper.
+"""The paper's Student-t likelihood of readings with unknown noise sd, made proper.
 
-The paper integrates a Gaussian over its unknown sigma and keeps [sum of squares]^(-(N-1)/2). A
-prior of sigma without bounds gives an infinite spike where the fit passes through the few readings
-of a small data set, and says nothing after one reading; so here sigma's prior is 1/sigma between a
-floor and a ceiling, and every constant stays.
+The paper integrates a Gaussian over its unknown sigma and keeps [sum of squares]^(-(N-1)/2). With
+an unbounded prior of sigma this diverges where a hypothesis fits the few readings of a small data set
+exactly, and is flat after one reading. So here sigma's prior is 1/sigma between a floor and a
+ceiling, and all constants are kept.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
     """Log of the integral of sigma^(-n-1) exp(-square / (2 sigma^2)) over sigma from `low` to `high`.
 
     With t = square / (2 sigma^2) it is (2 / square)^(n/2) / 2 times a difference of two incomplete
-    gamma functions of order n/2. It is taken in log space, from whichever tail both ends lie in,
-    so that it holds from square = 0 to squares whose integral underflows any float.
+    gamma functions of order n/2. It is computed in log space from the tail in which both ends lie,
+    so it is accurate from square = 0 to squares whose integral underflows.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
 
     Returns
     -------
-    Of the arguments' broadcast shape.
+    Natural log of the integral, of the arguments' broadcast shape.
     """
     s, a = np.asarray(square, dtype=np.float64), np.asarray(n, dtype=np.float64) / 2.0
     with np.errstate(over="ignore"):
@@ -83,7 +83,7 @@ def _log_difference(large: FloatArray, small: FloatArray) -> FloatArray:
 
 
 def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
-    """Log of gamma(a, t) / t^a, finite at t = 0; for t below a or so."""
+    """Log of gamma(a, t) / t^a, finite at t = 0; for t below about a."""
     share = gammainc(a, t)
     safe = np.where(share > _TINY, t, 1.0)
     out = np.log(np.maximum(share, _TINY)) + gammaln(a) - a * np.log(safe)
@@ -99,13 +99,13 @@ def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def _log_upper(a: FloatArray, t: FloatArray) -> FloatArray:
-    """Log of Gamma(a, t), for t above a or so; t may be inf, where it is -inf."""
+    """Log of Gamma(a, t), for t above about a; -inf at t = inf."""
     share = gammaincc(a, t)
     out = np.log(np.maximum(share, _TINY)) + gammaln(a)
     rare = share <= _TINY
     if rare.any():
         b, x = a[rare], t[rare]
-        # Legendre's continued fraction, from its tail.
+        # Legendre's continued fraction, evaluated from its tail.
         fraction = np.zeros_like(x)
         for k in range(_N_TERMS, 0, -1):
             fraction = k * (k - b) / (x + 2 * k + 1 - b - fraction)
@@ -117,7 +117,7 @@ def _log_upper(a: FloatArray, t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class StudentT:
-    """Integrate a Gaussian over the unknown sd of each data set (paper, eq. studentT and the product below it).
+    """Student-t likelihood: Gaussian noise, the sd of each data set integrated out (paper, eq. studentT and product).
 
     For a data set of N readings with sum of squares S, and L = ln(sd_ceiling / sd_floor):
     (2 pi)^(-N/2) / L times the integral of sigma^(-N-1) exp(-S / 2 sigma^2) from floor to ceiling.
@@ -125,7 +125,7 @@ class StudentT:
     Parameters
     ----------
     groups
-        Number of the data set each reading belongs to, (n_points,); any integers.
+        Label of the data set of each reading, (n_points,); any integers.
     sd_floor, sd_ceiling
         Bounds of every data set's sigma, in units of the reading.
     """
@@ -151,7 +151,7 @@ class StudentT:
         return np.asarray(self._membership.sum(axis=0))
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,), all constants kept."""
+        """Log likelihood of each hypothesis, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
             raise ShapeError(f"{residual.shape[1]} readings against {self.groups.size} groups; allowed: one each")
@@ -163,14 +163,14 @@ class StudentT:
         return np.asarray(integral.sum(axis=1) - constant)
 
     def pooled(self, readings: FloatArray, predicted: FloatArray) -> PooledSigma:
-        """Learn one sigma from the residuals of all data sets, for predicting a new one."""
+        """Posterior of one sigma shared by all data sets, for predicting a new one."""
         residual = residuals(readings, predicted)
         return PooledSigma((residual**2).sum(axis=1), residual.shape[1], self.sd_floor, self.sd_ceiling)
 
 
 @dataclass(frozen=True, eq=False)
 class PooledSigma:
-    """Believe in one sigma for a new scan, learnt by each hypothesis from all residuals so far.
+    """Posterior of one sigma for a new scan, given all residuals of each hypothesis.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ class PooledSigma:
         object.__setattr__(self, "square", frozen(self.square))
 
     def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log density of each new reading by itself, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+        """Marginal log density of each new reading, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
         square = self.square[:, None]
         more = log_sigma_integral(
             square + residuals(readings, predicted) ** 2, self.n + 1, self.sd_floor, self.sd_ceiling
@@ -200,7 +200,7 @@ class PooledSigma:
         return np.asarray(more - self._log_norm()[:, None] - 0.5 * _LOG_2PI)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log density of a new scan as a whole (one sigma for all of it), -> (n_samples,)."""
+        """Joint log density of a new scan with one shared sigma, -> (n_samples,)."""
         residual = residuals(readings, predicted)
         n_new = residual.shape[1]
         square = self.square + (residual**2).sum(axis=1)
@@ -208,7 +208,7 @@ class PooledSigma:
         return np.asarray(more - self._log_norm() - 0.5 * n_new * _LOG_2PI)
 
     def sd(self) -> FloatArray:
-        """Root of the posterior mean of sigma^2: the predictive sd of a reading's noise, (n_samples,)."""
+        """Predictive noise sd: the root of the posterior mean of sigma^2, (n_samples,)."""
         if self.n > 2:
             fewer = log_sigma_integral(self.square, self.n - 2, self.sd_floor, self.sd_ceiling)
             return np.asarray(np.exp(0.5 * (fewer - self._log_norm())))

@@ -1,15 +1,15 @@
 """Model a sensor, let it choose its own measurements, find the physics its model leaves out.
 
-One call each for what the command line does:
+The commands of the command line as functions:
 
-- `calibrate(recording, rng=rng)`: the sensor model of a recording
-- `predict(sensor, plan)`: what it expects to read
-- `explore(sensor, rng=rng)`: the robot finds a shape, choosing its own measurements
-- `audit(plan)`: before any data, what a plan cannot tell
-- `diagnose(recordings, rng=rng)`: the physics that the model leaves out
+- `calibrate(recording, rng=rng)` fits a sensor model to a recording
+- `predict(sensor, plan)` predicts the readings of a plan
+- `explore(sensor, rng=rng)` lets the robot find a shape, choosing its own measurements
+- `audit(plan)` says, before any data, which effects a plan cannot detect or distinguish
+- `diagnose(recordings, rng=rng)` finds the physics that the model leaves out
 
 `Recording.from_arrays` and `Recording.from_table` make recordings, `read_recording`, `read_plan` and `read_sensor` read
-files. Results show themselves in notebooks.
+files. Results display themselves in notebooks.
 
 The parts are packages, loaded as they are used. In the order of one reading's path: `arm` (where readings come from),
 `recordings`, `scene` (what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence

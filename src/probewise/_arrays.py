@@ -1,4 +1,4 @@
-"""Array types and the checks every value makes of its arrays."""
+"""Array types and common checks of arrays."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 
 
 def floats(values: ArrayLike, name: str = "values") -> FloatArray:
-    """Take numbers as an array of floats: an array, a list, a column of a table.
+    """Convert numbers (an array, a list, a column of a table) to an array of floats.
 
-    None becomes NaN, and so does what a masked array hides.
+    None becomes NaN, and so do the masked values of a masked array.
 
     Raises
     ------
     ParameterError
-        If there is a text, a date, a complex number, a set or a list of unequal lists.
+        If there is a text, a date, a complex number, a set or a ragged list.
     """
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(np.float64), np.nan)
@@ -42,7 +42,7 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
 
 
 def frozen(values: ArrayLike, name: str = "values") -> FloatArray:
-    """Copy to a read-only array of floats, so that an immutable value really is one."""
+    """Copy to a read-only array of floats."""
     array = np.array(floats(values, name))
     array.flags.writeable = False
     return array

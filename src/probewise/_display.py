@@ -1,8 +1,7 @@
-"""How results show themselves in a notebook: the values stand low, the pictures high.
+"""Display of results in a notebook, without an import of plotting from the packages that define them.
 
-A value derives from `ShowsItself` and knows nothing of pages or plots; `report.notebook`,
-which stands above, registers how to draw it. The package hands over the function that loads
-those renderers, and the first display calls it.
+A value derives from `ShowsItself`; `report.notebook`, higher in the layers, registers its renderer.
+The package registers the function that loads the renderers, and the first display calls it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ _waiting: list[Callable[[], object]] = []
 
 
 def before_first_display(load: Callable[[], object]) -> None:
-    """Call `load` once, when a value is first shown: drawing is not loaded for nothing."""
+    """Call `load` once, when a value is first displayed, so that plotting is imported only when needed."""
     _waiting.append(load)
 
 
@@ -29,7 +28,7 @@ def render_html(value: object) -> str:
 
 
 class Printer(Protocol):
-    """What IPython hands over to be written on."""
+    """IPython's pretty printer."""
 
     def text(self, text: str, /) -> None:
         """Write text."""
@@ -37,7 +36,7 @@ class Printer(Protocol):
 
 
 class ShowsItself:
-    """Give a value the `_repr_html_` that notebooks look for; `str` of it, and a terminal, show its summary."""
+    """Base of values that display themselves: HTML in a notebook, the summary in a terminal and as `str`."""
 
     __slots__ = ()
 

@@ -1,4 +1,4 @@
-"""Refuse values of the wrong kind in words, where they are made, and not as a TypeError three calls further down."""
+"""Checks of argument types, with messages that say what is allowed."""
 
 from __future__ import annotations
 
@@ -82,14 +82,14 @@ def require_one_or_several(
 
 
 def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
-    """Raise ParameterError unless `value` is one of these names, saying which was perhaps meant."""
+    """Raise ParameterError unless `value` is one of these names; the message suggests the nearest."""
     if isinstance(value, str) and value in known:
         return
     raise ParameterError(name, value, ", ".join(map(repr, known)) + did_you_mean(value, known))
 
 
 def did_you_mean(value: object, known: Iterable[str]) -> str:
-    """Ask after the known name that is nearest to a misspelt one, as the end of a message; "" where none is near."""
+    """Suggest the known name nearest to a misspelt one, to end a message; "" where none is near."""
     near = difflib.get_close_matches(value, list(known), n=1) if isinstance(value, str) else []
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -100,7 +100,7 @@ def require_flag(name: str, value: object) -> None:
 
 
 def require_path(name: str, value: object, allowed: str = "the name of a file: a text or a Path") -> Path:
-    """Return the name of a file as a Path, or raise ParameterError."""
+    """Return a file name as a Path, or raise ParameterError."""
     if isinstance(value, os.PathLike) or (isinstance(value, str) and value):
         named = os.fspath(value)
         if isinstance(named, str):
@@ -117,7 +117,7 @@ def require_kind(name: str, value: object, kind: type | tuple[type, ...], allowe
 
 
 def require_like(name: str, value: object, attributes: Sequence[str], allowed: str) -> None:
-    """Raise ParameterError unless `value` has these attributes and is no class itself (`Circle` for `Circle()`)."""
+    """Raise ParameterError unless `value` has these attributes; a class (`Circle` for `Circle()`) is refused too."""
     if isinstance(value, type):
         raise ParameterError(name, value, f"{allowed}; this is the class, a value of it is {value.__name__}(...)")
     for attribute in attributes:

@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar on a terminal or in a notebook, elsewhere a line now and then."""
+"""Progress on standard error: a bar in a terminal or notebook, otherwise an occasional line."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from probewise.progress import Progress, silent
 
 __all__ = ["of_nested", "progress_or_bar", "progress_shown"]
 
-_PATIENCE_S = 2.0  # what ends sooner needs no bar
+_PATIENCE_S = 2.0  # shorter work shows no bar
 _BETWEEN_LINES_S = 5.0
-_SHARE_OF_ALL = 0.05  # of the time so far: hours of work fill no log
+_SHARE_OF_ALL = 0.05  # of the elapsed time, the least wait between lines, so that long work does not flood a log
 _BEAT_S = 0.5
 _WITH_TOTAL = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt} of {total_fmt} [{elapsed}, {remaining} left]{postfix}"
 _WITHOUT = "{desc} [{elapsed}]{postfix}"
@@ -27,16 +27,16 @@ _WITHOUT = "{desc} [{elapsed}]{postfix}"
 
 @contextlib.contextmanager
 def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Iterator[Progress]:
-    """Yield what shows how far the work is, once it takes longer than two seconds.
+    """Yield a progress display that appears once the work has taken two seconds.
 
     Parameters
     ----------
     quiet
         Show nothing.
     beat
-        Keep the clock going between two words of the work. Not while a person is asked at the same terminal.
+        Update the elapsed time between reports; not while the program prompts at the same terminal.
     lines
-        Write lines of text where nobody looks: where standard error is neither a terminal's nor a notebook's.
+        Write lines of text where standard error is neither a terminal nor a notebook.
     """
     looked_at = sys.stderr.isatty() or "ipykernel" in sys.modules
     if quiet or not (looked_at or lines):
@@ -65,7 +65,7 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
 
 @contextlib.contextmanager
 def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
-    """Yield what a caller wants told: a callable of his own, a bar where somebody looks (True), or nothing (False).
+    """Yield the caller's progress function, a bar in a terminal or notebook (True), or nothing (False).
 
     Raises
     ------
@@ -81,7 +81,7 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
 
 
 def of_nested(progress: Progress) -> Callable[[int | str, State], None]:
-    """Tell of nested sampling, after every round: of a number of Gaussians, or of a hypothesis by name."""
+    """Adapt a progress function to nested sampling; each run is named or has a number of Gaussians."""
 
     def tell(what: int | str, state: State) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
@@ -92,7 +92,7 @@ def of_nested(progress: Progress) -> Callable[[int | str, State], None]:
 
 
 class _Said(NamedTuple):
-    """The last word of the work; see `Progress`."""
+    """The last report; its fields are the arguments of `Progress`."""
 
     stage: str
     done: int
@@ -101,7 +101,7 @@ class _Said(NamedTuple):
 
 
 class _Bars:
-    """A bar for each stage; those that took their time stay."""
+    """One bar per stage; bars of stages longer than two seconds stay visible."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -119,7 +119,7 @@ class _Bars:
             self._draw()
 
     def beat(self) -> None:
-        """Let the clock go on."""
+        """Update the elapsed time."""
         with self._lock:
             self._draw()
             if self._bar is not None:
@@ -142,7 +142,7 @@ class _Bars:
 
     def _end(self, *, ended: bool) -> None:
         if self._bar is not None:
-            if ended and self._bar.total:  # a stage may come to its end early
+            if ended and self._bar.total:  # a stage may end before its last step
                 self._bar.n = self._bar.total
             self._bar.leave = time.time() - self._began > _PATIENCE_S
             self._bar.close()
@@ -150,7 +150,7 @@ class _Bars:
 
 
 class _Lines:
-    """A line of text after two seconds, after five more, and more seldom as the work goes on."""
+    """A line of text after two seconds, after five more, and then at growing intervals."""
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
@@ -174,4 +174,4 @@ class _Lines:
         sys.stderr.flush()
 
     def close(self, *, ended: bool) -> None:
-        """Nothing is left open."""
+        """Do nothing: lines need no end."""

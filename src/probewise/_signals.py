@@ -1,4 +1,4 @@
-"""Signals that end a program, and how to finish a few lines before one of them is heard."""
+"""Signals that end a program, and a way to defer them during a critical block."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["ENDING", "SAME_S", "deferred"]
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")
 ENDING: Final = tuple(signal.Signals[name] for name in _NAMES if hasattr(signal, name))
 SAME_S: Final = 1.0
-"""Signals that come within so many seconds are one request: a closed terminal sends several."""
+"""Signals within this many seconds count as one request: a closed terminal sends several."""
 
 
 @contextlib.contextmanager
 def deferred() -> Iterator[None]:
-    """Finish the block before a signal that ends the program is heard; a repeated one is heard at once.
+    """Defer signals that end the program until the block ends; a repeated signal acts at once.
 
-    For lines that must not be left half done: stopping motors, putting files in place. Outside the main
-    thread, which alone hears signals, it does nothing.
+    For blocks that must not be interrupted: stopping motors, putting files in place. Outside the main
+    thread, which alone receives signals, it does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,8 +1,8 @@
-"""Many independent tasks on any executor, one line of a file each: stopped at any moment, it goes on.
+"""Run many independent tasks on any executor, with one line of a file per result, resumable after any stop.
 
-Format "campaign/1". The first line says what the campaign is: whatever decides its results. Every
-further line is a finished task, its key and its result. Lines come in the order in which the tasks
-end; what is made of them is made in the order of the keys, so that it does not depend on the executor.
+Format "campaign/1". The first line holds the settings that determine the results. Every further line
+is a finished task: its key and its result, in order of completion. Results are returned in the order
+of the tasks, so that nothing depends on the executor.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Result = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Finished:
-    """What a campaign's file holds: its settings, and the results by key, in the order of ending."""
+    """Contents of a campaign's file: its settings, and the results by key in order of completion."""
 
     settings: Mapping[str, Any]
     results: Mapping[str, Result]
@@ -46,24 +46,24 @@ def run_campaign(
     progress: Progress = silent,
     noun: str = "tasks",
 ) -> dict[str, Result]:
-    """Do every task that the file does not hold yet.
+    """Run the tasks whose results are not yet in the file.
 
     Parameters
     ----------
     work
-        Turns a task into a JSON object; a function at the top level of a module where workers are processes.
+        Function from a task to its result, a JSON object; defined at module level if workers are processes.
     tasks
-        Task by key. Each must bring its own seed: which worker does it, and when, must not matter.
+        Tasks by key. Each carries its own seed, so that the order and the worker do not matter.
     path
-        The campaign's file; made if missing, continued if there.
+        The campaign's file; created if missing, continued if present.
     settings
-        What decides the results, a JSON object; a file with other settings is refused.
+        Everything that determines the results, a JSON object; a file with other settings is refused.
     executor
-        Any `concurrent.futures.Executor`, also one of other machines; None: here, one after another.
+        Any `concurrent.futures.Executor`, also of other machines; None runs the tasks here, one by one.
     progress
-        Told how many tasks have ended, those of an earlier go with them, and the key of the last.
+        Called with the number of finished tasks, earlier runs included, and the key of the last.
     noun
-        What it calls them.
+        Name of the tasks in progress messages.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def run_campaign(
     FileError
         If the file belongs to another campaign, is damaged before its last line, or is being written to.
     NotConvergedError
-        If the executor's workers die; all that ended before is kept.
+        If a worker dies; finished results are kept.
     """
     path = Path(path)
     wanted = json.loads(json.dumps(dict(settings)))
@@ -94,14 +94,14 @@ def run_campaign(
 
 
 def read_campaign(path: str | os.PathLike[str]) -> Finished:
-    """Read a campaign's file; a last line that was torn in writing is left out.
+    """Read a campaign's file; an incomplete last line is ignored.
 
     Raises
     ------
     FileError
-        If it is missing, no campaign's, or damaged before its last line.
+        If it is missing, not a campaign's, or damaged before its last line.
     """
-    # The last is what follows the last line end: nothing, or a line that was torn.
+    # After the last line end there is nothing, or an incomplete line.
     *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
     rows = [_parsed(path, number, line) for number, line in enumerate(lines, start=1)]
     if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
@@ -118,14 +118,14 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
 
 
 def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str, Any]:
-    row = json_of(path, line, "one JSON object a line", row=number)
+    row = json_of(path, line, "one JSON object per line", row=number)
     if not isinstance(row, dict):
-        raise FileError(path, "not an object", "one JSON object a line", row=number)
+        raise FileError(path, "not an object", "one JSON object per line", row=number)
     return row
 
 
 class _Lines:
-    """Append lines, each on disk before the next; a torn end is cut off first."""
+    """Append lines, each synced to disk before the next; an incomplete last line is cut off first."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:
         if fresh:
@@ -167,7 +167,7 @@ class _Lines:
 def _ended(
     work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, Result]]]:
-    """Yield (key, result) as tasks end; on leaving, tasks that have not begun are called off."""
+    """Yield (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""
     if executor is None:
         yield ((key, work(task)) for key, task in tasks.items())
         return
@@ -184,5 +184,5 @@ def _result_of(future: Future[Result]) -> Result:
         return future.result()
     except BrokenExecutor as error:
         raise NotConvergedError(
-            f"a worker died ({error}); what had ended is kept, and the same command goes on from there"
+            f"a worker died ({error}); finished results are kept, and the same command continues from there"
         ) from error

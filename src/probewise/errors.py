@@ -1,4 +1,4 @@
-"""What can go wrong, each error also the builtin a caller would expect."""
+"""Errors and warnings of the package; each error also derives from the builtin a caller would expect."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ __all__ = [
     "shown",
 ]
 
-_LONGEST_VALUE = 100  # characters of a bad value that a message repeats
+_LONGEST_VALUE = 100  # characters of a bad value that a message shows
 _LONGEST_PART = 400  # characters of each part of a message
 
 
 def shortened(text: str, most: int = _LONGEST_PART) -> str:
-    """Cut a text after `most` characters, say how long it was, and escape what a terminal would obey."""
+    """Cut a text after `most` characters, say how long it was, and escape control characters."""
     begun = text[:most]
     if not begun.isprintable():
         begun = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in begun)
@@ -33,16 +33,16 @@ def shortened(text: str, most: int = _LONGEST_PART) -> str:
 
 
 def shown(value: object, most: int = _LONGEST_VALUE) -> str:
-    """Write a value in one line as Python would, cut after `most` characters."""
+    """Return the repr of a value on one line, cut after `most` characters."""
     try:
         text = " ".join(repr(value).split())
-    except (ValueError, RecursionError):  # a whole number of thousands of digits, or a list nested as deep
+    except (ValueError, RecursionError):  # an integer of thousands of digits, or a list nested too deep
         return f"a huge {type(value).__name__}"
     return shortened(text, most)
 
 
 class ProbewiseError(Exception):
-    """Stand above every error that this package raises on purpose."""
+    """Base class of the errors that this package raises on purpose."""
 
 
 class ParameterError(ProbewiseError, ValueError):
@@ -62,7 +62,7 @@ class ShapeError(ProbewiseError, ValueError):
 
 
 class FileError(ProbewiseError, ValueError):
-    """Report a file that cannot be used: which file, where in it, what stood there, what is allowed."""
+    """Report a file that cannot be used: the file, the place in it, what was found, what is allowed."""
 
     def __init__(
         self, path: object, found: str, allowed: str, *, row: int | None = None, column: str | None = None
@@ -76,7 +76,7 @@ class FileError(ProbewiseError, ValueError):
         super().__init__(f"{where}: {shortened(found)}; allowed: {shortened(allowed)}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        # As for ParameterError; `partial` carries what is keyword-only.
+        # As for ParameterError; `partial` carries the keyword-only arguments.
         return partial(type(self), row=self.row, column=self.column), (self.path, self.found, self.allowed)
 
 
@@ -89,7 +89,7 @@ class LinkError(ProbewiseError, OSError):
 
 
 class NotConvergedError(ProbewiseError, RuntimeError):
-    """Report a computation that stopped short; `partial` holds what there is."""
+    """Report a computation that did not converge; `partial` holds the result so far."""
 
     def __init__(self, message: str, partial: object = None) -> None:
         self.partial = partial
@@ -97,16 +97,16 @@ class NotConvergedError(ProbewiseError, RuntimeError):
 
 
 class DoubtfulResultWarning(UserWarning):
-    """Warn of a result that can be used but not trusted blindly; the result holds the reason too."""
+    """Warn of a usable but doubtful result; the result holds the reason too."""
 
 
 class SlowWarning(UserWarning):
-    """Warn of a computation that takes a slow way where a quick one could be given."""
+    """Warn of a slow fallback where the caller could provide a fast method."""
 
 
 class NotSavedWarning(UserWarning):
-    """Warn of a computation that goes on but could not be saved on the way."""
+    """Warn that intermediate results could not be saved; the computation goes on."""
 
 
 class LowBatteryWarning(UserWarning):
-    """Warn of a battery that will not drive the instrument much longer, or not as it should."""
+    """Warn of a battery too low to drive the instrument reliably or for much longer."""

@@ -1,6 +1,6 @@
-"""What is believed before any reading: probability distributions by name.
+"""Prior distributions of named parameters.
 
-Priors stand below shapes, sensors and effects because each of these carries its own.
+Shapes, sensors and effects each carry their own prior, so this module stands below them.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ __all__ = ["Empty", "Joint", "LogUniform", "Marginal", "Normal", "Prior", "Produ
 
 @runtime_checkable
 class Prior(Protocol):
-    """A distribution of several named parameters that the unit cube can be mapped to."""
+    """A distribution of several named parameters, with a map from the unit cube."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameter names, one a column of theta."""
+        """Parameter names, one per column of theta."""
         ...
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
@@ -34,7 +34,7 @@ class Prior(Protocol):
         ...
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map parameters back to a point of the unit cube that leads to them, same shapes."""
+        """Map parameters to a point of the unit cube that maps back to them, same shapes."""
         ...
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
@@ -43,20 +43,20 @@ class Prior(Protocol):
 
 
 class Coordinates(Protocol):
-    """Coordinates in which a problem is simpler than in its parameters or the unit cube.
+    """Coordinates in which the posterior is simpler than in the parameters or the unit cube.
 
-    A prior that has a property `coordinates` of this kind is sampled in them: what readings fix
-    sharply should be an axis there, not a bent surface through several.
+    A prior with a property `coordinates` of this kind is sampled in them. A quantity that the readings
+    determine sharply should be an axis there, not a curved surface across several axes.
     """
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        """Map parameters with positive prior density to coordinates, (n_samples, n_params) both ways."""
+        """Map parameters of positive prior density to coordinates, both (n_samples, n_params)."""
         ...
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters; also the prior's log density over coordinates, (n_samples,).
+        """Map coordinates to parameters; also return the prior's log density in the coordinates, (n_samples,).
 
-        Any finite coordinates are allowed; the density is -inf where they lead nowhere.
+        Any finite coordinates are allowed; the density is -inf where they match no parameters.
         """
         ...
 
@@ -69,7 +69,7 @@ class Marginal(Protocol):
         ...
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Distribution function, any shape: the inverse of `from_unit`."""
+        """Cumulative distribution function, any shape: the inverse of `from_unit`."""
         ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
@@ -79,7 +79,7 @@ class Marginal(Protocol):
 
 @dataclass(frozen=True)
 class Uniform:
-    """Spread belief evenly between two bounds."""
+    """Uniform distribution between two bounds."""
 
     low: float
     high: float
@@ -95,7 +95,7 @@ class Uniform:
         return self.low + (self.high - self.low) * u
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Distribution function, any shape: low..high -> 0..1."""
+        """Cumulative distribution function, any shape: low..high -> 0..1."""
         return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
@@ -109,7 +109,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class LogUniform:
-    """Spread belief evenly over orders of magnitude (Jeffreys' prior of a scale, made proper)."""
+    """Log-uniform distribution between two bounds (Jeffreys' prior of a scale, made proper)."""
 
     low: float
     high: float
@@ -125,7 +125,7 @@ class LogUniform:
         return np.asarray(self.low * (self.high / self.low) ** u)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Distribution function, any shape."""
+        """Cumulative distribution function, any shape."""
         within = np.clip(value, self.low, self.high)
         return np.asarray(np.log(within / self.low) / math.log(self.high / self.low))
 
@@ -141,7 +141,7 @@ class LogUniform:
 
 @dataclass(frozen=True)
 class Normal:
-    """Believe a value near `mean`, give or take `sd`."""
+    """Normal distribution with this mean and sd."""
 
     mean: float
     sd: float
@@ -157,7 +157,7 @@ class Normal:
         return self.mean + self.sd * np.asarray(ndtri(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Distribution function, any shape."""
+        """Cumulative distribution function, any shape."""
         return np.asarray(ndtr((value - self.mean) / self.sd))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
@@ -171,7 +171,7 @@ class Normal:
 
 @dataclass(frozen=True)
 class Product:
-    """Join independent marginals by name."""
+    """Joint distribution of independent marginals, by name."""
 
     marginals: Mapping[str, Marginal]
 
@@ -189,17 +189,17 @@ class Product:
         return tuple(self.marginals)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map each coordinate by its own marginal, (n_samples, n_params) both ways."""
+        """Map each coordinate by its own marginal, both (n_samples, n_params)."""
         u = _columns(u, self.names)
         return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map each parameter by its own marginal, (n_samples, n_params) both ways."""
+        """Map each parameter by its own marginal, both (n_samples, n_params)."""
         theta = _columns(theta, self.names)
         return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Sum of the marginals, (n_samples, n_params) -> (n_samples,)."""
+        """Sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = _columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
@@ -209,7 +209,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Joint:
-    """Join independent priors of several parameters each, in order."""
+    """Joint distribution of independent priors of several parameters each, in order."""
 
     parts: tuple[Prior, ...]
 
@@ -226,17 +226,17 @@ class Joint:
         return tuple(name for part in self.parts for name in part.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map each part's coordinates by that part, (n_samples, n_params) both ways."""
+        """Map each part's coordinates by that part, both (n_samples, n_params)."""
         u = _columns(u, self.names)
         return np.concatenate([p.from_unit_cube(c) for p, c in self._split(u)], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map each part's parameters by that part, (n_samples, n_params) both ways."""
+        """Map each part's parameters by that part, both (n_samples, n_params)."""
         theta = _columns(theta, self.names)
         return np.concatenate([p.to_unit_cube(c) for p, c in self._split(theta)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Sum of the parts, (n_samples, n_params) -> (n_samples,)."""
+        """Sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = _columns(theta, self.names)
         total = np.zeros(len(theta))
         for part, columns in self._split(theta):
@@ -250,28 +250,28 @@ class Joint:
 
 @dataclass(frozen=True)
 class Empty:
-    """Believe nothing about nothing: the prior of a model without free parameters."""
+    """The prior of a model without free parameters."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """None."""
+        """No names."""
         return ()
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Return the points: they have no coordinates."""
+        """Return the points unchanged: they have no coordinates."""
         return u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Return the points: they have no coordinates."""
+        """Return the points unchanged: they have no coordinates."""
         return theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Zero for each sample: the one hypothesis is certain."""
+        """Zero for each sample: the only hypothesis has probability 1."""
         return np.zeros(len(theta))
 
 
 def require_prior(name: str, prior: object, *more: str) -> None:
-    """Raise ParameterError unless `prior` has named parameters, a unit cube and the methods `more`."""
+    """Raise ParameterError unless `prior` has `names`, `from_unit_cube` and the methods `more`."""
     allowed = "a prior of named parameters, such as Product({'x_mm': Uniform(0.0, 1.0)})"
     require_like(name, prior, ("names", "from_unit_cube"), allowed)
     missing = [method for method in more if not hasattr(prior, method)]

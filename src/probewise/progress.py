@@ -1,4 +1,4 @@
-"""How far a long computation is: told to whoever asked for it, and to nobody by default."""
+"""The protocol by which a long computation reports its progress; silent by default."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ __all__ = ["Progress", "silent"]
 
 
 class Progress(Protocol):
-    """What is called as a computation goes on; the command line shows a bar, a notebook may print."""
+    """A function called as a computation proceeds; the command line shows a bar, a notebook may print."""
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        """Tell how far a stage is.
+        """Report the progress of a stage.
 
         Parameters
         ----------
         stage
-            What is being done, in a few words; a new text begins a new stage.
+            Name of the stage, in a few words; a new name begins a new stage.
         done, total
-            Steps done, and how many there are; 0 where nobody can know.
+            Steps done, and their total number; 0 where it is unknown.
         note
-            What there is to say of it now.
+            Current remark, such as the evidence so far.
         """
 
 
 def silent(stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-    """Tell nobody."""
+    """Ignore the report."""

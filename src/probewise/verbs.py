@@ -1,7 +1,7 @@
-"""What people do with the package, one call each, as the command line does it: same names, same defaults.
+"""The commands of the command line as Python functions, with the same names and defaults.
 
-The packages below hold the parts, with every option. Nothing heavy is imported before a verb is called, so
-that `import probewise` and `probewise --help` are quick.
+The packages below offer the same with every option. Heavy imports happen inside the functions, so that
+`import probewise` and `probewise --help` are quick.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
     "predict",
 ]
 
-# What the command line and the functions below do where nobody says otherwise.
+# Defaults of the command line and of the functions below.
 ORDERS = (1, 2, 3, 4)
 N_LIVE = 300
 SHAPE = "circle"
@@ -55,25 +55,25 @@ def calibrate(
     rng: np.random.Generator,
     progress: bool | Progress = True,
 ) -> Calibration:
-    """Fit the sensor model of a recording; weigh numbers of Gaussians by their evidence.
+    """Fit a sensor model to a recording; compare numbers of Gaussians by their evidence.
 
     Parameters
     ----------
     recording
         Readings over known patterns.
     orders
-        Numbers of Gaussians to weigh.
+        Numbers of Gaussians to compare.
     n_live
-        Live points of nested sampling: fewer are faster, and their evidences less certain.
+        Live points of nested sampling: fewer are faster but make the evidences less precise.
     rng
-        Source of randomness; with `np.random.default_rng(seed)` the result of `probewise calibrate --seed`.
+        Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise calibrate --seed`.
     progress
-        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
+        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------
     Calibration
-        Its `sensor` is the fitted sensor of the most probable order.
+        Its `sensor` is the fitted sensor of the most probable number of Gaussians.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def calibrate(
 
     See Also
     --------
-    probewise.calibration.calibrate : The same with priors, data sets and an executor of one's own.
+    probewise.calibration.calibrate : The same with your own priors, data sets and executor.
 
     Examples
     --------
@@ -109,17 +109,17 @@ def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
     sensor
         The fitted sensor.
     plan
-        Where, when and over what to read; or a recording, whose readings are then scored.
+        Pose, time and pattern of every reading; or a recording, whose readings are then scored.
 
     Returns
     -------
     Prediction
-        Mean and sd of one new reading for each row, and the log density of what was recorded.
+        Predictive mean and sd of a reading for each row, and the log density of each recorded reading.
 
     Raises
     ------
     ParameterError
-        If something is not of its kind, or a pattern is not described.
+        If an argument has the wrong type, or a pattern is not described.
 
     Examples
     --------
@@ -158,60 +158,59 @@ def explore(
 ) -> Exploration:
     """Let the robot find a shape, choosing each measurement itself.
 
-    Without an `arm` a simulated one stands over a field that hides a shape; what its sensor really sees comes from
-    the sensor too, painted pixel by pixel by `probewise.world`.
+    Without an `arm` it is simulated: `probewise.world` hides a shape on a field and computes the readings pixel by
+    pixel, with the SSF of `sensor` as the truth.
 
     Parameters
     ----------
     sensor
         A fitted sensor, of `calibrate` or `read_sensor`.
     shape
-        What may lie on the field: "circle", "ellipse", "rectangle", "triangle", "hexagon", several of them, or a shape
+        The hypothesis: "circle", "ellipse", "rectangle", "triangle", "hexagon", several of them, or a shape
         of `probewise.scene`.
     truth
-        What the simulated field hides: the parameters of the (first) shape, for a circle (x_mm, y_mm, radius_mm) or
+        Hidden parameters of the (first) shape on the simulated field, for a circle (x_mm, y_mm, radius_mm) or
         {"x_mm": 600, "y_mm": 260, "radius_mm": 90}; or {"rectangle": ...}, by name. By default drawn from the shape's
         prior.
     arm
-        Where the readings come from; entered and left here (`with arm:`). By default the simulated arm. An instrument
-        of your own needs no more than `measure(pose)`, which returns a number or a dict; see
-        `probewise.arm.instrument_of`.
+        The instrument, used as a context manager; by default the simulated arm. Your own needs only a method
+        `measure(pose)` that returns a number or a dict; see `probewise.arm.instrument_of`.
     field
         Width and height of the field; by default those of the paper.
     model
-        "ssf", or "naive": what the robot takes its sensor for.
+        The robot's sensor model: "ssf" or "naive".
     utility
-        What a reading is worth, by the names of `inquiry.UTILITY_NAMES`, or a utility.
+        The acquisition function: one of `inquiry.UTILITY_NAMES`, or your own utility.
     learn_sensor
-        Infer the size and place of the footprint and both levels along with the shape.
+        Infer the size and position of the footprint and both levels along with the shape.
     batch
-        Readings that are chosen at a time.
+        Number of readings chosen at a time.
     orientations_rad, heights_mm, repeats
-        What else may be chosen, of an arm that can: see `probewise.experiment.experiment_for`. One number leaves no
-        choice.
+        Candidate orientations, heights and repeats, for an arm that can vary them; one number leaves no choice. See
+        `probewise.experiment.experiment_for`.
     trust
-        Probability that the sensor model leaves nothing out; below 1 the run weighs what it may leave out along with
-        the shape. By default 0.9; 1 with the naive model, a sensor learnt along, another utility, or several shapes.
+        Prior probability that the sensor model is complete; below 1 the run also infers which effect it leaves out.
+        By default 0.9; 1 with the naive model, `learn_sensor`, another utility, or several shapes.
     max_readings
-        Stop here if the shape is not known by then.
+        Stop after so many readings at the latest.
     journal
-        File that gets one JSON line a measurement, in a folder that is made if missing; where it exists already the run
-        goes on from it, given an `rng` of the same seed, the same sensor and the same truth.
+        File with one JSON line per measurement; its folder is created if missing. If the file exists, the run
+        continues from it, given an `rng` of the same seed, the same sensor and the same truth.
     rng
-        Source of randomness; with `np.random.default_rng(seed)` the run of `probewise explore --seed`.
+        Source of randomness; `np.random.default_rng(seed)` gives the run of `probewise explore --seed`.
     progress
-        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
+        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------
     Exploration
-        Its steps; `last.mean` and `last.sd` are what is known in the end, `hidden` what the simulated
-        field held.
+        Its steps; `last.mean` and `last.sd` are the final posterior mean and sd, `hidden` the true shape of a
+        simulated field.
 
     Raises
     ------
     ParameterError
-        If something is not of its kind, or a truth is given with an arm that measures one.
+        If an argument has the wrong type, or a truth is given together with an arm.
     NotConvergedError
         If no hypothesis could have given the readings.
 
@@ -290,19 +289,19 @@ def explore(
 
 
 def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None) -> PlanAudit:
-    """Say, before any data, which effects a plan cannot see or cannot tell apart, and what readings would cure that.
+    """Audit a plan before any data: which effects are undetectable or aliased, and which readings would cure that.
 
     Parameters
     ----------
     plan
-        What is to be measured; of a recording its plan.
+        The plan, or a recording, of which only the plan is used.
     sensor
-        The sensor as calibrated; without, a typical one is expected.
+        The calibrated sensor; by default a typical one.
 
     Returns
     -------
     PlanAudit
-        How each effect is seen; its `cure_plan` holds the readings to add.
+        Detectability and aliases of each effect; its `cure_plan` holds the readings to add.
 
     Raises
     ------
@@ -311,7 +310,7 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None) -> Plan
 
     See Also
     --------
-    probewise.diagnosis.audit_plan : The same with a vocabulary of one's own.
+    probewise.diagnosis.audit_plan : The same with your own vocabulary.
 
     Examples
     --------
@@ -339,32 +338,32 @@ def diagnose(
     Parameters
     ----------
     recordings
-        One, or several of one apparatus that are diagnosed together.
+        One recording, or several of one apparatus, diagnosed together.
     sensor
         An earlier calibration, whose posterior becomes the prior.
     thorough
-        Weigh the leading hypotheses again by nested sampling, which wins where it disagrees. The bar says how many
-        minutes that takes, about: more with more readings and more leading hypotheses.
+        Recompute the evidence of the leading hypotheses by nested sampling, which overrides Laplace's approximation.
+        The progress bar estimates the minutes; they grow with the numbers of readings and of leading hypotheses.
     rng
-        Source of randomness; with `np.random.default_rng(seed)` the result of `probewise diagnose --seed`.
+        Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise diagnose --seed`.
     progress
-        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
+        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------
     Diagnosis
-        Verdict, probabilities, where the mismatch shows, the repaired model and what to measure next.
+        Verdict, probabilities, location of the mismatch, the repaired model and the advised next readings.
 
     Raises
     ------
     ParameterError
         If there is no usable reading, units differ, or two recordings are the same.
     NotConvergedError
-        If the fit of the sensor model did not arrive anywhere.
+        If the fit of the sensor model failed.
 
     See Also
     --------
-    probewise.diagnosis.diagnose : The same with a vocabulary or a model of one's own.
+    probewise.diagnosis.diagnose : The same with your own vocabulary or model.
 
     Examples
     --------

@@ -269,8 +269,10 @@ def field_of(
     w = w * np.repeat(shares, arrays[0].shape[2])
     total = np.zeros((len(v_mm), len(u_mm)))
     own = np.empty_like(total)  # reused for every Gaussian: allocating it costs more than the sums
-    lightest_first = np.argsort(w)
-    counts = np.cumsum(w[lightest_first]) > _NEGLIGIBLE * w.sum()  # of a nested run's dead points few carry weight
+    weight = np.abs(w)  # a free form's may be negative
+    lightest_first = np.argsort(weight)
+    # Of the dead points of a nested run few carry weight.
+    counts = np.cumsum(weight[lightest_first]) > _NEGLIGIBLE * weight.sum()
     for n in lightest_first[counts]:
         # Conditioning v on u leaves one exponential per Gaussian and pixel.
         slope = cov[n] / var_u[n]

@@ -178,7 +178,8 @@ def calibrate(
     Raises
     ------
     ParameterError
-        If no order is asked for, or the recording has no contrast (see `scan_geometry`).
+        If no order is asked for, the recording has no contrast (see `scan_geometry`), or a name in it is one that
+        no file can hold.
 
     Warns
     -----
@@ -190,6 +191,7 @@ def calibrate(
     require_rng(rng)
     require_whole("n_live", n_live)
     wanted = _orders(orders)
+    fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
     one = partial(
         _fit_order,
         recording,

@@ -135,7 +135,7 @@ def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[Int
     The number of each reading's scan, (n_points,), and the scans' names.
     """
     if names is None or isinstance(names, str):
-        return np.zeros(n_points, dtype=np.int64), (names or "scan",)
+        return np.zeros(n_points, dtype=np.int64), (_text("scan", names or "scan"),)
     cells = _texts("scan", names, n_points)
     starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
     begins = np.zeros(n_points, dtype=np.int64)
@@ -205,7 +205,14 @@ def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
     for k, cell in enumerate(cells):
         if _is_missing(cell):
             raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
-    return [str(cell) for cell in cells]
+    return [_text(name, str(cell)) for cell in cells]
+
+
+def _text(what: str, text: str) -> str:
+    """Take a name as it is read from a file: without the blanks around it."""
+    if not text.strip().isprintable():
+        raise ParameterError(what, text, "a printable text, without line ends")
+    return text.strip()
 
 
 def _is_missing(cell: object) -> bool:

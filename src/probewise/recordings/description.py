@@ -206,6 +206,8 @@ def read_description(path: Path) -> Description:
     notes: list[str] = []
     listed = top.get("patterns", "at least one pattern by name")
     for name, fields_of_it in _Fields(path, "patterns", listed).content.items():
+        if name != name.strip() or not name.isprintable():
+            raise FileError(path, f"patterns has a name {_shown(name)}", "a printable text without blanks around it")
         f = _Fields(path, f"patterns.{name}", fields_of_it)
         kind = f.text("kind", f"one of {', '.join(_KINDS)}")
         if kind not in _KINDS:

@@ -26,6 +26,7 @@ __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recordin
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
+_A_NAME = "a printable text without blanks around it"
 _FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
 
@@ -118,7 +119,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     """
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         if name != name.strip() or not name.isprintable():
-            raise ParameterError("name", name, "a printable text without blanks around it")
+            raise ParameterError("name", name, _A_NAME)
     clash = [name for name in plan.covariates if name in (*_KNOWN, "")]
     if clash:
         raise ParameterError("covariate", clash[0], "a name that is no column of the format")
@@ -199,6 +200,10 @@ def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list
     notes = list(description.notes)
     scan, scan_names = _scans(table)
     time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
+    for k, name in enumerate(scan_names):
+        if not name.isprintable():
+            row = table.row(int(np.argmax(scan == k)))
+            raise FileError(path, shown(name), _A_NAME, row=row, column="scan")
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
         notes.append(f"time_s runs backwards at row {table.row(int(back[0]) + 1)}")
@@ -279,6 +284,8 @@ def _covariates(table: Table, notes: list[str]) -> dict[str, FloatArray]:
         filled = [cell for cell in table.cells(name) if cell not in MISSING]
         if not name:
             notes.append("a column without a name, ignored")
+        elif not name.isprintable():
+            raise FileError(table.path, shown(name), f"{_A_NAME} for each column", row=1)
         elif not filled:
             notes.append(f"column {name} is empty, ignored")
         elif 2 * count_numbers(filled) <= len(filled):

@@ -38,6 +38,7 @@ def test_an_audit_names_the_aliases_of_one_way_scans_and_the_scans_that_cure_the
     assert "would cure" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_without_a_directory_nothing_is_written(recording_file, tmp_path, capsys):
     recording_file.write_text("\n".join(recording_file.read_text().splitlines()[:27]) + "\n")
     before = sorted(tmp_path.rglob("*"))

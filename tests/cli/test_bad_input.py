@@ -72,6 +72,32 @@ def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, 
     refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (
+            ("investigate", "--plan", "paper", "--origin-mm", "1,2"),
+            "--origin-mm is '1,2'; allowed: none with",
+        ),
+        (("investigate", "--plan", "paper", "--geometry", "arm.toml"), "--geometry is 'arm.toml'; allowed: none with"),
+        (
+            ("investigate", "--plan", "paper", "--truth", "backlash:nan"),
+            "'backlash:nan'; allowed: backlash:",
+        ),
+        (("study", "--model", "naive", "--learn-sensor"), "learn_sensor is True; allowed: False with"),
+        (("study", "--model", "naive", "--width", "1.3"), "width is 1.3; allowed: 1.0 with"),
+        (("study", "--batch", "3", "--utility", "entropy"), "batch is 3; allowed: 1, or more with"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused_before_any_work(words, says, tmp_path, capsys):
+    assert says in refused(capsys, tmp_path / "out", *words, "--out", tmp_path / "out")
+
+
+def test_a_scan_of_more_readings_than_memory_holds_is_refused(tmp_path, capsys):
+    words = ("arm", "scan", "450,260", "600,260", "--arm", "simulated", "--readings", 10**11)
+    assert "--readings is 100000000000; allowed: up to 100000" in refused(capsys, tmp_path / "out", *words)
+
+
 @pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
 def test_a_recording_that_is_not_there_is_refused(verb, tmp_path, capsys):
     said = refused(capsys, tmp_path / "out", verb, tmp_path / "nowhere.csv", "--out", tmp_path / "out")

@@ -43,7 +43,11 @@ def test_the_sensor_may_be_learnt_along(explore, capsys):
     [
         ((), "Finishing(of=InformationGain(), least=0.25)"),
         (("--utility", "entropy"), "ReadingEntropy(bin_width=1.0)"),
-        (("--utility", "about:radius_mm"), "InformationAbout(of=ParameterValue(name='radius_mm', n_bins=16))"),
+        pytest.param(
+            ("--utility", "about:radius_mm"),
+            "InformationAbout(of=ParameterValue(name='radius_mm', n_bins=16))",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_journal_names_the_utility(explore, options, utility):
@@ -184,6 +188,7 @@ def test_the_bar_says_where_the_arm_moves_before_it_does():
     assert arm.pose == Pose(*arm.reach.rest_mm)
 
 
+@pytest.mark.slow
 def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, monkeypatch, quick_frames):
     told = []
 

@@ -21,6 +21,7 @@ def few(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_one_round_leaves_a_diagnosis_and_all_it_was_made_of(few, tmp_path, capsys):
     out = tmp_path / "out"
     options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--seed", 1)

@@ -183,6 +183,7 @@ def test_the_emulator_is_an_arm_like_the_others(sensor_file, tmp_path):
     assert reading.covariates["battery_mv"] > 6000
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_a_journal_finds_the_sensor_of_its_run_and_refuses_another_truth(sensor_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"

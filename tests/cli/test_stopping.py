@@ -158,12 +158,13 @@ def struck_session(n):
     return bench.radio.brick, len(sent)
 
 
-def test_wherever_a_signal_strikes_a_measurement_motors_and_led_are_off():
-    """At every ninth telegram of a session and the last ten, which end it; the emulator says how it is left."""
+@pytest.mark.parametrize("step", [31, pytest.param(4, marks=pytest.mark.slow)])
+def test_wherever_a_signal_strikes_a_measurement_motors_and_led_are_off(step):
+    """At every so manyth telegram of a session and the last ten, which end it; the emulator says how it is left."""
     before = signal.signal(signal.SIGTERM, strike)
     try:
         _, total = struck_session(0)
-        for n in {*range(1, total, 9), *range(total - 10, total + 1)}:
+        for n in {*range(1, total, step), *range(total - 10, total + 1)}:
             brick, _ = struck_session(n)
             assert all(output.is_at_rest for output in brick.outputs.ports), n
             assert brick.answer(bytes((0, 7, GEOMETRY.sensor_port)))[6] == 0, n  # its type: none, without LED

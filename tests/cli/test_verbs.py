@@ -60,6 +60,7 @@ def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, 
     assert (cut / "run.gif").read_bytes().startswith(b"GIF")
 
 
+@pytest.mark.slow
 def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quick_frames):
     """The page loads itself anew until the run is over; it is opened once."""
     pages, opened = [], []

@@ -67,6 +67,7 @@ def strict(diagnosis) -> dict:
     return document
 
 
+@pytest.mark.slow
 def test_a_recording_without_effects_is_clean():
     found = clean_diagnosis()
     document = strict(found)

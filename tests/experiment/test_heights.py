@@ -94,6 +94,7 @@ def test_a_run_with_heights_finds_the_circle_and_is_resumed(small, tmp_path):
         ({"calibrated_height_mm": None}, "calibrated_height_mm"),
         ({"heights_mm": ()}, "calibrated_height_mm"),
         ({"heights_mm": (0.0, 14.0)}, "heights_mm"),
+        ({"heights_mm": (14.0, 1e9)}, "heights_mm is .* 1000000000.0.*calibrated at"),
     ],
 )
 def test_heights_that_mean_nothing_are_refused(small, change, name):

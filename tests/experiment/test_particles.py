@@ -76,6 +76,7 @@ def test_evidence_and_moments_are_those_of_adding_up_all_hypotheses(small, latti
     np.testing.assert_allclose(posterior.sd(), sd, rtol=0.12)
 
 
+@pytest.mark.slow
 def test_the_stated_error_of_the_evidence_is_its_scatter(small):
     """Twelve seeds: a chi-square of 11 degrees of freedom, 1e-4 on either side, and a factor for correlations."""
     runs = [carried(small, n_particles=600, seed=seed) for seed in range(12)]

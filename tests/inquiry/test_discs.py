@@ -13,9 +13,12 @@ from probewise.inquiry import (
     DiscTable,
     Grid,
     InformationGain,
+    Prospect,
+    Readout,
     forecast_of,
     utility_map,
 )
+from probewise.inquiry.forecast import MOST_LEVELS
 from probewise.scene import Circle, HypothesisScene, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
@@ -113,3 +116,23 @@ def test_the_whole_map_of_3000_hypotheses_is_quick(made):
     start = time.process_time()
     utility_map(again, InformationGain())
     assert time.process_time() - start < 0.3
+
+
+def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
+    """A thousand levels and cells, however little noise there is: 32,768 were too many for a level's number."""
+    mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
+    circle = Circle(radius_mm=(50.0, 150.0), inside=True)
+    grid = Grid(1048.0, 520.0, 27, 14)
+    theta = circle.prior.from_unit_cube(rng().random((200, 3)))
+    bits = []
+    for scale, noise_sd in ((1.0, 0.05), (1000.0, 0.5)):
+        model = Chain(mixture, FixedLevels(10.0 * scale, 60.0 * scale), HypothesisScene(circle))
+        prospect = Prospect(
+            forecast_of(model), Readout(noise_sd), theta, np.full(200, 1 / 200), theta, Designs(grid),
+            Designs(grid).plan("field"), np.arange(grid.n_places), np.ones(grid.n_places),
+        )  # fmt: skip
+        assert len(prospect.outlook.levels) == MOST_LEVELS
+        bits.append(prospect.information(prospect.weight))
+    # A hundred times less noise tells no less anywhere, and what 200 circles can tell bounds both.
+    assert (bits[1] > bits[0] - 0.05).all()
+    assert bits[1].max() <= np.log2(200)

@@ -52,3 +52,15 @@ def test_a_reading_that_the_sensor_cannot_return_is_refused():
 def test_a_readout_out_of_range_is_refused(change):
     with pytest.raises(ParameterError):
         Readout(**{"noise_sd": 1.0, **change})
+
+
+def test_cells_taken_together_hold_what_they_held_apart():
+    levels = np.linspace(1000.0, 60000.0, 50)
+    readout = Readout(100.0, 1.0, 0.0, 65535.0)
+    edges = readout.edges(levels, most=300)
+    assert len(edges) <= 301
+    assert (edges % 1.0 == 0.5).all()  # no reading lies on one
+    together = readout.probability(levels, most=300)
+    expected = norm.cdf(edges[:, None], levels, 100.0).T
+    np.testing.assert_allclose(np.cumsum(together, axis=1)[:, :-1], expected, atol=1e-12)
+    np.testing.assert_allclose(together.sum(axis=1), 1.0)

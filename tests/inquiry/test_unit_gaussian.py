@@ -30,6 +30,12 @@ def test_a_corner_far_off_leaves_one_edge():
         assert found == pytest.approx(ndtr(h), abs=TO_NEAREST + ndtr(-REACH))
 
 
+def test_the_sharpest_bend_is_the_last_of_the_table():
+    """In single precision 1e9 / (1 + 1e9) is one, which would be a row behind the last."""
+    sharp = seen_of_bend(single(np.zeros(2)), single(np.array([1e3, 1e9])))
+    assert sharp[0] == sharp[1] < 0.15
+
+
 @pytest.mark.parametrize("bend", [0.0, 0.1, 0.7, 3.0])
 def test_a_bent_edge_shows_what_lies_within_a_parabola(bend):
     distance = np.linspace(-2.5, 3.5, 13)

@@ -38,6 +38,8 @@ def test_what_a_world_conceals_is_read_from_its_name_and_numbers():
         ("backlash", "backlash:width_mm"),
         ("backlash:x", "backlash:width_mm"),
         ("backlash:1,2", "backlash:width_mm"),
+        ("backlash:nan", "magnitude up to 1e"),
+        ("backlash:0.5+lag:1e300", "magnitude up to 1e"),
         ("bcklash:1", "did you mean backlash"),
         ("", "nothing"),
     ],

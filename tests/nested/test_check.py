@@ -145,6 +145,7 @@ def test_a_cost_below_the_search_itself_is_refused() -> None:
         quiet(problems.plateau(), max_cost=0.5)
 
 
+@pytest.mark.slow
 def test_a_bias_that_all_runs_share_is_found_when_they_are_merged() -> None:
     """Each of eight runs is off by 1.5 errors, which its own check lets pass; together they are off by four."""
     known = problems.problem("Gaussian 4-D")

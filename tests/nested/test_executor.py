@@ -289,15 +289,16 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends Ctrl-C otherwise")
 @pytest.mark.parametrize(
     ("pool", "start", "everybody"),
     [
         ("ProcessPoolExecutor", "fork", True),
-        pytest.param("ProcessPoolExecutor", "spawn", False, marks=pytest.mark.slow),
-        pytest.param("ProcessPoolExecutor", "spawn", True, marks=pytest.mark.slow),
-        pytest.param("ProcessPoolExecutor", "forkserver", True, marks=pytest.mark.slow),
-        pytest.param("ThreadPoolExecutor", "", True, marks=pytest.mark.slow),
+        ("ProcessPoolExecutor", "spawn", False),
+        ("ProcessPoolExecutor", "spawn", True),
+        ("ProcessPoolExecutor", "forkserver", True),
+        ("ThreadPoolExecutor", "", True),
     ],
 )
 def test_ctrl_c_ends_the_run_and_every_worker(

@@ -63,7 +63,7 @@ def test_chains_that_remember_have_an_error_that_knows_it() -> None:
     assert z_sd(found, with_memory=False) > high
 
 
-@pytest.mark.parametrize("options", [{}, {"n_replaced": 7}])
+@pytest.mark.parametrize("options", [pytest.param({}, marks=pytest.mark.slow), {"n_replaced": 7}])
 def test_independent_points_have_no_memory(options: dict[str, int]) -> None:
     assert np.mean([r.memory for r in runs(0.0, 8, **options)]) < 1.1
 

@@ -38,7 +38,7 @@ def alive(result: NestedResult) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["plateau", "naive steps", "Rosenbrock 2-D"])
-@pytest.mark.parametrize("n_replaced", [1, 7])
+@pytest.mark.parametrize("n_replaced", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_births_and_deaths_alone_give_the_count_that_the_sampler_kept(name: str, n_replaced: int) -> None:
     result = run(problems.PROBLEMS[name](), rng=np.random.default_rng(1), n_live=20, n_replaced=n_replaced)
     assert np.array_equal(alive(result), result.n_at_death)

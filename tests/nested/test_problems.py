@@ -118,7 +118,7 @@ def test_the_circle_agrees_with_importance_sampling_about_its_posterior(rng: np.
     known = problems.circle()
     mean = np.array([check.mean for check in known.checks])
     spread = np.array([1.0, 1.0, 1.0])
-    for n in (20_000, 40_000):
+    for n in (5_000, 10_000):
         z = rng.standard_normal((n, 3)) / np.sqrt(rng.chisquare(4, n) / 4)[:, None]
         theta = mean + z * spread
         square = (z**2).sum(axis=1)
@@ -250,6 +250,7 @@ def test_the_comparison_names_the_best_correct_peer() -> None:
     assert "DNF" in compare.table(rows.values())
 
 
+@pytest.mark.slow
 def test_a_run_in_a_process_of_its_own_is_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "compare.jsonl"
     for _ in range(2):

@@ -105,6 +105,7 @@ class _OneSide:
         return np.maximum(x, -1.0), self.log_prob(x)
 
 
+@pytest.mark.slow
 def test_coordinates_that_lead_nowhere_are_impossible_whatever_they_are_clipped_to():
     """A likelihood that falls from the wall on: the normal's own share of it."""
     scale = 0.2

@@ -1,6 +1,7 @@
 """The recording format, rule by rule, and what a file that breaks one is answered."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -235,6 +236,13 @@ def test_an_unused_field_of_a_pattern_is_noted(tmp_path):
     patterns = {"a": {"kind": "uniform", "albedo": 1, "colour": "white"}}
     notes = read_recording(put(tmp_path, HEAD + "0,0,1\n", patterns)).notes
     assert notes == ("pattern a: colour not used, no field of kind uniform",)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="devices have other names there")
+def test_a_device_is_no_file():
+    """It may have no end."""
+    with pytest.raises(FileError, match="/dev/zero: this is a device; allowed: a CSV file"):
+        read_recording("/dev/zero")
 
 
 def test_missing_files_are_named(tmp_path):

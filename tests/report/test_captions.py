@@ -50,7 +50,7 @@ def searched(n_readings):
 
 @pytest.fixture(scope="module")
 def run():
-    return searched(3)
+    return searched(2)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run
         "bits",
         "seconds",
     ]
-    assert (document["format"], document["readings"], document["known"]) == ("exploration/1", 3, False)
+    assert (document["format"], document["readings"], document["known"]) == ("exploration/1", 2, False)
     assert document["stop_reason"] == run.stop_reason
     assert document["shape"]["name"] == "circle"
     rows = np.genfromtxt(io.StringIO(samples_csv(run)), delimiter=",", names=True)

@@ -23,6 +23,7 @@ def plain(text):
     return " ".join(text.replace("**", "").replace("*", "").replace("> ", "").split())
 
 
+@pytest.mark.slow
 def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
     """The printed lines and `explore`, given the same randomness, take the same readings to the last bit."""
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)

@@ -45,6 +45,7 @@ __all__ = ["TASKS", "VERB"]
 
 PAPER = "paper"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
+_MOST_READINGS = 100_000  # of one scan
 _OFF_PLAN_MM = 5.0  # an instrument of one's own may know better where it read
 UNITS = "LEGO units (1 dark to 100 bright)"
 
@@ -238,6 +239,8 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.carry_out import bounds_of
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
+    if arguments.readings > _MOST_READINGS:
+        raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
     places = np.linspace(start, end, arguments.readings)
     if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before the brick is called
         require_reach(geometry, places, "reading of the scan")

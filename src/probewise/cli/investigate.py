@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--origin-mm",
         metavar="X,Y",
-        help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)",
+        help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0; none with "
+        "simulated)",
     )
     add_geometry(parser)
     add_out_directory(parser)
@@ -108,6 +109,11 @@ def run(arguments: argparse.Namespace) -> int:
     chosen = parse_arm(arguments.arm)
     if arguments.truth is not None and chosen.kind != "simulated":
         raise ParameterError("--truth", arguments.truth, f"none with {arguments.arm}: it is for the simulated arm")
+    idle = {"simulated": ("origin_mm", "geometry"), "file": ("geometry",)}.get(chosen.kind, ())
+    for name in idle:
+        if getattr(arguments, name) is not None:
+            allowed = f"none with {arguments.arm}, which has no use for it"
+            raise ParameterError(f"--{name.replace('_', '-')}", str(getattr(arguments, name)), allowed)
     plan = _plan(arguments, chosen)
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
     truth_seed, noise_seed, rounds_seed, files_seed = np.random.SeedSequence(arguments.seed).spawn(4)

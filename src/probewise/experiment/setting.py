@@ -41,6 +41,9 @@ from probewise.sensor.stages import SensorModel
 __all__ = ["Experiment", "OneScan", "widest_mm"]
 
 
+MOST_LIFTED = 10.0
+"""How many times higher, or lower, than where it was calibrated a sensor may be asked to read."""
+
 MOST_OFF = 0.01
 """Probability of a length that is far off, below which a run that doubts its sensor may end."""
 
@@ -167,6 +170,11 @@ class Experiment:
             )
         if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
             raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
+        if self.calibrated_height_mm is not None:
+            low, high = self.calibrated_height_mm / MOST_LIFTED, self.calibrated_height_mm * MOST_LIFTED
+            if not all(low <= height <= high for height in self.heights_mm):
+                allowed = f"{low:g} to {high:g}: the sensor was calibrated at {self.calibrated_height_mm:g} mm"
+                raise ParameterError("heights_mm", self.heights_mm, allowed)
         if self.model.names != self.prior.names:
             raise ParameterError(
                 "model.names",

@@ -14,7 +14,20 @@ from probewise.inquiry.sight import Sight
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["AskedForecast", "Forecast", "Outlook", "by_combination", "predicted", "spread_levels", "thinned"]
+__all__ = [
+    "MOST_LEVELS",
+    "AskedForecast",
+    "Forecast",
+    "Outlook",
+    "by_combination",
+    "predicted",
+    "spread_levels",
+    "thinned",
+]
+
+MOST_LEVELS = 1000
+"""Levels, and cells of the reading, that the choice of a place tells apart: more than hypotheses can fill."""
+
 
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
 _MOST_ASKED = 400  # hypotheses that are asked one by one
@@ -91,7 +104,7 @@ class AskedForecast:
         """See `Forecast.outlook`."""
         asked, share = thinned(weight, _MOST_ASKED)
         answers = predicted(self.model, theta[asked], plan.take(rows))
-        levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD)
+        levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
         per_level = 1.0 / (levels[1] - levels[0])
         index = np.rint((answers - levels[0]) * per_level).astype(np.int32)
         return _AskedOutlook(asked, share / weight[asked], index, levels, rows, designs.grid.n_places)
@@ -140,10 +153,11 @@ def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
     return out
 
 
-def spread_levels(low: float, high: float, spacing: float) -> FloatArray:
-    """Even levels from one reading to another, no further apart than `spacing`."""
+def spread_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
+    """Even levels from one reading to another, no further apart than `spacing` unless that takes more than `most`."""
     low, high = min(low, high), max(low, high)
-    return np.linspace(low, max(high, low + spacing), max(2, int(np.ceil((high - low) / spacing)) + 1))
+    n = max(2, int(np.ceil((high - low) / spacing)) + 1)
+    return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
 
 
 def thinned(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.inquiry.forecast import spread_levels
+from probewise.inquiry.forecast import MOST_LEVELS, spread_levels
 from probewise.inquiry.readout import Readout
 
 __all__ = ["GivenReading"]
@@ -34,11 +34,11 @@ class GivenReading:
 
     def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout) -> None:
         self._n = answers.shape[1]
-        levels = spread_levels(float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD)
+        levels = spread_levels(float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
         index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
         self._key = (index + np.arange(self._n) * len(levels)).ravel()
         self._weight, self._n_levels = weight, len(levels)
-        self._chance = readout.probability(levels, fine=1.0)
+        self._chance = readout.probability(levels, fine=1.0, most=MOST_LEVELS)
 
     @cached_property
     def mass(self) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, require_finite
 from probewise.errors import ShapeError
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import Forecast, Outlook
+from probewise.inquiry.forecast import MOST_LEVELS, Forecast, Outlook
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 
@@ -114,7 +114,7 @@ class Prospect:
     def _chance(self, at: IntArray) -> FloatArray:
         """Probability of each cell given each level, for designs that are read equally often."""
         n = int(self.designs.n_repeats[self.rows[at[0]]])
-        chance = self.readout.probability(self.outlook.levels, repeats=n, fine=_CELL)
+        chance = self.readout.probability(self.outlook.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
         return np.asarray(chance.astype(np.float32))
 
 

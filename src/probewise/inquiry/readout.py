@@ -54,25 +54,30 @@ class Readout:
                 f"{self.low:g} to {self.high:g}, the range of the sensor; is it the sensor that was calibrated?",
             )
 
-    def edges(self, levels: FloatArray, *, fine: float = _FINE) -> FloatArray:
+    def edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
         """Edges of the cells that readings of these levels may fall into, (n_cells - 1,); the end cells are open.
 
-        Readings that are not rounded fall into cells of `fine` sds of noise.
+        Readings that are not rounded fall into cells of `fine` sds of noise; where that makes more than `most` cells,
+        neighbours are taken together.
         """
         width = fine * self.noise_sd if self.step is None else self.step
         least = max(float(np.min(levels)) - _REACH * self.noise_sd, self.low)
-        most = min(float(np.max(levels)) + _REACH * self.noise_sd, self.high)
-        first, last = math.floor(least / width + 0.5), math.ceil(most / width - 0.5)
+        greatest = min(float(np.max(levels)) + _REACH * self.noise_sd, self.high)
+        if most is not None:
+            width *= max(1, math.ceil((greatest - least) / (most * width))) | 1  # odd: no edge lies on a step
+        first, last = math.floor(least / width + 0.5), math.ceil(greatest / width - 0.5)
         return np.asarray((np.arange(first, max(last, first + 1)) + 0.5) * width, dtype=np.float64)
 
-    def probability(self, levels: FloatArray, *, repeats: int = 1, fine: float = _FINE) -> FloatArray:
-        """Probability of each cell given each level, (n_levels,) -> (n_levels, n_cells).
+    def probability(
+        self, levels: FloatArray, *, repeats: int = 1, fine: float = _FINE, most: int | None = None
+    ) -> FloatArray:
+        """Probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `edges`.
 
         Of several repeats it is that of their mean, as if it were rounded as finely as its noise is small.
         """
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
-        below = ndtr((each.edges(levels, fine=fine) - levels[:, None]) / sd)
+        below = ndtr((each.edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
         ends = np.zeros((len(levels), 1)), np.ones((len(levels), 1))
         return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
 

@@ -12,7 +12,15 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.discs import DiscTable
-from probewise.inquiry.forecast import AskedForecast, Forecast, Outlook, by_combination, predicted, spread_levels
+from probewise.inquiry.forecast import (
+    MOST_LEVELS,
+    AskedForecast,
+    Forecast,
+    Outlook,
+    by_combination,
+    predicted,
+    spread_levels,
+)
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.silhouettes import Silhouettes
 from probewise.recordings.plan import Instrumentation, Plan
@@ -47,7 +55,7 @@ class DiscForecast:
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> Outlook:
         """See `Forecast.outlook`."""
-        levels = spread_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD)
+        levels = spread_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
         turns = plan.orientation_rad.reshape(-1, designs.grid.n_places)
         return _DiscOutlook(self.table, theta, designs.grid, turns, rows, levels)
 
@@ -135,7 +143,7 @@ class SilhouetteForecast:
             sights[turn, height] = _Sight(silhouettes, *self._ends(height))
         low = min(min(sight.dark, sight.bright) for sight in sights.values())
         high = max(max(sight.dark, sight.bright) for sight in sights.values())
-        levels = spread_levels(low, high, noise_sd / _PER_SD)
+        levels = spread_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
         return _SilhouetteOutlook(sights, ways, designs.grid, rows, levels)
 
     def _silhouettes(self, theta: FloatArray, turn_rad: float, height: float) -> Silhouettes | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry.forecast import predicted, spread_levels
+from probewise.inquiry.forecast import MOST_LEVELS, predicted, spread_levels
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
@@ -64,8 +64,8 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
         raise ParameterError("rivals", [rival.probability for rival in rivals], "two models or more, one probable")
     answers = [predicted(rival.model, rival.theta, plan) for rival in rivals]
     low, high = min(a.min() for a in answers), max(a.max() for a in answers)
-    levels = spread_levels(float(low), float(high), readout.noise_sd / _PER_SD)
-    chance = readout.probability(levels)
+    levels = spread_levels(float(low), float(high), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
+    chance = readout.probability(levels, most=MOST_LEVELS)
     bits = np.zeros(len(plan))
     for start in range(0, len(plan), _BLOCK):
         block = slice(start, start + _BLOCK)

@@ -40,7 +40,7 @@ def seen_of_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> 
 
 def seen_of_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
     """Mass of the unit Gaussian within an edge that bends away, `bend` the curvature times the sd; one shape."""
-    index = whole(bend / (1.0 + bend) * _N_BENDS) * _N
+    index = np.minimum(whole(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
     index += _entry(distance)
     return np.asarray(_bends().reshape(-1)[index])
 

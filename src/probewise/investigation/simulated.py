@@ -18,6 +18,7 @@ from probewise.world.concealed import Concealed
 __all__ = ["SimulatedRecorder", "parse_concealed"]
 
 NOTHING = "nothing"
+_LARGEST = 1e9  # of a number of an effect
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,15 @@ def _one(text: str) -> Concealed:
         )
     kind = kinds[name]
     wanted = ",".join(field.name for field in fields(kind))
+    allowed = f"{name}:{wanted}, all of them numbers of magnitude up to {_LARGEST:g}"
     try:
-        return kind(*map(float, numbers.split(",")))  # type: ignore[no-any-return]
+        values = [float(number) for number in numbers.split(",")]
+        effect = kind(*values)
     except (TypeError, ValueError) as error:
-        raise ParameterError("--truth", text, f"{name}:{wanted}, all of them numbers") from error
+        raise ParameterError("--truth", text, allowed) from error
+    if not all(abs(value) <= _LARGEST for value in values):  # nor NaN
+        raise ParameterError("--truth", text, allowed)
+    return effect  # type: ignore[no-any-return]
 
 
 def _kinds() -> dict[str, Any]:

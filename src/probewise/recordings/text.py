@@ -15,14 +15,18 @@ def read_bytes(path: Path, what: str) -> bytes:
     Raises
     ------
     FileError
-        If it is missing or cannot be read.
+        If it is missing, cannot be read or is a device.
     """
     try:
-        return path.read_bytes()
+        device = path.is_char_device() or path.is_block_device()  # /dev/zero never ends
+        content = b"" if device else path.read_bytes()
     except FileNotFoundError as error:
         raise FileError(path, "there is no such file", what) from error
     except (OSError, ValueError) as error:
         raise FileError(path, f"cannot be read ({error})", what) from error
+    if device:
+        raise FileError(path, "this is a device", what)
+    return content
 
 
 def read_text(path: Path, what: str) -> str:

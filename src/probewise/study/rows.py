@@ -12,6 +12,8 @@ from probewise.study.circles import POPULATIONS
 
 __all__ = ["REFERENCE", "Row", "standard_rows"]
 
+_IN_BATCHES = ("finishing", "information")
+
 
 @dataclass(frozen=True)
 class Row:
@@ -53,6 +55,12 @@ class Row:
         for name in ("noise_sd", "width"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ParameterError(name, getattr(self, name), "finite, greater than 0")
+        if self.model == "naive":
+            for name, plain in (("width", 1.0), ("learn_sensor", False)):
+                if getattr(self, name) != plain:
+                    raise ParameterError(name, getattr(self, name), f'{plain} with the model "naive", which has no SSF')
+        if self.batch > 1 and self.utility not in _IN_BATCHES:
+            raise ParameterError("batch", self.batch, f"1, or more with the utility {' or '.join(_IN_BATCHES)}")
 
     @property
     def name(self) -> str:

@@ -53,6 +53,7 @@ def stepped():
     return searched(line_recording(0.3))
 
 
+@pytest.mark.slow
 def test_the_weighing_says_first_how_long_it_may_take_and_then_how_far_it_is(stepped):
     """A bar over all hypotheses that never goes back; its title holds minutes from the time that one call takes."""
     told = []

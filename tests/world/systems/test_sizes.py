@@ -71,7 +71,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(cases, "KINDS", tuple(kind for kind in KINDS if kind.law is None))
 
 
-@pytest.mark.parametrize("number", [1, 2, 8, 14])
+@pytest.mark.parametrize("number", [1, 2, pytest.param(8, marks=pytest.mark.slow), 14])
 def test_a_case_follows_from_the_seed_and_its_number(number, quick):
     one, again = (truth_of(draw_system_case(12, number)) for _ in range(2))
     assert one == again

@@ -23,8 +23,8 @@ def before_first_display(load: Callable[[], object]) -> None:
 
 @functools.singledispatch
 def render_html(value: object) -> str:
-    """Render a value as an HTML fragment; types without a renderer show their repr."""
-    return f"<pre>{html.escape(repr(value))}</pre>"
+    """Render a value as an HTML fragment; types without a renderer show their summary."""
+    return f"<pre>{html.escape(str(value))}</pre>"
 
 
 class Printer(Protocol):
@@ -36,24 +36,37 @@ class Printer(Protocol):
 
 
 class ShowsItself:
-    """Base of values that display themselves: HTML in a notebook, the summary in a terminal and as `str`."""
+    """Base of values that display themselves: HTML in a notebook, the summary in a terminal and as `str`.
+
+    The `repr`, which lists, debuggers and error messages show, is one line: all its arrays would fill a megabyte.
+    """
 
     __slots__ = ()
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        # IPython prefers a class's own __repr__, which dataclass makes, to a base's _repr_pretty_.
+        # IPython prefers a class's own __repr__ to a base's _repr_pretty_; dataclass leaves a __repr__ that is there.
         cls._repr_pretty_ = ShowsItself._repr_pretty_  # type: ignore[method-assign]
+        cls.__repr__ = ShowsItself.__repr__  # type: ignore[method-assign]
 
     def __str__(self) -> str:
         summary = getattr(self, "summary", None)
-        return str(summary()) if callable(summary) else super().__str__()
+        return str(summary()) if callable(summary) else f"<{type(self).__name__}>"
+
+    def __repr__(self) -> str:
+        said = str(self)
+        return said if said.startswith("<") else f"<{type(self).__name__}: {_first_line(said)}>"
 
     def _repr_html_(self) -> str:
-        while _waiting:
-            _waiting.pop()()
+        # Each stays until it has ended, for Ctrl-C may come in between, and another thread may show a value too.
+        for load in list(_waiting):
+            load()
+        _waiting.clear()
         return render_html(self)
 
     def _repr_pretty_(self, printer: Printer, cycle: bool) -> None:
-        summary = getattr(self, "summary", None)
-        printer.text(summary() if callable(summary) else f"<{type(self).__name__}>")
+        printer.text(str(self))
+
+
+def _first_line(text: str) -> str:
+    return " ".join(text.partition("\n")[0].split())

@@ -1,17 +1,41 @@
 """What a newcomer gets wrong first is said in words, where it is made: never a KeyError or a TypeError from below."""
 
 import warnings
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import probewise
+from probewise import diagnosis
 from probewise.arm import Pose, Reading, SimulatedArm
 from probewise.calibration import Calibration, FittedSensor, read_sensor, write_sensor
+from probewise.diagnosis import (
+    OwnModel,
+    audit_system,
+    diagnose_system,
+    diagnosis_json,
+    fit_json,
+    fit_simulator,
+    model_with,
+    repaired_of,
+)
+from probewise.effects import VOCABULARY, NamedEffect
 from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
-from probewise.experiment import Experiment, Exploration, experiment_for, explore, shape_named
+from probewise.experiment import (
+    Experiment,
+    Exploration,
+    experiment_for,
+    explore,
+    result_json,
+    samples_csv,
+    shape_named,
+)
+from probewise.experiment import run as explore_once
 from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
+from probewise.investigation import Budget, investigate
 from probewise.nested import NestedResult, RemainingEvidence, SliceMove, diversify, run
 from probewise.priors import Joint, LogUniform, Normal, Product, Uniform
 from probewise.recordings import (
@@ -26,6 +50,7 @@ from probewise.recordings import (
 from probewise.report.plots import corner_plot, readings_by_orientation, spatial_sensitivity
 from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, Rectangle, RegularPolygon
 from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture, NaiveSensor
+from probewise.systems import Law, Simulator, predict_system, write_fitted_system
 from probewise.world import Blob, World, gaussian_spot
 
 RNG = np.random.default_rng(0)
@@ -54,6 +79,41 @@ SENSOR = FittedSensor(
 )
 EXPERIMENT = Experiment(CIRCLE, MODEL, GaussianKnown(0.7), 0.7)
 ARM = SimulatedArm(lambda pose, time_s, height_mm: 10.0)
+
+
+TABLE = {"run": ["a"] * 12, "t_s": np.arange(12.0), "temp_c": 20.0 + np.arange(12.0)}
+
+
+def simulator(**changed):
+    """A heater that is told nothing wrong but what is changed."""
+    known = {"reading": "temp_c", "unit": "degC", "parameters": {"tau_s": ("log", 1, 1000)}, "time": "t_s"}
+    return Simulator(**{**known, "simulate": lambda p, data: p["tau_s"] + data["t_s"], **changed})
+
+
+def arrays(**changed):
+    """A recording of which nothing is wrong but what is changed."""
+    known = {"x_mm": np.arange(30.0), "y_mm": 0, "readings": np.arange(30.0), "patterns": EDGE, "unit": "V"}
+    return Recording.from_arrays(**{**known, **changed})
+
+
+def record(number, plan, asked):
+    """Records what is known already."""
+    return RECORDING
+
+
+OVEN = simulator()
+FIELD = Recording.from_arrays(x_mm=[500.0], y_mm=250.0, readings=[10.0], patterns={"field": EDGE}, unit="LEGO")
+
+
+class Empty(NamedEffect):
+    """An effect of which nothing was written yet."""
+
+
+class OneNumber:
+    """A likelihood that forgets that it is asked for many hypotheses."""
+
+    def log_prob(self, readings, predicted):
+        return 0.0
 
 
 class Frame:
@@ -303,6 +363,116 @@ MISTAKES = {
         r"unreadable \(no NumPy archive\); allowed: a file wr",
     ),
     "a result that is not there": (lambda: NestedResult.load("nowhere.npz"), "nowhere.npz: there is no such file"),
+    "one Exploration for another result": (lambda: result_json(CALIBRATION), "run is .*; allowed: an Exploration"),
+    "no run for samples": (lambda: samples_csv(None), "run is None; allowed: an Exploration"),
+    "no diagnosis to write": (lambda: diagnosis_json(CALIBRATION), "diagnosis is .*; allowed: a Diagnosis"),
+    "no fit to write": (lambda: fit_json(CALIBRATION), "fit is .*; allowed: a SystemFit"),
+    "no diagnosis of a simulator": (lambda: repaired_of(CALIBRATION), "allowed: the Diagnosis of a simulator"),
+    "no system to write": (lambda: write_fitted_system(CALIBRATION, "s.json"), "fitted is .*; allowed: a FittedSystem"),
+    "a run for a recording": (
+        lambda: write_recording(Exploration(EXPERIMENT, ()), "r.csv"),
+        r"take its .recording\(\), this is the Exploration",
+    ),
+    "a repaired model for a sensor": (
+        lambda: write_sensor(SimpleNamespace(repaired=1), "s.json"),
+        r"found.repaired.fitted_sensor\(found.recording, rng=rng\)",
+    ),
+    # simulators
+    "a table for a simulator": (
+        lambda: diagnose_system(TABLE, OVEN, rng=RNG),
+        r"simulator is .*; allowed: a Simulator\(",
+    ),
+    "a path for a table": (
+        lambda: fit_simulator(OVEN, "oven.csv", rng=RNG),
+        "table is 'oven.csv'; allowed: columns by name",
+    ),
+    "a recording for a table": (lambda: audit_system(OVEN, RECORDING), "table is .*; allowed: columns by name"),
+    "a table of no row": (lambda: fit_simulator(OVEN, {"t_s": [], "temp_c": []}, rng=RNG), "table is 'without a row'"),
+    "a seed for a simulator": (lambda: fit_simulator(OVEN, TABLE, rng=1), r"rng is 1; .*default_rng\(1\)"),
+    "a simulator for its fit": (lambda: predict_system(OVEN, TABLE, rng=RNG), "fitted is .*; allowed: a FittedSystem"),
+    "a file for a function": (
+        lambda: simulator(simulate="oven.py"),
+        r"simulate is 'oven.py'; .*read_simulator\('FILE.py'\)",
+    ),
+    "a list of priors": (
+        lambda: simulator(parameters=["tau_s"]),
+        "parameters is .*; allowed: the prior of each by name",
+    ),
+    "a number for the noise": (lambda: simulator(noise=0.05), "noise is 0.05; .*was {'sd': 0.05} meant"),
+    "one name for several": (
+        lambda: simulator(run="run", per_run="tau_s"),
+        r"per_run is 'tau_s'; .*in a list: \['tau_s'\]",
+    ),
+    "a prior for an effect": (lambda: simulator(extra={"drag": (0, 1)}), r"extra\['drag'\] is .*; allowed: an Extra\("),
+    "a column that is none": (lambda: simulator(reading=3), "reading is 3; allowed: the name of the column"),
+    "a law of lists": (lambda: Law(["temp_c"], 2), "states is .*; allowed: where each state starts"),
+    "a law of numbers": (lambda: Law({"temp_c": 20.0}, 2), "rates is 2; allowed: a function rates"),
+    # models and effects of one's own
+    "a model swapped": (
+        lambda: OwnModel(Bell.prior, lambda p, plan: 0),
+        "simulate is .*; allowed: a function.*in the order",
+    ),
+    "a prior of pairs": (lambda: OwnModel(lambda p, plan: 0, {"a": (0, 1)}), "prior is .*; allowed: a prior of named"),
+    "a function for a null": (
+        lambda: diagnosis.diagnose(RECORDING, null=lambda p, plan: 0, rng=RNG),
+        r"null is .*; allowed: a null model: OwnModel\(",
+    ),
+    "names for effects": (
+        lambda: diagnosis.diagnose(RECORDING, effects=["lag"], rng=RNG),
+        "effects is .*; allowed: classes",
+    ),
+    "a number for an effect": (
+        lambda: diagnosis.diagnose(RECORDING, effects={"lag": 3}, rng=RNG),
+        r"effects\['lag'\] is 3",
+    ),
+    "an effect by another name": (
+        lambda: diagnosis.diagnose(RECORDING, effects={"lagg": VOCABULARY["lag"]}, rng=RNG),
+        "effects is 'lagg'; allowed: 'lag', the name of the class Lag",
+    ),
+    "an effect that says nothing": (
+        lambda: diagnosis.diagnose(RECORDING, effects={"own": Empty}, rng=RNG),
+        "allowed: a class of an effect with .*; name is missing",
+    ),
+    "one letter after the other": (
+        lambda: model_with(RECORDING, "lag", rng=RNG),
+        r"names is 'lag'; .*in a list: \['lag'\]",
+    ),
+    "a misspelt effect": (lambda: model_with(RECORDING, ["lagg"], rng=RNG), "did you mean lag"),
+    "a likelihood of one number": (
+        lambda: SensorProblem(CIRCLE.prior, MODEL, OneNumber(), FIELD).log_likelihood(
+            np.array([[500.0, 250.0, 90.0]] * 2)
+        ),
+        r"log_prob of OneNumber returned shape \(\); allowed: \(2,\), one number per hypothesis",
+    ),
+    "a likelihood of one number in a run": (
+        lambda: explore_once(ARM, replace(EXPERIMENT, likelihood=OneNumber()), max_readings=1, rng=RNG),
+        r"log_prob of OneNumber returned shape \(\)",
+    ),
+    # investigations
+    "a name for a plan": (lambda: investigate(record, "paper", rng=RNG), "plan is 'paper'; allowed: a Plan"),
+    "a number for a budget": (
+        lambda: investigate(record, PLAN, budget=300, rng=RNG),
+        r"budget is 300; allowed: a Budget\(",
+    ),
+    "a recorder of one": (
+        lambda: investigate(lambda plan: RECORDING, PLAN, rng=RNG),
+        "record is .*; allowed: a function of",
+    ),
+    "a budget of texts": (lambda: Budget(readings="400"), "readings is '400'; allowed: a number"),
+    # the verbs
+    "a bar of another kind": (
+        lambda: probewise.calibrate(RECORDING, rng=RNG, progress=lambda done: None),
+        r"progress is .*; allowed: True, False, or a function progress\(stage, done, total, note\)",
+    ),
+    "a yes for True": (
+        lambda: probewise.explore(SENSOR, learn_sensor="yes", rng=RNG),
+        "learn_sensor is 'yes'; allowed: True",
+    ),
+    "no trust": (lambda: probewise.explore(SENSOR, trust="no", rng=RNG), "trust is 'no'; allowed: a number"),
+    "a folder that cannot be": (
+        lambda: probewise.explore(SENSOR, journal="/proc/nowhere/run.jsonl", rng=RNG, progress=False),
+        "/proc/nowhere: cannot be made",
+    ),
     # drawings
     "a figure as axes": (
         lambda: spatial_sensitivity(SENSOR.field, ax=Figure()),
@@ -317,6 +487,19 @@ MISTAKES = {
     "arrays as plan": (lambda: Recording(np.zeros(3), np.zeros(3)), f"plan is .*; {A_PLAN}"),
     "a swapped recording": (lambda: Recording(RECORDING.readings, PLAN), f"plan is .*; {A_PLAN}"),
     "readings as texts": (lambda: Recording(PLAN, ["a"] * 30), "readings is .*; allowed: numbers"),
+    "covariates without names": (lambda: arrays(covariates=[1.0]), "covariates is .*; allowed: what was logged"),
+    "a covariate with a place": (
+        lambda: arrays(covariates={"x_mm": range(30)}),
+        "covariates is 'x_mm'; allowed: a name",
+    ),
+    "objects for readings": (lambda: arrays(readings=[object()] * 30), "readings is .*; allowed: numbers"),
+    "a number for a pattern's name": (lambda: arrays(patterns={0: EDGE}), "a name in patterns is 0; allowed: a text"),
+    "a row that is not there": (
+        lambda: RECORDING.take([30]),
+        "rows is .*; allowed: numbers of rows in a list, up to 29",
+    ),
+    "half a row": (lambda: PLAN.take(0.5), "rows is 0.5; allowed: numbers of rows"),
+    "too few truths": (lambda: RECORDING.take([True, False]), "rows is .*; 30 truth values; or a slice"),
     # scenes
     "a radius": (lambda: Circle(radius_mm=90.0), r"radius_mm is 90.0; allowed: \(low, high\)"),
     "a radius first": (lambda: Circle(90.0), r"field is 90.0; allowed: a Field: Field\("),

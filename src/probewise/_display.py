@@ -47,14 +47,18 @@ class ShowsItself:
         super().__init_subclass__()
         # IPython prefers a class's own __repr__ to a base's _repr_pretty_; dataclass leaves a __repr__ that is there.
         cls._repr_pretty_ = ShowsItself._repr_pretty_  # type: ignore[method-assign]
-        cls.__repr__ = ShowsItself.__repr__  # type: ignore[method-assign]
+        if "__repr__" not in cls.__dict__:
+            cls.__repr__ = ShowsItself.__repr__  # type: ignore[method-assign]
 
     def __str__(self) -> str:
         summary = getattr(self, "summary", None)
         return str(summary()) if callable(summary) else f"<{type(self).__name__}>"
 
     def __repr__(self) -> str:
-        said = str(self)
+        try:
+            said = str(self)
+        except Exception:  # what is half made is shown in tracebacks and debuggers too
+            return f"<{type(self).__name__}>"
         return said if said.startswith("<") else f"<{type(self).__name__}: {_first_line(said)}>"
 
     def _repr_html_(self) -> str:

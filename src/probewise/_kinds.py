@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 
@@ -20,14 +21,21 @@ __all__ = [
     "require_flag",
     "require_kind",
     "require_like",
+    "require_mapping",
     "require_number",
     "require_one_of",
     "require_one_or_several",
     "require_pair",
     "require_path",
     "require_rng",
+    "require_takes",
+    "require_takes_places",
+    "require_text",
+    "require_texts",
     "require_whole",
 ]
+
+_MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not cut off
 
 
 def require_rng(rng: object, name: str = "rng") -> None:
@@ -85,7 +93,10 @@ def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
     """Raise ParameterError unless `value` is one of these names; the message suggests the nearest."""
     if isinstance(value, str) and value in known:
         return
-    raise ParameterError(name, value, ", ".join(map(repr, known)) + did_you_mean(value, known))
+    listed = ", ".join(map(repr, known))
+    if len(listed) > _MOST_LISTED:
+        listed = f"{listed[:_MOST_LISTED]} ... ({len(known)} names)"
+    raise ParameterError(name, value, listed + did_you_mean(value, known))
 
 
 def did_you_mean(value: object, known: Iterable[str]) -> str:
@@ -129,3 +140,50 @@ def require_callable(name: str, value: object, allowed: str) -> None:
     """Raise ParameterError unless `value` can be called."""
     if not callable(value):
         raise ParameterError(name, value, allowed)
+
+
+def require_takes(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
+    """Raise ParameterError unless `value` can be called with these arguments, by their names."""
+    listed = f"{allowed} {name}({', '.join(arguments)})"
+    require_callable(name, value, listed)
+    try:
+        inspect.signature(value).bind(**dict.fromkeys(arguments))  # type: ignore[arg-type]
+    except TypeError:
+        raise ParameterError(name, value, listed) from None
+    except ValueError:  # a function written in C may not tell what it takes
+        return
+
+
+def require_takes_places(name: str, value: object, n_arguments: int, allowed: str) -> None:
+    """Raise ParameterError unless `value` can be called with so many arguments."""
+    require_callable(name, value, allowed)
+    try:
+        inspect.signature(value).bind(*[None] * n_arguments)  # type: ignore[arg-type]
+    except TypeError:
+        raise ParameterError(name, value, allowed) from None
+    except ValueError:  # a function written in C may not tell what it takes
+        return
+
+
+def require_text(name: str, value: object, allowed: str = "a text") -> str:
+    """Return a text that is not empty, or raise ParameterError."""
+    if isinstance(value, str) and value:
+        return str(value)
+    raise ParameterError(name, value, allowed)
+
+
+def require_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
+    """Return several texts as a tuple; raise ParameterError for a single text, whose letters it would be."""
+    if isinstance(value, str) or not isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping):
+        raise ParameterError(
+            name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
+        )
+    return tuple(require_text(name, each, allowed) for each in value)
+
+
+def require_mapping(name: str, value: object, allowed: str) -> None:
+    """Raise ParameterError unless `value` is a dict or the like, with texts for its names."""
+    require_kind(name, value, Mapping, allowed)
+    assert isinstance(value, Mapping)
+    for each in value:
+        require_text(f"a name in {name}", each)

@@ -11,7 +11,7 @@ from typing import NamedTuple, Never
 
 from tqdm import tqdm
 
-from probewise._kinds import require_callable
+from probewise._kinds import require_takes
 from probewise.nested import State
 from probewise.progress import Progress, silent
 
@@ -76,7 +76,7 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         with progress_shown(quiet=not progress, lines=False) as shown:
             yield shown
     else:
-        require_callable("progress", progress, "True, False, or a function progress(stage, done, total, note)")
+        require_takes("progress", progress, ("stage", "done", "total", "note"), "True, False, or a function")
         yield progress
 
 

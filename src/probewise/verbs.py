@@ -231,9 +231,18 @@ def explore(
     2
     """
     from probewise import experiment as posing
-    from probewise._kinds import require_kind, require_one_or_several, require_path, require_rng, require_whole
+    from probewise._kinds import (
+        require_flag,
+        require_kind,
+        require_number,
+        require_one_or_several,
+        require_path,
+        require_rng,
+        require_whole,
+    )
     from probewise._progress import progress_or_bar
     from probewise.arm import instrument_of
+    from probewise.calibration.sensor_file import require_sensor
     from probewise.errors import ParameterError
     from probewise.inquiry import utility_named
     from probewise.scene import Field
@@ -241,6 +250,8 @@ def explore(
     require_rng(rng)
     field = Field() if field is None else field
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
+    require_sensor(sensor, "in the order explore(sensor, ...)")
+    require_flag("learn_sensor", learn_sensor)
     lies = posing.shape_of(shape, field)
     worth = utility_named(utility) if isinstance(utility, str) else utility
     usual = posing.usual_trust(lies, model=model, learn_sensor=learn_sensor, utility=worth)
@@ -255,7 +266,7 @@ def explore(
         orientations_rad=require_one_or_several("orientations_rad", orientations_rad),
         heights_mm=require_one_or_several("heights_mm", heights_mm),
         repeats=tuple(require_whole("repeats", n) for n in require_one_or_several("repeats", repeats)),
-        trust=usual if trust is None else trust,
+        trust=usual if trust is None else require_number("trust", trust, "a number greater than 0, up to 1"),
     )
     streams, hidden = posing.Streams.of(rng), None
     path = None if journal is None else require_path("journal", journal)
@@ -288,7 +299,7 @@ def explore(
         )
 
 
-def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None) -> PlanAudit:
+def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progress: bool | Progress = True) -> PlanAudit:
     """Audit a plan before any data: which effects are undetectable or aliased, and which readings would cure that.
 
     Parameters
@@ -297,6 +308,8 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None) -> Plan
         The plan, or a recording, of which only the plan is used.
     sensor
         The calibrated sensor; by default a typical one.
+    progress
+        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
 
     Returns
     -------
@@ -320,9 +333,11 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None) -> Plan
     >>> len(probewise.audit(plan).seen_as("invisible")) > 0
     True
     """
+    from probewise._progress import progress_or_bar
     from probewise.diagnosis import audit_plan
 
-    return audit_plan(plan, sensor=sensor)
+    with progress_or_bar(progress) as told:
+        return audit_plan(plan, sensor=sensor, progress=told)
 
 
 def diagnose(

@@ -201,7 +201,7 @@ def test_a_run_that_ended_is_replayed_without_asking_the_arm(small, tmp_path):
 def test_a_run_that_ended_at_max_readings_can_be_extended(small, found, tmp_path):
     journal = tmp_path / "journal.jsonl"
     short = run(small.arm(), small.experiment(), rng=rng(), max_readings=2, journal=journal)
-    assert short.stop_reason.startswith("max_readings = 2 is reached; the widest length is known to ")
+    assert short.stop_reason.startswith("all 2 readings that it may take are taken; the widest length is known to ")
     assert not short.reached
     longer = run(small.arm(), small.experiment(), rng=rng(), journal=journal)
     assert longer.readings == found[0].readings
@@ -545,7 +545,7 @@ def test_the_only_place_within_reach_is_read_while_it_tells_something(small):
     arm = small.arm(reach_mm=30.0, truth=(230.0, 40.0, 60.0))
     result = run(arm, small.experiment(grid=ONE_PLACE), rng=rng(), max_readings=4)
     assert [(pose.x_mm, pose.y_mm) for pose in arm.poses] == [(200.0, 0.0)] * 4
-    assert result.stop_reason.startswith("max_readings = 4 is reached")
+    assert result.stop_reason.startswith("all 4 readings that it may take are taken")
     bits = [info.bits for info in result.steps]
     assert bits[0] > 0.05
     assert result.steps[0].map.highest > result.steps[2].map.highest > 0

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from probewise import _display
 from probewise._display import ShowsItself, render_html
 from probewise.calibration import calibrate
 from probewise.nested import run
@@ -55,10 +56,36 @@ def test_in_a_terminal_a_result_shows_its_summary():
     assert written == [result.summary()]
 
 
-def test_a_value_without_a_renderer_shows_its_escaped_repr():
+def test_a_value_without_a_renderer_shows_its_escaped_summary():
     class Plain(ShowsItself):
-        def __repr__(self):
-            return "<plain>"
+        def summary(self):
+            return "a < b\nand more"
 
-    assert Plain()._repr_html_() == "<pre>&lt;plain&gt;</pre>"
+    assert Plain()._repr_html_() == "<pre>a &lt; b\nand more</pre>"
+    assert repr(Plain()) == "<Plain: a < b>"
     assert render_html(3) == "<pre>3</pre>"
+
+
+def test_the_repr_of_a_result_is_one_short_line():
+    values = (run(Bell(), rng=np.random.default_rng(0), n_live=50), Recording(paper_plan(), np.linspace(10, 60, 408)))
+    for value in (*values, SSFField(np.ones((5, 5)), 1.0, (-2.0, -2.0))):
+        assert repr(value).startswith(f"<{type(value).__name__}")
+        assert "\n" not in repr(value)
+        assert len(repr(value)) < 200
+
+
+def test_a_first_display_that_was_interrupted_loads_its_pictures_at_the_next(monkeypatch):
+    loaded = []
+
+    def load():
+        loaded.append(len(loaded))
+        if len(loaded) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(_display, "_waiting", [load])
+    value = SSFField(np.ones((5, 5)), 1.0, (-2.0, -2.0))
+    with pytest.raises(KeyboardInterrupt):
+        value._repr_html_()
+    for _ in range(2):
+        value._repr_html_()
+    assert loaded == [0, 1]

@@ -429,6 +429,10 @@ def require_sensor(sensor: object, more: str = "") -> None:
     allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
     if isinstance(getattr(sensor, "sensor", None), FittedSensor):
         allowed = f"a FittedSensor: take its .sensor, this is the {type(sensor).__name__}"
+    elif hasattr(sensor, "repaired"):
+        allowed = "a FittedSensor: of a diagnosis found it is found.repaired.fitted_sensor(found.recording, rng=rng)"
+    elif hasattr(sensor, "fitted_sensor"):
+        allowed = "a FittedSensor: take its .fitted_sensor(recording, rng=rng), of the recording that was diagnosed"
     require_kind("sensor", sensor, FittedSensor, f"{allowed}{', ' if more else ''}{more}")
 
 

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from probewise._kinds import require_rng
+from probewise._kinds import require_like, require_rng, require_takes
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.advice.rivals import next_readings
 from probewise.diagnosis.fitting.earlier import SensorPrior
@@ -36,6 +36,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictRepor
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
 from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
 from probewise.effects import VOCABULARY, NamedEffect
+from probewise.effects.vocabulary import require_effects
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
@@ -96,6 +97,13 @@ def diagnose(
         If the fit of the null did not arrive anywhere.
     """
     require_rng(rng)
+    require_takes("progress", progress, ("stage", "done", "total", "note"), "a function")
+    require_effects(effects)
+    if null is not None:
+        allowed = (
+            "a null model: OwnModel(simulate, prior) or SensorAndShape, of probewise.diagnosis; a sensor is sensor="
+        )
+        require_like("null", null, ("admits", "starts", "n_params"), allowed)
     prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(dict(effects), hands))
     return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from probewise._kinds import require_one_of, require_rng, require_texts
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
@@ -14,7 +15,7 @@ from probewise.diagnosis.search.constants import MAX_ORDER
 from probewise.diagnosis.search.search import search
 from probewise.effects import EFFECTS, Extent, NamedEffect
 from probewise.errors import ParameterError
-from probewise.recordings.plan import Recording
+from probewise.recordings.plan import Recording, require_recording
 from probewise.sensor import Stage
 
 __all__ = ["model_with"]
@@ -42,10 +43,14 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     ParameterError
         If a name is not of the vocabulary, or its effect cannot show in this recording.
     """
+    require_recording(recording)
+    require_rng(rng)
+    names = require_texts("names", names, "names of effects")
     extent = Extent.of(recording)
     effects: dict[str, NamedEffect[Any]] = {}
     for name in names:
-        effect = EFFECTS[name].for_extent(extent) if name in EFFECTS else None
+        require_one_of("names", name, list(EFFECTS))
+        effect = EFFECTS[name].for_extent(extent)
         if effect is None:
             raise ParameterError("names", name, "effects of the vocabulary that can show in this recording")
         effects[name] = effect

@@ -9,8 +9,10 @@ from typing import ClassVar, Protocol, Self, TypeVar
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise._kinds import require_mapping
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import NoiseRows
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseLevel
 
@@ -139,6 +141,33 @@ class NamedEffect(Effect[V], Protocol[V]):
         for k in self.amplitudes:
             setting[k] = amounts @ entry[:, k]
         return np.asarray(setting)
+
+
+def require_effects(effects: object) -> None:
+    """Raise ParameterError unless these are classes of effects by their names, each with what it has to say itself."""
+    allowed = "classes of effects by name, such as {**VOCABULARY, 'overflow': Overflow}, of probewise.effects"
+    require_mapping("effects", effects, allowed)
+    assert isinstance(effects, Mapping)
+    for name, kind in effects.items():
+        if not isinstance(kind, type) or not hasattr(kind, "for_extent"):
+            raise ParameterError(f"effects[{name!r}]", kind, "a class as NamedEffect, of probewise.effects, has it")
+        lacking = [each for each in _OWN if getattr(kind, each, None) in (None, _inherited(kind, each))]
+        if lacking:
+            raise ParameterError(
+                f"effects[{name!r}]", kind, f"a class of an effect with {', '.join(_OWN)}; {lacking[0]} is missing"
+            )
+        own = getattr(kind, "name")
+        if own != name:
+            raise ParameterError("effects", name, f"{own!r}, the name of the class {kind.__name__}")
+
+
+_OWN = ("name", "stage", "units", "covariates", "amplitudes", "for_extent", "prior", "apply", "bank", "sentence")
+
+
+def _inherited(kind: type, name: str) -> object:
+    """Give what the bare protocol has in the place of a member: for a class method, bound to this class."""
+    found = getattr(NamedEffect, name, None)
+    return getattr(found, "__func__", found).__get__(kind) if name == "for_extent" else found  # type: ignore[union-attr]
 
 
 class NoiseEffect(NamedEffect[NoiseLevel], Protocol):

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise.experiment.judging import chance_off
 from probewise.experiment.left_out import left_out_of
-from probewise.experiment.values import Exploration
+from probewise.experiment.values import Exploration, require_exploration
 from probewise.nested.weights import weighted_quantiles
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf, RegularPolygon
@@ -69,6 +69,7 @@ def found_shape(run: Exploration) -> FoundShape:
 
 def result_json(run: Exploration) -> str:
     """Write what was found and what it cost as strict JSON, format "exploration/1"."""
+    require_exploration(run)
     document = {
         "format": FORMAT,
         "readings": len(run.steps),
@@ -88,6 +89,7 @@ def samples_csv(run: Exploration) -> str:
 
     Of a set of shapes the column "shape" names each sample's, and parameters of the others are left empty.
     """
+    require_exploration(run)
     shape, names = run.experiment.shape, run.last.names
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     text = io.StringIO()

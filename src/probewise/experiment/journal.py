@@ -314,7 +314,10 @@ class JournalWriter:
         path = Path(path)
         if path.exists():
             raise _exists(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FileError(path.parent, f"cannot be made ({error.strerror})", "a folder you may write to") from error
         with contextlib.ExitStack() as stack:
             stack.enter_context(locked(path))
             if path.exists():

@@ -124,5 +124,5 @@ def stop_reason(
             f"the widest length is known to {widest:.1f} mm"
         )
     if max_readings is not None and n_readings >= max_readings:
-        return f"max_readings = {max_readings} is reached; the widest length is known to {widest:.1f} mm"
+        return f"all {max_readings} readings that it may take are taken; the widest length is known to {widest:.1f} mm"
     return None

@@ -66,11 +66,13 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
     others = [spoken_name(n) for n in LeftOut(probability, "").credible_set[1:] if n != CLEAN]
     beside = f" Not excluded: {', '.join(others)}." if others else ""
     if name == CLEAN:
-        return LeftOut(probability, f"The sensor model leaves nothing out that shows (p = {p:.3g}).{beside} {_ALIASES}")
+        return LeftOut(
+            probability, f"The sensor model leaves nothing out that shows (probability {p:.3g}).{beside} {_ALIASES}"
+        )
     if p < _NAMED:
-        said = f"Something may be left out, most probably {spoken_name(name)} (p = {p:.3g})."
+        said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
     else:
-        said = f"The sensor model leaves something out: {_said(last, name)} (p = {p:.3g})."
+        said = f"The sensor model leaves something out: {_said(last, name)} (probability {p:.3g})."
     return LeftOut(probability, f"{said}{beside} {_ALIASES}")
 
 
@@ -98,7 +100,7 @@ def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> F
     kinds = [k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name]
     best = max(kinds, key=lambda k: last.kinds.log_odds[k])
     effect = last.kinds.kinds[best].effect
-    note = f"a run that explored with it found {spoken_name(name)} (p = {p:.3g})"
+    note = f"a run that explored with it found {spoken_name(name)} (probability {p:.3g})"
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     n_own, n = len(effect.prior.names), len(sensor.samples)

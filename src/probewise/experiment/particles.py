@@ -22,7 +22,7 @@ from scipy.special import logsumexp
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.experiment.kernels import LocalKernels
-from probewise.inference.problem import SensorProblem
+from probewise.inference.problem import SensorProblem, scores
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled
@@ -248,7 +248,7 @@ class _Bridge:
         if not recording.usable[-1]:
             return 0.0
         reading = recording.readings[-1:]
-        best = self.problem.likelihood.log_prob(reading, predicted[:, -1:]).max()
+        best = scores(self.problem.likelihood, reading, predicted[:, -1:]).max()
         return float(self.problem.likelihood.log_prob(reading, reading[None])[0] - best)
 
     def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -262,7 +262,7 @@ class _Bridge:
         """Log likelihood of these readings alone; of none it is zero."""
         if not rows.any():
             return np.zeros(len(predicted))
-        return self.problem.likelihood.log_prob(self.problem.recording.readings[rows], predicted[:, rows])
+        return scores(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
     def cloud(self, theta: FloatArray) -> _Cloud:
         """Evaluate samples; the model is not asked where the prior has none."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
+from probewise._kinds import require_kind
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import recording_of
@@ -226,3 +227,8 @@ class Exploration(ShowsItself):
 def _decimals(name: str) -> int:
     """Decimals of a parameter by its unit, so that an angle of a milliradian shows as a tenth of a millimetre does."""
     return 3 if name.endswith("_rad") else 1
+
+
+def require_exploration(run: object) -> None:
+    """Raise ParameterError unless `run` is an Exploration."""
+    require_kind("run", run, Exploration, "an Exploration, as probewise.explore returns it")

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_like
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Prior, require_prior
 from probewise.recordings.plan import Recording, require_recording
 from probewise.sensor.stages import SensorModel
@@ -44,6 +44,23 @@ def require_model(model: object) -> None:
     """Raise ParameterError unless `model` is a sensor model."""
     allowed = "a sensor model such as Chain(ssf, levels, scene), with names and predict(theta, plan)"
     require_like("model", model, ("names", "predict"), allowed)
+
+
+def scores(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Score predictions (n_samples, n_points) by a likelihood: (n_samples,).
+
+    Raises
+    ------
+    ShapeError
+        If the likelihood, which may be a person's own, gives anything else than one number a hypothesis.
+    """
+    scored = likelihood.log_prob(readings, predicted)
+    if np.shape(scored) != (len(predicted),):
+        raise ShapeError(
+            f"log_prob of {type(likelihood).__name__} returned shape {np.shape(scored)}; allowed: ({len(predicted)},), "
+            f"one number per hypothesis: predicted is a batch of shape {predicted.shape}, one hypothesis per row"
+        )
+    return np.asarray(scored, dtype=np.float64)
 
 
 def require_likelihood(likelihood: object) -> None:
@@ -83,5 +100,5 @@ class SensorProblem:
         usable = self.recording.usable
         predicted = self.model.predict(theta, self.recording.plan)
         if usable.all():
-            return self.likelihood.log_prob(self.recording.readings, predicted)
-        return self.likelihood.log_prob(self.recording.readings[usable], predicted[:, usable])
+            return scores(self.likelihood, self.recording.readings, predicted)
+        return scores(self.likelihood, self.recording.readings[usable], predicted[:, usable])

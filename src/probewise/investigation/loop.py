@@ -8,13 +8,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from probewise._kinds import require_callable, require_rng, require_whole
+from probewise._kinds import require_kind, require_rng, require_takes_places, require_whole
 from probewise.diagnosis import Diagnosis, NextMeasurement, SensorPrior, diagnose
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.investigation.budget import Budget
 from probewise.investigation.rounds import Round, settled_by
 from probewise.progress import Progress, silent
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.plan import Plan, Recording, require_plan
 
 __all__ = ["MOST_ROUNDS", "Record", "investigate"]
 
@@ -68,8 +68,11 @@ def investigate(
     ParameterError
         If an argument is not what it has to be; see also `diagnose`.
     """
-    require_callable("record", record, "a function of a round's number, its plan and the plan in words")
+    require_takes_places("record", record, 3, "a function of a round's number, its plan and the plan in words")
+    require_plan(plan)
     require_rng(rng)
+    if budget is not None:
+        require_kind("budget", budget, Budget, "a Budget(readings=..., minutes=...), or None")
     require_whole("rounds", rounds)
     return _rounds(
         record,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, IntArray, floats
+from probewise._kinds import require_mapping, require_text
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import PATTERNS, Pattern
 from probewise.recordings.table import MISSING
@@ -99,6 +100,8 @@ def with_missing(values: ArrayLike) -> ArrayLike:
 
 def _number_or_missing(cell: Any) -> Any:
     if not isinstance(cell, str):
+        if not (_is_missing(cell) or hasattr(cell, "__float__") or hasattr(cell, "__index__")):
+            raise ValueError("no number")
         return math.nan if _is_missing(cell) else cell
     return math.nan if cell.strip() in MISSING else float(cell)
 
@@ -112,6 +115,46 @@ def seconds(values: ArrayLike) -> ArrayLike:
     if array.dtype.kind == "M" and array.ndim == 1 and not np.isnat(array).any():
         return np.asarray((array - array[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
     return values
+
+
+def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
+    """Take what else was logged, one number a reading of each.
+
+    Raises
+    ------
+    ParameterError
+        If they have no names, or one that a recording has a column for.
+    """
+    if columns is None:
+        return {}
+    require_mapping(
+        "covariates", columns, "what was logged beside the readings, by name: {'temperature_c': [21.3, ...]}"
+    )
+    for name in columns:
+        if name in _KNOWN:
+            raise ParameterError("covariates", name, "a name that is no column of a recording; see its own argument")
+    return {name: column(name, values, n_points) for name, values in columns.items()}
+
+
+def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
+    """Take the rows that are asked for: numbers, one truth value a row, or a slice; their numbers, (n_rows,).
+
+    Raises
+    ------
+    ParameterError
+        If they are nothing of these, or a row is not there.
+    """
+    allowed = f"numbers of rows in a list, up to {n_points - 1}; {n_points} truth values; or a slice"
+    if isinstance(rows, slice):
+        return np.arange(n_points)[rows]
+    asked = np.asarray(rows)
+    if asked.size == 0:
+        return np.zeros(0, dtype=np.int64)
+    if asked.dtype == np.bool_ and asked.shape == (n_points,):
+        return np.flatnonzero(asked)
+    if asked.dtype.kind not in "iu" or asked.ndim != 1 or not ((asked >= -n_points) & (asked < n_points)).all():
+        raise ParameterError("rows", rows, allowed)
+    return np.asarray(asked, dtype=np.int64)
 
 
 def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
@@ -162,6 +205,7 @@ def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Patte
 def require_patterns(patterns: Mapping[str, Pattern]) -> None:
     """Raise ParameterError unless every value is a pattern; a dict of a pattern's fields is the usual mistake."""
     for name, pattern in patterns.items():
+        require_text("a name in patterns", name)
         if not isinstance(pattern, PATTERNS):
             raise ParameterError(f"patterns[{name!r}]", pattern, _A_PATTERN)
 

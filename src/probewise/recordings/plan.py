@@ -20,8 +20,10 @@ from probewise.recordings.columns import (
     columns_of,
     covariates_of,
     named_patterns,
+    own_covariates,
     pattern_codes,
     require_patterns,
+    row_numbers,
     scan_codes,
     seconds,
     undescribed,
@@ -201,7 +203,7 @@ class Plan:
             pattern=pattern_codes(pattern, described, n_points),
             pattern_names=tuple(described),
             patterns=described,
-            covariates={name: column(name, values, n_points) for name, values in (covariates or {}).items()},
+            covariates=own_covariates(covariates, n_points),
             instrumentation=Instrumentation(
                 unit=unit, min=min, max=max, step=step, sensor=sensor, height_mm=height_mm, controls=controls
             ),
@@ -242,9 +244,9 @@ class Plan:
         pairs = [(name, np.flatnonzero(self.pattern == k)) for k, name in enumerate(self.pattern_names)]
         return [(name, rows) for name, rows in pairs if rows.size]
 
-    def take(self, rows: IntArray | BoolArray) -> Plan:
-        """Select rows, in the given order (scans and patterns keep their names)."""
-        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == np.bool_ else np.asarray(rows, dtype=np.int64)
+    def take(self, rows: ArrayLike | slice) -> Plan:
+        """Select rows (numbers, truth values or a slice), in the given order (scans and patterns keep their names)."""
+        rows = row_numbers(rows, len(self))
         kept = np.unique(self.scan[rows])
         return Plan(
             x_mm=self.x_mm[rows],
@@ -484,8 +486,9 @@ class Recording(ShowsItself):
         instrumentation = replace(self.plan.instrumentation, min=None, max=None)
         return replace(self, plan=replace(self.plan, instrumentation=instrumentation), notes=())
 
-    def take(self, rows: IntArray | BoolArray) -> Self:
-        """Select rows, in the given order."""
+    def take(self, rows: ArrayLike | slice) -> Self:
+        """Select rows (numbers, truth values or a slice), in the given order."""
+        rows = row_numbers(rows, len(self))
         return replace(self, plan=self.plan.take(rows), readings=self.readings[rows])
 
 
@@ -498,7 +501,10 @@ def require_plan(plan: object) -> None:
 def require_recording(recording: object) -> None:
     """Raise ParameterError unless `recording` is a Recording; the message says how to make one."""
     allowed = "a Recording: read_recording('NAME.csv'), Recording.from_arrays(...) or Recording.from_table(table, ...)"
-    require_kind("recording", recording, Recording, f"{allowed}, of probewise.recordings")
+    allowed += ", of probewise.recordings"
+    if callable(getattr(recording, "recording", None)) and not isinstance(recording, type):
+        allowed = f"a Recording: take its .recording(), this is the {type(recording).__name__}"
+    require_kind("recording", recording, Recording, allowed)
 
 
 def require_described(plan: Plan) -> None:

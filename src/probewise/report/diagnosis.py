@@ -20,7 +20,6 @@ from probewise.diagnosis import (
     p_in_words,
 )
 from probewise.diagnosis.system.apparatus import PersonsSystem
-from probewise.effects import spoken_name
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import family_words, words_and_unit
@@ -458,7 +457,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
         ("aliased in these readings", "cosine", "what would separate them", "readings needed"),
         (
             (
-                " and ".join(map(spoken_name, a.effects)),
+                " and ".join(map(effect_in_words, a.effects)),
                 number(a.cosine, 3),
                 readable(a.settle_by),
                 _readings(a.readings),

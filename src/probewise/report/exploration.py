@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
+from probewise.effects import spoken_name
 from probewise.experiment import CLEAN, OFF_MM, Experiment, Exploration, Step, chance_off, found_shape, left_out_of
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
@@ -35,6 +36,8 @@ __all__ = [
 ]
 
 MODEL_NAMES = {"ssf": "SSF"}
+_LEAST_SHOWN = 1e-3  # probability of what the sensor model may leave out, in the table
+_MOST_SHOWN = 6
 
 
 def view(
@@ -229,18 +232,22 @@ def write_page(
     ]
     learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)
     doubted = left_out_of(run.last, run.experiment.trust)
+    beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in run.steps]
+    changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
+    dashed = " A dashed line: another became the most probable." if changed else ""
+    named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN]
     doubt = (
         Section(
             "What the sensor model leaves out",
             (
                 paragraph(doubted.sentence),
                 figure(
-                    png(belief_in_the_sensor([{n or CLEAN: p for n, p in s.left_out.items()} for s in run.steps])),
-                    "What the robot believes about its sensor after each reading. A dashed line: it changed its mind.",
+                    png(belief_in_the_sensor(beliefs)),
+                    f"What the robot believes about its sensor after each reading.{dashed}",
                 ),
                 table(
                     ("left out", "probability"),
-                    ((n.replace("_", " "), probability(p)) for n, p in list(doubted.probability.items())[:6]),
+                    (("nothing" if n == CLEAN else spoken_name(n), probability(p)) for n, p in named[:_MOST_SHOWN]),
                 ),
             ),
         ),

@@ -15,10 +15,18 @@ from probewise.report.plots import beliefs_by_round, png
 from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, probability, readable
 
-__all__ = ["answer", "write_page"]
+__all__ = ["answer", "believed", "write_page"]
 
 _MOST_TOLD = 4
 _LEAST_TOLD = 0.005
+
+
+def believed(found: Investigation) -> Markup:
+    """Draw the probability of each explanation after each round."""
+    return figure(
+        png(beliefs_by_round({_title(each): _beliefs(each) for each in found.rounds})),
+        "What was believed after each round: the probability of each explanation, given all readings so far.",
+    )
 
 
 def answer(found: Investigation) -> str:
@@ -53,11 +61,7 @@ def write_page(
         What a simulated world concealed, told at the end; None for a real arm.
     """
     last = found.last
-    beliefs = {_title(each): _beliefs(each) for each in found.rounds}
-    bars = figure(
-        png(beliefs_by_round(beliefs)),
-        "What was believed after each round: the probability of each explanation, given all readings so far.",
-    )
+    bars = believed(found)
     run = definition_list(
         (
             ("arm", source),

@@ -8,14 +8,17 @@ import numpy as np
 
 from probewise._display import render_html
 from probewise.calibration import Calibration, FittedSensor
-from probewise.diagnosis import Diagnosis, PlanAudit
+from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
 from probewise.experiment import Exploration, Step
+from probewise.investigation import Investigation
 from probewise.nested import NestedResult, Weighted
 from probewise.recordings import Prediction, Recording
 from probewise.report import audit as audit_report
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
+from probewise.report import fit as fit_report
+from probewise.report import investigation as investigation_report
 from probewise.report.effect_words import effect_in_words, hypothesis_in_words
 from probewise.report.html import Markup, element, figure, paragraph, table
 from probewise.report.plots import (
@@ -24,12 +27,15 @@ from probewise.report.plots import (
     png,
     posterior_widths,
     predicted_against_recorded,
+    predicted_and_recorded,
     readings_by_orientation,
     spatial_sensitivity,
     ssf_by_order,
 )
-from probewise.report.words import count, unit_of, with_error, without_unit
+from probewise.report.words import count, unit_name, unit_of, with_error, without_unit
 from probewise.sensor import SSFField
+from probewise.systems import SystemPrediction
+from probewise.systems.table import RunRecording
 
 __all__: list[str] = []
 
@@ -40,6 +46,10 @@ MOST_PARAMETERS = 6  # of a run's picture in a notebook: compact; `corner_plot` 
 
 def _card(*parts: Markup) -> str:
     return element("div", *parts)
+
+
+def _text(text: str) -> Markup:
+    return Markup(f"<pre>{html.escape(text)}</pre>")
 
 
 @render_html.register
@@ -58,6 +68,11 @@ def _(value: Recording) -> str:
         f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
     )
     return _card(figure(png(readings_by_orientation(value), dpi=DPI), said))
+
+
+@render_html.register
+def _(value: RunRecording) -> str:
+    return _card(paragraph(f"{value.summary()}; {count(len(value.plan.scan_names), 'run')}"))
 
 
 @render_html.register
@@ -82,7 +97,7 @@ def _(value: Calibration) -> str:
 
 @render_html.register
 def _(value: NestedResult) -> str:
-    text = Markup(f"<pre>{html.escape(value.summary())}</pre>")
+    text = _text(value.summary())
     if not value.names:
         return _card(text)
     drawn = corner_plot(value, parameters=value.names[:MOST_PARAMETERS])
@@ -138,7 +153,7 @@ def _(value: Prediction) -> str:
 @render_html.register
 def _(value: PlanAudit) -> str:
     drawn = png(audit_report.picture(value), dpi=DPI)
-    text = Markup(f"<pre>{html.escape(value.summary())}</pre>")
+    text = _text(value.summary())
     return _card(paragraph(audit_report.answer(value)), figure(drawn, "What the plan sees and tells apart"), text)
 
 
@@ -156,3 +171,32 @@ def _(value: Diagnosis) -> str:
         figure(png(bars, dpi=DPI), "Probability of each hypothesis"),
         *((table(("effect", "probability", "what it does"), rows),) if rows else ()),
     )
+
+
+@render_html.register
+def _(value: SystemFit) -> str:
+    own = value.fitted.simulator
+    readings = np.where(value.recording.usable, value.recording.readings, np.nan)
+    unit = unit_name(own.unit)
+    drawn = predicted_and_recorded(readings, value.predicted, value.sd, label=own.reading, unit=unit)
+    return _card(
+        paragraph(fit_report.answer(value)),
+        figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."),
+        _text(value.summary()),
+    )
+
+
+@render_html.register
+def _(value: SystemPrediction) -> str:
+    said = _text(value.summary())
+    if not np.isfinite(value.readings).any():
+        return _card(said)
+    unit = unit_name(value.table.instrumentation.unit)
+    drawn = predicted_and_recorded(value.readings, value.mean, value.sd, label="reading", unit=unit)
+    return _card(figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."), said)
+
+
+@render_html.register
+def _(value: Investigation) -> str:
+    said = _text(value.summary())
+    return _card(paragraph(investigation_report.answer(value)), investigation_report.believed(value), said)

@@ -80,6 +80,7 @@ def paper_view(
         truth_mm=truth_mm,
         utility_label=drawn.label,
         title=title or f"after {count(number, 'reading')}",
+        lego_scale=True,
         ax=ax,
     )
     ax.collections[0].set_linewidth(_OUTLINE)

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
+from probewise._display import ShowsItself
+from probewise._kinds import require_kind
 from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
@@ -32,7 +34,7 @@ _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` 
 
 
 @dataclass(frozen=True, eq=False)
-class FittedSystem:
+class FittedSystem(ShowsItself):
     """Hold what a recording taught about a simulator and what it leaves out.
 
     Parameters
@@ -108,6 +110,25 @@ class FittedSystem:
         """Central interval of each parameter that holds `mass`."""
         low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
         return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
+
+    def summary(self) -> str:
+        """Say in plain text what it models, and each parameter with its interval."""
+        own, unit = self.simulator, self.simulator.unit
+        effects = f", with {', '.join(self.effects)}" if self.effects else ""
+        lines = [f"{own.source or 'a simulator'} of {own.reading} ({unit}){effects}; {len(self.samples)} samples"]
+        lines.append(f"noise of a new reading {np.median(self.noise_sd):.4g} {unit}")
+        return "\n".join([*lines, self.parameter_table()])
+
+    def parameter_table(self) -> str:
+        """List each parameter with its median and its 95 % interval, as text."""
+        width = max(9, *(len(name) for name in self.names))
+        median, interval = np.median(self.samples, axis=0), self.interval()
+        lines = [f"{'parameter':<{width}}  {'median':>11}  95 % interval"]
+        lines += [
+            f"{name:<{width}}  {median[k]:>11.5g}  {interval[name][0]:.5g} to {interval[name][1]:.5g}"
+            for k, name in enumerate(self.names)
+        ]
+        return "\n".join(lines)
 
     def to_json(self) -> str:
         """Write it as strict JSON, format "system/1"."""
@@ -200,7 +221,16 @@ def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> Fi
 
 def write_fitted_system(fitted: FittedSystem, path: str | os.PathLike[str]) -> None:
     """Write repaired.json or calibrated.json in one piece or not at all."""
+    require_fitted_system(fitted)
     write_text_atomically(path, fitted.to_json())
+
+
+def require_fitted_system(fitted: object) -> None:
+    """Raise ParameterError unless `fitted` is a FittedSystem, saying how to come by one."""
+    allowed = "a FittedSystem: repaired_of(diagnosis), calibrated_of(diagnosis), of probewise.diagnosis"
+    if isinstance(getattr(fitted, "fitted", None), FittedSystem):
+        allowed = f"a FittedSystem: take its .fitted, this is the {type(fitted).__name__}"
+    require_kind("fitted", fitted, FittedSystem, allowed)
 
 
 def _known_json(known: Recorded) -> dict[str, Any]:

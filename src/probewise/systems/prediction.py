@@ -11,6 +11,8 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise._display import ShowsItself
+from probewise._kinds import require_rng
 from probewise.effects import EFFECTS, NamedEffect, NoisePerRun, PredictiveMixture, RandomWalk
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
@@ -19,7 +21,7 @@ from probewise.recordings.plan import Plan
 from probewise.recordings.prediction import said_of_prediction
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import AnyEffect, NoiseLevel, Stage
-from probewise.systems.fitted import FittedSystem
+from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.again import forms_again, own_of_runs
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
@@ -32,7 +34,7 @@ _BLOCK = 2_000_000  # numbers held at once by one pass over some samples
 
 
 @dataclass(frozen=True, eq=False)
-class SystemPrediction:
+class SystemPrediction(ShowsItself):
     """What each row's reading is expected to be, (n_points,).
 
     `sd` is that of one new reading, noise and parameters together; `log_density` is the natural logarithm of the
@@ -130,6 +132,8 @@ def predict_system(
     DoubtfulResultWarning
         If the simulator gives no finite readings for some samples.
     """
+    require_fitted_system(fitted)
+    require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = cast(RunTable, recording.plan)
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_callable, require_kind, require_mapping, require_text, require_texts
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
 from probewise.systems.table import RunTable
@@ -76,8 +77,11 @@ class Noise:
         ParameterError
             If it is nothing like that.
         """
+        if isinstance(given, Noise):
+            return given
         if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
-            raise ParameterError("noise", given, 'a dict with some of "sd", "step", "range", "zero"')
+            meant = f"; was {{'sd': {given}}} meant?" if isinstance(given, int | float) else ""
+            raise ParameterError("noise", given, f'a dict with some of "sd", "step", "range", "zero"{meant}')
         ends = given.get("range", (None, None))
         if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
             raise ParameterError('noise["range"]', ends, "(low, high), low < high")
@@ -118,6 +122,10 @@ class Law:
     max_step_s: float | None = None
 
     def __post_init__(self) -> None:
+        require_mapping("states", self.states, "where each state starts, by name: {'temp_c': 'start_c'}")
+        require_callable("rates", self.rates, "a function rates(states, parameters, columns)")
+        if self.observe is not None:
+            require_callable("observe", self.observe, "a function observe(states, parameters, columns), or None")
         if not self.states:
             raise ParameterError("states", dict(self.states), "one state or more, each with where it starts")
         if self.hold not in ("previous", "linear"):
@@ -192,13 +200,24 @@ class Simulator:
             raise ParameterError(
                 "simulate, rates", found, "one of them: def simulate(p, data), or states and def rates(s, p, u)"
             )
+        require_text("reading", self.reading, "the name of the column that is predicted")
+        require_kind("unit", self.unit, str, "a text")
+        for name, column in (("time", self.time), ("run", self.run)):
+            if column is not None:
+                require_text(name, column, "the name of a column, or None")
+        if self.simulate is not None:
+            way = "a function simulate(parameters, columns); of a file: read_simulator('FILE.py') of probewise.systems"
+            require_callable("simulate", self.simulate, way)
+        else:
+            require_kind("law", self.law, Law, "a law of motion: Law(states, rates)")
+        require_mapping("parameters", self.parameters, "the prior of each by name: {'tau_s': ('log', 1, 1000)}")
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
         object.__setattr__(self, "parameters", {n: marginal_of(n, prior) for n, prior in self.parameters.items()})
-        object.__setattr__(self, "per_run", tuple(self.per_run))
-        object.__setattr__(self, "controls", tuple(self.controls))
-        if isinstance(self.noise, Mapping):
-            object.__setattr__(self, "noise", Noise.of(self.noise))
+        object.__setattr__(self, "per_run", require_texts("per_run", self.per_run, "names of parameters"))
+        object.__setattr__(self, "controls", require_texts("controls", self.controls, "names of columns"))
+        object.__setattr__(self, "noise", Noise.of(self.noise))
+        require_mapping("extra", self.extra, "effects by name: {'drag': Extra(prior, null, says)}")
         for name in self.per_run:
             if name not in self.parameters:
                 raise ParameterError("per_run", name, f"a parameter: {', '.join(self.parameters)}")
@@ -214,14 +233,22 @@ class Simulator:
                     raise ParameterError(
                         f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}"
                     )
-        for name in self.extra:
+        for name, effect in self.extra.items():
+            require_kind(f"extra[{name!r}]", effect, Extra, "an Extra(prior, null, says), of probewise.systems")
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")
 
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
     """Take a table, or columns by name (a dict of arrays, a DataFrame), with the time and the runs of a simulator."""
+    require_simulator(simulator)
     return data if isinstance(data, RunTable) else RunTable(data, simulator.time, simulator.run)
+
+
+def require_simulator(simulator: object) -> None:
+    """Raise ParameterError unless `simulator` is a Simulator, saying how to come by one."""
+    allowed = "a Simulator(reading, unit, parameters, simulate=...), or read_simulator('FILE.py'), of probewise.systems"
+    require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
 
 
 def marginal_of(name: str, given: object) -> Marginal:

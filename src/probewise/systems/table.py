@@ -48,6 +48,9 @@ class RunTable:
     like: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not hasattr(self.columns, "items"):
+            allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
+            raise ParameterError("table", self.columns, allowed)
         columns = {name: _column(name, values) for name, values in self.columns.items()}
         if not columns:
             raise ParameterError("columns", (), "one or more")
@@ -55,6 +58,8 @@ class RunTable:
         for name, values in columns.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"column {name!r} has shape {values.shape}; allowed: ({n_points},), as the others")
+        if n_points == 0:
+            raise ParameterError("table", "without a row", "one row or more")
         object.__setattr__(self, "columns", columns)
         for what, column in (("time", self.time), ("run", self.run)):
             if column is not None and column not in columns:

@@ -11,11 +11,12 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_callable
 from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
 from probewise.diagnosis.fitting.null import Null
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.errors import ParameterError, ShapeError
-from probewise.priors import Prior
+from probewise.priors import Prior, require_prior
 from probewise.recordings.plan import Plan
 from probewise.sensor import AnyEffect, Stage
 
@@ -49,6 +50,11 @@ class OwnModel(Null):
 
     simulate: Simulate
     prior: Prior
+
+    def __post_init__(self) -> None:
+        order = "in the order OwnModel(simulate, prior)"
+        require_callable("simulate", self.simulate, f"a function simulate(parameters, plan), {order}")
+        require_prior("prior", self.prior)
 
     @property
     def n_params(self) -> int:

@@ -12,6 +12,8 @@ from scipy.special import ndtri
 
 from probewise import nested
 from probewise._arrays import FloatArray
+from probewise._display import ShowsItself
+from probewise._kinds import require_kind, require_rng, require_takes
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.evidence.templates import TemplateMemory
@@ -51,7 +53,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class SystemFit:
+class SystemFit(ShowsItself):
     """A simulator fitted to a table.
 
     Parameters
@@ -92,14 +94,7 @@ class SystemFit:
             f"log evidence {self.evidence.log_z:.2f}{error} nats by {self.evidence.method}{how}",
             f"noise of a new reading {np.median(own.noise_sd):.4g} {unit}",
         ]
-        width = max(9, *(len(name) for name in own.names))
-        median, interval = np.median(own.samples, axis=0), own.interval()
-        lines.append(f"{'parameter':<{width}}  {'median':>11}  95 % interval")
-        lines += [
-            f"{name:<{width}}  {median[k]:>11.5g}  {interval[name][0]:.5g} to {interval[name][1]:.5g}"
-            for k, name in enumerate(own.names)
-        ]
-        return "\n".join(lines)
+        return "\n".join([*lines, own.parameter_table()])
 
 
 def fit_simulator(
@@ -140,6 +135,8 @@ def fit_simulator(
         If the fit did not arrive anywhere.
     """
     table = table_for(simulator, table)
+    require_rng(rng)
+    require_takes("progress", progress, ("stage", "done", "total", "note"), "a function")
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, bound=False)
     if prepared.too_little:
         found = (
@@ -237,6 +234,7 @@ def _told(progress: Progress) -> Callable[[nested.State], None]:
 
 def fit_json(fit: SystemFit) -> dict[str, Any]:
     """Lay a fit out as fit.json, format "fit/1": strict JSON."""
+    require_kind("fit", fit, SystemFit, "a SystemFit, as fit_simulator returns it")
     own, interval = fit.fitted, fit.fitted.interval()
     median, sd = np.median(own.samples, axis=0).tolist(), own.samples.std(axis=0).tolist()
     return {

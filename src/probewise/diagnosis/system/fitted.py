@@ -8,9 +8,11 @@ from typing import cast
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._kinds import require_kind
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, System, write_run_table
 from probewise.systems.forms import About
@@ -24,21 +26,25 @@ def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
 
     Raises
     ------
-    TypeError
-        If it is the diagnosis of a light sensor.
+    ParameterError
+        If it is no diagnosis of a simulator.
     """
-    return _fitted(diagnosis, diagnosis.repaired)
+    return _fitted(diagnosis, "repaired")
 
 
 def calibrated_of(diagnosis: Diagnosis) -> FittedSystem:
     """Take the null of a diagnosis: the simulator alone; what is raised is as in `repaired_of`."""
-    return _fitted(diagnosis, diagnosis.null)
+    return _fitted(diagnosis, "null")
 
 
-def _fitted(diagnosis: Diagnosis, model: ModelSamples) -> FittedSystem:
-    apparatus = diagnosis.apparatus
+def _fitted(diagnosis: Diagnosis, which: str) -> FittedSystem:
+    allowed = "the Diagnosis of a simulator, as diagnose_system returns it"
+    if isinstance(getattr(diagnosis, "fitted", None), FittedSystem):
+        allowed += f"; of this {type(diagnosis).__name__} take its .fitted"
+    require_kind("diagnosis", diagnosis, Diagnosis, allowed)
+    apparatus, model = diagnosis.apparatus, getattr(diagnosis, which)
     if not isinstance(apparatus, PersonsSystem):
-        raise TypeError("a light sensor's models are written as sensor.json; a simulator's alone as system/1")
+        raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
     before = diagnosis.repair.before.readings
     return fitted_system(
         apparatus.system, model, diagnosis.recording, before, known=bound_about(apparatus.about, model)

@@ -8,6 +8,7 @@ from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 from probewise._display import ShowsItself
+from probewise._kinds import require_kind
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
@@ -182,3 +183,8 @@ def _p_value_said(p_value: float) -> str:
     """Write the p-value with what it means."""
     meant = "how often chance alone, with nothing missing from the mean, gives readings as odd as these"
     return f"{p_in_words(p_value)} ({meant})"
+
+
+def require_diagnosis(diagnosis: object) -> None:
+    """Raise ParameterError unless `diagnosis` is a Diagnosis."""
+    require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")

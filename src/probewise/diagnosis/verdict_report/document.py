@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import Any
 
 from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, require_diagnosis
 from probewise.diagnosis.verdict_report.findings import ParameterFound
 from probewise.effects import public_name
 
@@ -31,6 +31,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     The witness figures (`where`) and the next plan are named here and written by the report and the
     command line.
     """
+    require_diagnosis(diagnosis)
     gain, plan = diagnosis.improvement, diagnosis.next_measurement
     document: dict[str, Any] = {
         "format": "diagnosis/1",

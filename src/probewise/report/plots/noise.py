@@ -54,7 +54,7 @@ def correlation_of_neighbours(
     if rho is not None:
         ax.plot(lags, rho**lags, "--", color=BLUE, linewidth=1.5, label=f"noise model found: {rho:.2f} per step")
     ax.set_xticks(lags)
-    tidy(ax, x="how many readings apart (same scan)", y="correlation (no unit)")
+    tidy(ax, x="how many readings apart (within a scan or run)", y="correlation (no unit)")
     plain_numbers(ax, x=False)
     legend_above(ax)
     return ax

@@ -38,6 +38,7 @@ def playing_field(
     title: str = "",
     utility_label: str = "entropy (bits)",
     utility_max: float | None = None,
+    lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the field as the machine learning system sees it (paper, figures of the entropy map).
@@ -62,6 +63,8 @@ def playing_field(
         Text of the figure and of its colour bar.
     utility_max
         Upper end of the colour scale, so that figures can be compared; the map's own maximum without.
+    lego_scale
+        Whether the paper's coordinates, LEGO distance units, stand on top.
     ax
         Axes to draw on; a new figure without.
     """
@@ -106,7 +109,8 @@ def playing_field(
     ax.set_aspect("equal")
     ax.set_xlabel("x (mm)")
     ax.set_ylabel("y (mm)")
-    _add_lego_scale(ax)
+    if lego_scale:
+        _add_lego_scale(ax)
     if title:
         ax.set_title(title, fontsize="medium", loc="left")
     return ax

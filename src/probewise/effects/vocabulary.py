@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self, TypeVar, cast
 
 import numpy as np
 
@@ -156,7 +156,7 @@ def require_effects(effects: object) -> None:
             raise ParameterError(
                 f"effects[{name!r}]", kind, f"a class of an effect with {', '.join(_OWN)}; {lacking[0]} is missing"
             )
-        own = getattr(kind, "name")
+        own = cast(type[NamedEffect[Any]], kind).name
         if own != name:
             raise ParameterError("effects", name, f"{own!r}, the name of the class {kind.__name__}")
 

@@ -9,11 +9,13 @@ random is drawn here.
 
 # %%
 import json
+import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-file = next(p for p in (Path("docs"), Path("../docs")) if p.is_dir()) / "results" / "nested_scaling.json"
+near = (Path("docs"), Path("../docs"), Path(sys.argv[0]).resolve().parent.parent / "docs")
+file = next(path for docs in near if (path := docs / "results" / "nested_scaling.json").exists())
 studies = json.loads(file.read_text(encoding="utf-8"))["studies"]
 for name, study in studies.items():
     print(f"{name}: probewise {study['version']}, {study['date']}, {study['command']}")

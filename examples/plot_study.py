@@ -8,13 +8,15 @@ measured by ``probewise study`` over hundreds of circles and stored; nothing ran
 
 # %%
 import csv
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 from probewise.report.plots import readings_needed
 from probewise.study import Estimate
 
-file = next(p for p in (Path("docs"), Path("../docs")) if p.is_dir()) / "results" / "study.csv"
+near = (Path("docs"), Path("../docs"), Path(sys.argv[0]).resolve().parent.parent / "docs")
+file = next(path for docs in near if (path := docs / "results" / "study.csv").exists())
 with file.open(encoding="utf-8", newline="") as lines:
     rows = list(csv.DictReader(lines))
 

@@ -207,3 +207,12 @@ def test_a_scan_with_a_name_that_no_file_can_hold_is_refused_where_it_is_made():
     with pytest.raises(ParameterError, match=r"scan is 'b.*printable"):
         made(scan=["a", "a", "b\n\0c"])
     assert made(scan=[" a", "a", "b\n"]).plan.scan_names == ("a", "b")
+
+
+def test_rows_are_taken_by_number_by_truth_and_by_slice():
+    whole = read_recording(shipped("paper"))
+    for rows in ([0, 1, 2], slice(3), np.arange(len(whole)) < 3):
+        assert whole.take(rows).readings.tolist() == whole.readings[:3].tolist()
+        assert whole.plan.take(rows).x_mm.tolist() == whole.plan.x_mm[:3].tolist()
+    assert len(whole.take([])) == 0
+    assert whole.take([-1]).readings[0] == whole.readings[-1]

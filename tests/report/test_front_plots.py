@@ -99,3 +99,11 @@ def test_one_scan_is_drawn_about_where_the_two_models_differ():
 def test_readings_that_lie_on_no_line_have_no_curve(recording):
     with pytest.raises(ParameterError, match="three places"):
         plots.before_and_after(recording, np.arange(404, 408), recording.readings, recording.readings)
+
+
+@pytest.mark.parametrize("lego_scale", [False, True])
+def test_lego_units_stand_over_the_field_only_where_they_are_asked_for(lego_scale):
+    ax = plots.playing_field(np.ones((3, 4)), np.arange(4.0), np.arange(3.0), lego_scale=lego_scale)
+    assert [axis.get_xlabel() for axis in ax.child_axes if axis.get_xlabel()] == [
+        "LEGO distance units (8 mm)"
+    ] * lego_scale

@@ -76,7 +76,7 @@ def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quic
     assert run("explore", "--sensor", sensor_file, "--out", out, "--live", "--quiet", "--max-readings", 2) == 0
     assert ['http-equiv="refresh"' in page for page in pages] == [True, False]
     assert (out / "live.html").read_text() == pages[-1]
-    assert "max_readings" in pages[-1]
+    assert "all 2 readings that it may take are taken" in pages[-1]
     assert opened == [(out / "live.html").as_uri()]
 
 

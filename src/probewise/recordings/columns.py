@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, IntArray, floats
-from probewise._kinds import require_mapping, require_text
+from probewise._kinds import require_kind, require_mapping
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import PATTERNS, Pattern
 from probewise.recordings.table import MISSING
@@ -205,7 +205,7 @@ def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Patte
 def require_patterns(patterns: Mapping[str, Pattern]) -> None:
     """Raise ParameterError unless every value is a pattern; a dict of a pattern's fields is the usual mistake."""
     for name, pattern in patterns.items():
-        require_text("a name in patterns", name)
+        require_kind("a name in patterns", name, str, "a text")
         if not isinstance(pattern, PATTERNS):
             raise ParameterError(f"patterns[{name!r}]", pattern, _A_PATTERN)
 

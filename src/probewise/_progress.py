@@ -12,7 +12,7 @@ from typing import NamedTuple, Never
 from tqdm import tqdm
 
 from probewise._kinds import require_takes
-from probewise.nested import State
+from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
 
 __all__ = ["of_nested", "progress_or_bar", "progress_shown"]
@@ -80,10 +80,10 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         yield progress
 
 
-def of_nested(progress: Progress) -> Callable[[int | str, State], None]:
+def of_nested(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
     """Adapt a progress function to nested sampling; each run is named or has a number of Gaussians."""
 
-    def tell(what: int | str, state: State) -> None:
+    def tell(what: int | str, state: RoundSummary) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
         to_come = state.log_ratio_remaining
         progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")

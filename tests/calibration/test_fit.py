@@ -14,7 +14,7 @@ from probewise.calibration.coverage import Coverage, coverage, draw_truth, order
 from probewise.calibration.distinct import DistinctRows
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
-from probewise.nested import State
+from probewise.nested import RoundSummary
 from probewise.recordings import Recording, fingerprint
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
@@ -110,7 +110,7 @@ def test_readings_left_out_change_nothing_but_are_counted(recording: Recording, 
 @pytest.mark.slow
 def test_fewer_readings_than_parameters_are_warned_of_and_noted(recording: Recording) -> None:
     few = recording.take(np.array([0, 10, 15, 17, 20, 33]))
-    rounds: list[tuple[int, State]] = []
+    rounds: list[tuple[int, RoundSummary]] = []
     with pytest.warns(DoubtfulResultWarning, match="6 usable readings for 8 parameters"):
         found = calibrate(
             few,

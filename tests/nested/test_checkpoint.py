@@ -30,8 +30,8 @@ from probewise.nested import (
     NestedResult,
     Points,
     RemainingEvidence,
+    RoundSummary,
     SliceMove,
-    State,
     Tally,
     run,
 )
@@ -123,11 +123,11 @@ def assert_same(one: NestedResult, other: NestedResult) -> None:
             assert a == b, field.name
 
 
-def stopper(n_rounds: int) -> Callable[[State], None]:
+def stopper(n_rounds: int) -> Callable[[RoundSummary], None]:
     """Give a progress function that raises at the end of the so-manyth round."""
     rounds = itertools.count(1)
 
-    def progress(state: State) -> None:
+    def progress(state: RoundSummary) -> None:
         if next(rounds) == n_rounds:
             raise Stop
 
@@ -143,7 +143,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_run_stopped_after_every_round_ends_as_one_never_stopped(name: str, move: str, path: Path) -> None:
     make, options = PROBLEMS[name]
-    states: list[State] = []
+    states: list[RoundSummary] = []
     whole = quiet(make(), move=MOVES[move], progress=states.append, **options)
     assert len(states) > 4
     for _ in states:
@@ -158,13 +158,13 @@ def test_a_run_stopped_after_every_round_ends_as_one_never_stopped(name: str, mo
 
 
 def test_a_run_stopped_once_at_any_round_ends_as_one_never_stopped(tmp_path: Path) -> None:
-    states: list[State] = []
+    states: list[RoundSummary] = []
     whole = quiet(problems.plateau(), n_live=40, progress=states.append)
     for k in range(1, len(states) + 1):
         options = {"n_live": 40, "checkpoint": tmp_path / f"{k}.npz", "checkpoint_every_s": NEVER}
         with pytest.raises(Stop):
             quiet(problems.plateau(), progress=stopper(k), **options)
-        seen: list[State] = []
+        seen: list[RoundSummary] = []
         assert_same(quiet(problems.plateau(), progress=seen.append, **options), whole)
         assert seen == states[k:]
 
@@ -313,7 +313,7 @@ def test_a_run_killed_at_any_time_ends_as_one_never_killed(tmp_path: Path) -> No
 def test_a_finished_run_is_given_again_and_its_file_left_alone(path: Path) -> None:
     whole = quiet(half_impossible(), n_live=30, checkpoint=path)
     before, when = path.read_bytes(), path.stat().st_mtime_ns
-    problem, states = Counted(half_impossible()), list[State]()
+    problem, states = Counted(half_impossible()), list[RoundSummary]()
     assert_same(quiet(problem, n_live=30, checkpoint=path, progress=states.append), whole)
     assert (problem.n_hypotheses, states) == (1, [])
     assert (path.read_bytes(), path.stat().st_mtime_ns) == (before, when)
@@ -502,9 +502,9 @@ def test_a_move_and_a_rule_of_ones_own_are_taken_up_again(path: Path) -> None:
 
     @dataclasses.dataclass(frozen=True)
     class Rule:
-        wrapped: Callable[[State], str | None]
+        wrapped: Callable[[RoundSummary], str | None]
 
-        def __call__(self, state: State) -> str | None:
+        def __call__(self, state: RoundSummary) -> str | None:
             return self.wrapped(state)
 
     def make() -> dict[str, object]:
@@ -589,10 +589,10 @@ def test_ctrl_c_raises_where_it_should_and_the_run_is_saved(path: Path) -> None:
 
 def test_ctrl_c_after_the_last_round_interrupts_nothing(path: Path) -> None:
     """It comes from `progress`, when the rule has already said that the run is done."""
-    states: list[State] = []
+    states: list[RoundSummary] = []
     whole = quiet(problems.plateau(), n_live=40, progress=states.append)
 
-    def progress(state: State) -> None:
+    def progress(state: RoundSummary) -> None:
         if state == states[-1]:
             raise KeyboardInterrupt
 
@@ -615,7 +615,7 @@ def _with_nan(theta: np.ndarray) -> np.ndarray:
         (lambda t: np.full(len(t), np.inf), r"log likelihood is inf at p0 = 0\.\d+, p1 = 0\.\d+"),
         (lambda t: np.zeros((len(t), 1)), r"shape \(\d+, 1\); allowed: \(\d+,\).*p0 = 0\.\d+, p1 = 0\.\d+"),
         (lambda t: 0.0, r"shape \(\); allowed: \(\d+,\).*p0 = 0\.\d+"),
-        (lambda t: ["low"] * len(t), r"no numbers \(could not convert string.*p0 = 0\.\d+"),
+        (lambda t: ["low"] * len(t), r"something other than numbers \(could not convert string.*p0 = 0\.\d+"),
         (lambda t: 1 / 0, r"raised ZeroDivisionError: division by zero; .*first of the \d+ .* p0 = 0\.\d+"),
         (lambda t: next(iter(())), r"raised RuntimeError: generator raised StopIteration; .*p0 = 0\.\d+"),
     ],
@@ -685,7 +685,7 @@ def test_a_run_is_saved_as_often_as_asked(
         true(self, now)
 
     monkeypatch.setattr(Keeper, "save", save)
-    states: list[State] = []
+    states: list[RoundSummary] = []
     quiet(slope(), n_live=30, checkpoint=path, checkpoint_every_s=every_s, progress=states.append)
     # The first live points, every round, and the end.
     assert next(n_saved) == round(share * (1 + len(states))) + 1
@@ -724,14 +724,14 @@ def test_memory_beside_the_samples_is_the_same_in_long_runs(n_rounds: int) -> No
     per_point, per_round = 8 * (2 * n_params + 10), 12 * 130 + 1200
     held, peak, dead = [], [], []
 
-    def progress(state: State) -> None:
+    def progress(state: RoundSummary) -> None:
         now, most = tracemalloc.get_traced_memory()
         held.append(now)
         peak.append(most - now)
         dead.append(state.n_dead)
         tracemalloc.reset_peak()
 
-    def stop(state: State) -> str | None:
+    def stop(state: RoundSummary) -> str | None:
         return "enough" if state.n_dead >= n_rounds * n_live // 2 else None
 
     # No end: the likelihood rises for ever on the way to the middle.

@@ -23,7 +23,7 @@ import pytest
 from nested_sampling import problems
 
 from probewise.errors import FileError, NotConvergedError, ParameterError, ReachError
-from probewise.nested import Evaluator, KernelMove, NestedResult, SliceMove, State, run
+from probewise.nested import Evaluator, KernelMove, NestedResult, RoundSummary, SliceMove, run
 from probewise.priors import Product, Uniform
 
 # A module of its own, since a process is sent the names of functions and not the functions.
@@ -172,7 +172,7 @@ def test_a_run_with_an_executor_is_taken_up_again_without_and_the_other_way_roun
     class Stop(Exception):
         pass
 
-    def stop(state: State) -> None:
+    def stop(state: RoundSummary) -> None:
         raise Stop
 
     whole = run(slopes.Slope(), rng=rng(), n_live=50)

@@ -20,8 +20,8 @@ from probewise.nested import (
     Points,
     PriorRejection,
     RemainingEvidence,
+    RoundSummary,
     SliceMove,
-    State,
     run,
 )
 from probewise.nested.checkpoint import Live, Origin
@@ -257,7 +257,7 @@ def test_the_call_limit_gives_a_doubtful_result(rng: np.random.Generator) -> Non
 
 
 def test_progress_is_told_every_round(rng: np.random.Generator) -> None:
-    states: list[State] = []
+    states: list[RoundSummary] = []
     result = run(problems.plateau(), rng=rng, n_live=40, progress=states.append, max_cost=1.0)
     assert states[-1].n_calls == result.n_calls
     assert all(a.log_volume > b.log_volume for a, b in itertools.pairwise(states))

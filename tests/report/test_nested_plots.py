@@ -203,4 +203,4 @@ def test_merged_runs_are_drawn_as_one():
 def test_a_notebook_shows_no_more_than_six_parameters():
     shown = synthetic(9)._repr_html_()
     assert "of the first 6 of 9 parameters" in shown
-    assert "worth 600 independent ones" in shown
+    assert "effective sample size 600" in shown

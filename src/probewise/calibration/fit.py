@@ -23,7 +23,7 @@ from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, def
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor, student_t
-from probewise.nested import NestedResult, State, Weighted, refine, run
+from probewise.nested import NestedResult, RoundSummary, Weighted, refine, run
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_described, require_recording
 from probewise.scene import KnownScene
@@ -138,7 +138,7 @@ def calibrate(
     orders: Sequence[int] = (1, 2, 3, 4),
     n_live: int = 300,
     rng: np.random.Generator,
-    progress: Callable[[int, State], None] | None = None,
+    progress: Callable[[int, RoundSummary], None] | None = None,
     prior: Callable[[Recording, int], SSFPrior] = default_prior,
     data_sets: IntArray | None = None,
     pixel_mm: float | None = None,
@@ -236,7 +236,7 @@ def _fit_order(
     rng: np.random.Generator,
     *,
     n_live: int,
-    progress: Callable[[int, State], None] | None,
+    progress: Callable[[int, RoundSummary], None] | None,
     prior: Callable[[Recording, int], SSFPrior],
     data_sets: IntArray | None,
     pixel_mm: float | None,
@@ -274,7 +274,7 @@ def _fit_order(
     return OrderFit(n_gaussians, belief, result, refined, sensor)
 
 
-def _told(progress: Callable[[int, State], None], n_gaussians: int) -> Callable[[State], None]:
+def _told(progress: Callable[[int, RoundSummary], None], n_gaussians: int) -> Callable[[RoundSummary], None]:
     return lambda state: progress(n_gaussians, state)
 
 

@@ -2,12 +2,12 @@
 
 The paper's section "The Machine Learning System" (50 samples, diversified by about 1000
 Metropolis-Hastings steps) and its section on estimating the SSF's parameters (the evidence Z and
-the stop rule on consecutive values of log Z).
+the stopping rule on consecutive values of log Z).
 """
 
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
-from probewise.nested.families import chain_memory
+from probewise.nested.genealogy import chain_memory
 from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
@@ -17,7 +17,7 @@ from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
 from probewise.nested.sampler import LIVE_PER_PARAM, least_live, step
-from probewise.nested.stop import EvidenceChange, RemainingEvidence, State, StopRule
+from probewise.nested.stop import EvidenceChange, RemainingEvidence, RoundSummary, State, StopRule
 
 __all__ = [
     "LIVE_PER_PARAM",
@@ -35,6 +35,7 @@ __all__ = [
     "PriorRejection",
     "RemainingEvidence",
     "Repartitioned",
+    "RoundSummary",
     "Samplable",
     "SliceMove",
     "State",

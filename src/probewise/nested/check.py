@@ -1,11 +1,11 @@
-"""Ask a run's evidence again by a second route, and spend more where the two disagree.
+"""Check a run's evidence by a second, independent estimate, and repeat the run where the two disagree.
 
-A run can be wrong without a trace: chains that are too short bias every shell a little and always in the same
-direction, so that log Z drifts with every nat and neither the insertion ranks nor the scatter between seeds tell.
-The second route, with chains twice as long, has few nats to shrink by: a run from a prior near the posterior that the
-first has found (`repartition`). Where the posterior fills so much of the prior that nothing is gained by that, a small
-run of the same problem stands in. How far chains jump, in units of the live points' own spread, is no such test: it is
-least where many modes or a thin shell keep chains in their place, and there the evidence is right.
+A run can be biased without any sign of it: chains that are too short bias every shell a little and always in the same
+direction, so that log Z drifts with every nat while the insertion ranks and the scatter between seeds look right.
+The second estimate uses chains twice as long and has few nats of compression: it is a run from a prior near the
+posterior that the first run found (`repartition`). Where the posterior fills so much of the prior that this saves
+nothing, a small run of the same problem is used. The jump distance of the chains, in units of the live points' spread,
+is no substitute: it is smallest for many modes or a thin shell, where the evidence is right.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Check, NestedResult, few_possible
 
-__all__ = ["DISAGREE", "Search", "checked", "weighted_mean"]
+__all__ = ["DISAGREE", "SingleRun", "checked", "weighted_mean"]
 
 DISAGREE = 2.5
-"""Errors that the two routes may lie apart by before they are said to disagree."""
+"""Difference of the two estimates, in combined standard errors, above which they disagree."""
 
-# Apart by this many errors, the second route is asked again and more sharply.
+# Above this many errors the second estimate is repeated with more live points.
 _APART = 2.0
 _MOST_MEMORY = 10.0
 _N_SAMPLES = 2000
-# A prior near the posterior is no gain where the way from it is nearly as long.
+# The repartitioned run is used only if it needs less than this share of the first run's nats.
 _GAIN = 0.8
-_SHARE = 0.1  # of the first run's live points and nats, for a second route, whose chains are twice as long
+_SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
 
 
-class Search(Protocol):
-    """Run a problem once, without asking whether it is right; raises NotConvergedError as `run` does."""
+class SingleRun(Protocol):
+    """A function that runs nested sampling once, without a check; it raises NotConvergedError as `run` does."""
 
     def __call__(
         self, problem: Samplable, *, n_live: int, move: Move, max_calls: int | None, rng: np.random.Generator
     ) -> NestedResult:
-        """Run it."""
+        """Run nested sampling on the problem."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class _Route:
-    """A second way to the evidence: a problem of the same evidence, how many live points, and which chains."""
+    """A second estimate of the evidence: a problem of the same evidence, the number of live points and the move."""
 
     problem: Samplable
     n_live: int
@@ -63,37 +63,37 @@ def checked(
     first: NestedResult,
     problem: Samplable,
     move: Move,
-    search: Search,
+    search: SingleRun,
     *,
     max_cost: float,
     max_calls: int | None,
     least_live: int,
     rng: np.random.Generator,
 ) -> NestedResult:
-    """Check a run, and repeat it with longer chains where the second route disagrees.
+    """Check a run, and repeat it with longer chains where the second estimate disagrees.
 
     Parameters
     ----------
     first
-        The run, ended by its stop rule.
+        The run, ended by its stopping rule.
     problem, move
-        What it ran on, and how it moved.
+        Its problem and its move.
     search
-        Runs a problem once.
+        Runs nested sampling once, without a check.
     max_cost
-        Evaluations in all, in units of the first run's.
+        Limit on all evaluations, in units of the first run's.
     max_calls
-        Evaluations in all, or None.
+        Limit on all evaluations, or None.
     least_live
-        Fewest live points that a run of the problem accepts.
+        Fewest live points allowed for the problem.
     rng
         Source of randomness.
 
     Returns
     -------
     NestedResult
-        The first run, or one with longer chains if only that agrees with the second route. Its `check` says what the
-        second route found; a warning says so where the two disagree in the end.
+        The first run, or one with longer chains if only that agrees with the second estimate. `check` holds the second
+        estimate; a warning is added if the two still disagree.
     """
     budget = max_cost * first.n_calls
     if max_calls is not None:
@@ -101,7 +101,7 @@ def checked(
     spent = first.n_calls
 
     def ask(route: _Route) -> NestedResult | None:
-        """Run a route; None where that would cost too much."""
+        """Run a second estimate; None where it would exceed the budget."""
         nonlocal spent
         left = int(budget - spent)
         if left < 2 * route.n_live:
@@ -109,7 +109,7 @@ def checked(
         try:
             found = search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=rng)
         except NotConvergedError as error:
-            # A route of its own may ask where the run never was; what it met there is told.
+            # It may evaluate hypotheses that the first run never met; the error is reported as a warning.
             raise _FailedError(str(error)) from error
         spent += found.n_calls
         return found if found.complete else None
@@ -134,7 +134,7 @@ def checked(
 
 
 class _FailedError(Exception):
-    """A second route met what no run can use."""
+    """The likelihood failed during a second estimate."""
 
 
 def _second_route(
@@ -146,10 +146,10 @@ def _second_route(
         weight = np.exp(first.log_weight[first.log_weight > -math.inf])
         log_likelihood = first.log_likelihood[first.log_weight > -math.inf]
         nats = float(weight @ (log_likelihood + near.prior.made_up(theta))) - first.log_z
-        # A log Z that is far too great makes them look few, or less than none.
+        # With a log Z that is far too large the nats come out too few, or negative.
         if first.information > 0 and nats < _GAIN * first.information:
             wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
-            enough = 2.0 * first.n_live * nats / first.information  # for an error below the run's own
+            enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
             n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
             return _Route(near, n_live, _longer(move), "a second pass from near the posterior")
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
@@ -157,7 +157,7 @@ def _second_route(
 
 
 def _near(first: NestedResult, problem: Samplable, rng: np.random.Generator) -> Repartitioned | None:
-    """State the problem near what was found; None where the prior or the samples do not allow it."""
+    """Repartition the problem about the posterior found; None where the prior or the samples do not allow it."""
     if not hasattr(problem.prior, "log_prob"):
         return None
     try:
@@ -169,7 +169,7 @@ def _near(first: NestedResult, problem: Samplable, rng: np.random.Generator) -> 
 
 
 def _longer(move: Move) -> Move:
-    """Chains twice as long; slice chains where the move is one of another kind."""
+    """Double the length of the chains; other moves are replaced by slice sampling."""
     return move.longer() if isinstance(move, SliceMove) else SliceMove().longer()
 
 
@@ -178,7 +178,7 @@ def _doubtful(answer: NestedResult) -> bool:
 
 
 def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
-    """Average independent estimates of log Z by their errors; also the error of the mean."""
+    """Return the inverse-variance weighted mean of independent estimates of log Z, and its error."""
     weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
@@ -188,7 +188,7 @@ def _together(answers: list[NestedResult]) -> tuple[float, float]:
 
 
 def _distance(run: NestedResult, answers: list[NestedResult]) -> float:
-    """Difference of the two routes in units of their errors."""
+    """Difference of the two estimates in combined standard errors."""
     log_z, error = _together(answers)
     return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
@@ -198,7 +198,7 @@ def _suspicious(run: NestedResult, answers: list[NestedResult], most: float) -> 
 
 
 def _told(now: NestedResult, name: str, answers: list[NestedResult], spent: int) -> NestedResult:
-    """Store what the check found, and the doubt where the routes disagree."""
+    """Store the check in the result, with a warning where the estimates disagree."""
     log_z, error = _together(answers)
     distance = _distance(now, answers)
     check = Check(name, log_z, error, distance, sum(answer.n_calls for answer in answers))
@@ -212,9 +212,9 @@ def _told(now: NestedResult, name: str, answers: list[NestedResult], spent: int)
         )
     elif _doubtful(answers[-1]):
         why = answers[-1].warnings[0] if answers[-1].warnings else f"its memory is {answers[-1].memory:.1f}"
-        warnings = (*warnings, f"{name}, which checks the evidence, is in doubt itself: {why}")
+        warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
-        # How few hypotheses the volume was counted by no longer matters where another route has counted it.
+        # A poorly known share of possible hypotheses no longer matters once a second estimate agrees.
         counted = few_possible(now.log_start, now.log_start_error, now.n_live)
         warnings = tuple(note for note in warnings if note != counted)
     return replace(now, n_calls=spent, check=check, warnings=warnings)

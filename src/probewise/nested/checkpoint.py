@@ -1,4 +1,4 @@
-"""Hold a run between two rounds, and save it so that a kill loses nothing that was saved."""
+"""The state of a run between two rounds, and its checkpoint file, which survives a kill."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Say of points where each came from, all (n,).
+    """Origin of points; all arrays are (n,).
 
-    `log_birth`, `birth_label`: the level that it was drawn above. `ident`: its number in order of birth; `parent`:
-    that of the point at which its chain began, -1 for none.
+    `log_birth`, `birth_label`: the bound above which each was drawn. `ident`: its number in order of birth; `parent`:
+    the number of the point at which its chain began, -1 for none.
     """
 
     log_birth: FloatArray
@@ -45,22 +45,22 @@ class Origin:
 
     @classmethod
     def of_prior(cls, n: int) -> Origin:
-        """Say so of draws from the prior, numbered."""
+        """Return the origin of `n` draws from the prior, numbered from 0."""
         return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
 
     def take(self, rows: IntArray) -> Origin:
-        """Select."""
+        """Select rows."""
         return Origin(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
     def join(cls, *parts: Origin) -> Origin:
-        """Put one behind the other."""
+        """Concatenate."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
 class Live:
-    """Hold the live points and the log volume they fill."""
+    """The live points and the log of the prior volume they fill."""
 
     points: Points
     origin: Origin
@@ -69,10 +69,10 @@ class Live:
 
 @dataclass(frozen=True, eq=False)
 class Dead:
-    """Hold the points that one round removed, worst first, and how their successors came in.
+    """The points that one round removed, worst first, and the insertion ranks of their successors.
 
-    `n_at_death`: points alive when each died, itself included. `rank`, `n_ranked`: how many of
-    the `n_ranked` points alive at a successor's insertion were worse than it.
+    `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the
+    `n_ranked` points alive at a successor's insertion were worse than it.
     """
 
     points: Points
@@ -84,11 +84,11 @@ class Dead:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Hold everything that the rest of a run depends on.
+    """The state of the sampler after a round: everything that the rest of the run depends on.
 
-    `log_start`, `log_start_error`: log of the prior's possible share. `best`: greatest log likelihood of the live
-    points; `log_z_over_best`: log of the evidence of the dead points, less that. `n_stuck`: chains that could
-    not leave their start; `last_cost`: evaluations of the last round; `ended`: why it is over.
+    `log_start`, `log_start_error`: log of the share of the prior with nonzero likelihood. `best`: greatest log
+    likelihood of the live points; `log_z_over_best`: log evidence of the dead points, minus `best`. `n_stuck`: chains
+    that never left their start; `last_cost`: evaluations of the last round; `ended`: the stop reason, if it is over.
     """
 
     live: Live
@@ -109,12 +109,12 @@ class Run:
 def settings_of(
     names: tuple[str, ...], n_live: int, n_replaced: int, move: Move, stop: StopRule, seed_state: str
 ) -> dict[str, object]:
-    """Describe what a resumed run must share with the one that was interrupted.
+    """Describe the settings that a resumed run must share with the interrupted one.
 
     Raises
     ------
     ParameterError
-        If the move is none that a checkpoint can hold.
+        If the move is not a dataclass, which a checkpoint requires.
     """
     _numbers(move)
     return {
@@ -130,13 +130,13 @@ def settings_of(
 def _told(value: object) -> str:
     if not is_dataclass(value):
         return str(getattr(value, "__qualname__", type(value).__qualname__))
-    # Where a function stands in memory differs from one process to the next.
+    # A function's memory address differs between processes.
     return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
 
 
 @dataclass
 class Keeper:
-    """Save a run to `path`, whole or not at all, and take it up again."""
+    """Save a run to `path` atomically, and resume it."""
 
     path: Path
     every_s: float
@@ -151,7 +151,7 @@ class Keeper:
         if self.path.is_dir():
             raise FileError(self.path, "a folder", "a file in an existing, writable folder")
         try:
-            # Found out now rather than when there is something to lose.
+            # Fail now, before anything is computed.
             tempfile.TemporaryFile(dir=self.path.parent).close()
         except OSError as error:
             raise FileError(
@@ -159,12 +159,12 @@ class Keeper:
             ) from error
 
     def save_if_due(self, now: Run) -> None:
-        """Save if the last time is long ago, and long compared with what saving takes; always if `every_s` is 0."""
+        """Save at most every `every_s` seconds and every ten times the saving time; always if `every_s` is 0."""
         if self.every_s == 0 or time.monotonic() - self._last >= max(self.every_s, 10.0 * self._took):
             self.save(now)
 
     def save(self, now: Run) -> None:
-        """Write the file, unless it holds this run already; warn where that fails: the run itself is sound."""
+        """Write the file unless it holds this state already; a failure only warns, as the run itself is sound."""
         if now is self._held:
             return
         begun = time.monotonic()
@@ -200,7 +200,7 @@ class Keeper:
         return buffer.getvalue()
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> Run | None:
-        """Read the file and put the generator where it was; None where there is no file.
+        """Read the file and restore the generator's state; None where there is no file.
 
         Raises
         ------
@@ -211,13 +211,13 @@ class Keeper:
             return None
         try:
             with open(self.path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-                # An array read short of its end would go unchecked.
+                # np.load does not verify the checksum of an array that it reads partly.
                 damaged = file.zip.testzip()
                 if damaged is not None:
                     raise zipfile.BadZipFile(f"{damaged} is damaged")
                 head = json.loads(str(file["head"]))
                 found, settings = head["format"], head["settings"]
-                # Only then, since another version or move may have stored other things.
+                # Read the state only then: another version or move may have stored other fields.
                 same = found == _FORMAT and settings == self.settings
                 now = (
                     _run_from(head, {name: file[name] for name in file.files if name != "head"}, move) if same else None
@@ -237,7 +237,7 @@ class Keeper:
         return now
 
     def _of_another(self, settings: dict[str, object]) -> FileError:
-        """Say in what the file's settings differ from this run's."""
+        """Report the first setting in which the file differs from this run."""
         name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
         if name == "seed_state":
             return FileError(
@@ -307,7 +307,7 @@ def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move
 
 
 def _near(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
-    """Compare but for rounding: the last digits of a row depend on how many rows are computed with it."""
+    """Compare up to rounding: a row's last digits depend on how many rows are computed with it."""
     with np.errstate(invalid="ignore"):  # inf - inf
         return a.shape == b.shape and bool(((a == b) | (np.abs(a - b) <= _ROUNDING * scale)).all())
 
@@ -318,7 +318,7 @@ def _short(value: object) -> str:
 
 
 def _numbers(move: Move) -> dict[str, float]:
-    """Give what a move has tuned: its numbers."""
+    """Return the numeric fields of a move, which hold what it has tuned."""
     if not is_dataclass(move):
         raise ParameterError("move", move, "a dataclass, whose numbers a checkpoint can keep")
     return {f.name: v for f in fields(move) if isinstance(v := getattr(move, f.name), int | float)}
@@ -336,7 +336,7 @@ def _plain(value: object) -> object:
 
 
 def _state(value: object) -> dict[str, Any]:
-    """Turn lists of a generator's state back into arrays."""
+    """Convert the lists in a generator's state back to arrays."""
     if not isinstance(value, dict):
         raise ValueError("no state of a random generator")
 

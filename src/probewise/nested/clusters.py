@@ -1,4 +1,4 @@
-"""Find separate clusters among live points, so that moves can take the measure of each by itself."""
+"""Find clusters among live points, so that moves can use the mean and covariance of each."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _N_REFINEMENTS = 4
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Describe clusters by mean and covariance, and divide space between them.
+    """Clusters by mean and covariance; space is divided between them.
 
-    `mean` (n_clusters, n_params); `root` the Cholesky roots of the covariances and `inverse_root`
-    their inverses, (n_clusters, n_params, n_params); `log_det` of the roots and `size` in points, (n_clusters,).
+    `mean` (n_clusters, n_params); `root` the Cholesky factors of the covariances and `inverse_root`
+    their inverses, (n_clusters, n_params, n_params); `log_det` of the factors and `size` in points, (n_clusters,).
     """
 
     mean: FloatArray
@@ -32,7 +32,7 @@ class Clusters:
         return len(self.mean)
 
     def assign(self, u: FloatArray) -> IntArray:
-        """Give each point to the cluster whose Gaussian is densest there, (n, n_params) -> (n,)."""
+        """Assign each point to the cluster with the greatest Gaussian density there, (n, n_params) -> (n,)."""
         if len(self) == 1:
             return np.zeros(len(u), dtype=np.int64)
         z = (u[None, :, :] - self.mean[:, None, :]) @ self.inverse_root.transpose(0, 2, 1)
@@ -40,7 +40,7 @@ class Clusters:
 
     @staticmethod
     def of(groups: list[FloatArray]) -> Clusters:
-        """Measure groups of points, each (n, n_params)."""
+        """Compute mean and covariance of groups of points, each (n, n_params)."""
         mean = np.stack([g.mean(axis=0) for g in groups])
         root = np.stack([_root(g) for g in groups])
         inverse = np.asarray(np.linalg.inv(root), dtype=np.float64)
@@ -48,24 +48,24 @@ class Clusters:
         return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
 
     def without(self, u: FloatArray, home: IntArray) -> Clusters:
-        """Measure each point's cluster without the point itself.
+        """Compute each point's cluster without the point itself.
 
         Parameters
         ----------
         u
-            Points among those the clusters were measured by, (n, n_params).
+            Points that belong to the clusters, (n, n_params).
         home
             The cluster of each, (n,).
 
         Returns
         -------
-        One cluster a point, in the points' order.
+        One cluster per point, in the points' order.
         """
         n = self.size[home][:, None]
         off = u - self.mean[home]
         root = self.root[home]
-        # Sherman and Morrison: one point less is one outer product less. In the cluster's own metric the
-        # product is at most that of the whole scatter; a hair is left where the point alone spans a direction.
+        # Removing a point is a rank-one downdate of the covariance. In the whitened frame its length is at
+        # most 1; a small remainder is kept where the point alone spans a direction.
         z = np.einsum("nij,nj->ni", self.inverse_root[home], off)
         share = np.einsum("ni,ni->n", z, z) * (n / (n - 1.0) ** 2)[:, 0]
         z *= np.sqrt(np.minimum(1.0, (1.0 - 1e-6) / np.maximum(share, 1e-300)))[:, None]
@@ -78,11 +78,11 @@ class Clusters:
 
 
 def find_clusters(points: FloatArray) -> Clusters:
-    """Split points, (n, n_params), again and again while two Gaussians explain them better than one.
+    """Split points, (n, n_params), recursively while two Gaussians explain them better than one.
 
-    The criterion is the gain in log likelihood beyond two Gaussians' additional parameters
-    (Akaike's), ten against chance and 0.15 a point: halving a uniform box gains nothing but noise,
-    while two equal modes five sd apart gain a quarter a point. A false split costs little: the moves stay exact
+    The gain in log likelihood must exceed the number of additional parameters (Akaike's criterion),
+    plus 10 nats against chance, plus 0.15 nats per point: halving a uniform box gains only noise, while two
+    equal modes 5 sd apart gain a quarter of a nat per point. A false split costs little: the moves are exact
     however space is divided.
     """
     queue, done = [points], list[FloatArray]()
@@ -95,7 +95,7 @@ def find_clusters(points: FloatArray) -> Clusters:
             queue.extend(halves)
     clusters = Clusters.of(done)
     if len(done) > 1:
-        # Measured once more by the division of space that will be used.
+        # Recompute the clusters from the division of space that will be used.
         home = clusters.assign(points)
         if np.bincount(home, minlength=len(done)).min() >= _least(points.shape[1]):
             clusters = Clusters.of([points[home == k] for k in range(len(done))])
@@ -110,7 +110,7 @@ def _split(points: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     z = (points - points.mean(axis=0)) / np.maximum(points.std(axis=0), 1e-300)
     values, vectors = np.linalg.eigh(z.T @ z / n)
     axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, 1e-300))], axis=1)
-    # Two equal modes make the fourth moment small, a small mode beside a great one makes it great.
+    # Two equal modes make the kurtosis small, a small mode beside a large one makes it large.
     fourth = (axes**4).mean(axis=0)
     whole = n * _log_det(points)
     n_more = 1 + n_params * (n_params + 3) / 2
@@ -138,7 +138,7 @@ def _split(points: FloatArray) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _least(n_params: int) -> int:
-    """Give the fewest points that a cluster can be measured by."""
+    """Fewest points of a cluster, so that its covariance is well determined."""
     return 2 * n_params + 2
 
 
@@ -146,7 +146,7 @@ def _root(points: FloatArray) -> FloatArray:
     n_params = points.shape[1]
     centred = points - points.mean(axis=0)
     covariance = centred.T @ centred / max(len(points) - 1, 1)
-    # The ridge keeps a direction without extent from making the root singular.
+    # The ridge keeps the covariance positive definite where a direction has no extent.
     ridge = 1e-10 * np.diag(covariance) + 1e-24 + 1e-13 * np.trace(covariance) / n_params
     return np.linalg.cholesky(covariance + np.diag(ridge))
 

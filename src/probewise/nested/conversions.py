@@ -1,4 +1,4 @@
-"""Hand a result to the libraries that others analyse samples with: anesthetic and ArviZ, both optional."""
+"""Convert results for anesthetic and ArviZ, both optional packages."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ __all__ = ["to_anesthetic", "to_arviz"]
 def to_anesthetic(result: NestedResult) -> Any:
     """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.
 
-    anesthetic counts the live points anew from births and deaths, and knows no labels. Where the
-    likelihood is exactly constant the levels are therefore spread by single units in the last
-    place, in the order of the labels. It also knows nothing of impossible hypotheses (zero
-    likelihood): where there are some, `log_start` is added to every level, which leaves the product
-    of prior and likelihood as it is, the prior being that of the possible ones alone. So its
-    evidence is ours.
+    anesthetic recomputes the number of live points from births and deaths, and has no labels. On plateaus
+    of the likelihood the levels are therefore made distinct by single units in the last place, in
+    the order of the labels. It does not know impossible hypotheses (zero likelihood) either: where there
+    are some, `log_start` is added to every level, which restores the evidence, since anesthetic's prior
+    is that of the possible hypotheses only.
 
     Raises
     ------
@@ -42,22 +41,22 @@ def to_anesthetic(result: NestedResult) -> Any:
 
 
 def to_arviz(result: NestedResult, *, rng: np.random.Generator, n: int | None = None) -> Any:
-    """Convert to ArviZ's container: `n` equally weighted samples as one chain, with evidence as attributes.
+    """Convert to ArviZ's container: `n` equally weighted samples as one chain, with the evidence in the attributes.
 
     Parameters
     ----------
     result
-        What to convert.
+        The result to convert.
     rng
-        Draws the samples.
+        Source of randomness, for drawing the samples.
     n
-        Number of samples; by default the effective number, so that few are replications.
+        Number of samples; by default the effective sample size, so that few are repeated.
 
     Returns
     -------
     arviz.InferenceData, or xarray.DataTree from ArviZ 1.0 on
-        Group `posterior` has a variable for each parameter, group `sample_stats` each sample's
-        log likelihood `log_l`, the level `log_l_birth` it was drawn above and its `row` in the result, all of
+        Group `posterior` has a variable for each parameter. Group `sample_stats` has each sample's log likelihood
+        `log_l`, the level `log_l_birth` above which it was drawn, and its `row` in the result. All have
         dimensions (chain, draw).
 
     Raises
@@ -89,14 +88,14 @@ def to_arviz(result: NestedResult, *, rng: np.random.Generator, n: int | None = 
         "stop_reason": result.stop_reason,
         "warnings": json.dumps(result.warnings),
     }
-    # ArviZ 1.0 takes all groups as one mapping, earlier versions one argument a group.
+    # ArviZ 1.0 takes all groups as one mapping, earlier versions one argument per group.
     if "data" in inspect.signature(arviz.from_dict).parameters:
         return arviz.from_dict(groups, attrs={"/": attributes})
     return arviz.from_dict(**groups, attrs=attributes)
 
 
 def _strict_levels(result: NestedResult) -> tuple[FloatArray, FloatArray]:
-    """Log likelihoods at death and birth, (n_dead,), equal ones spread apart in the order of their labels."""
+    """Log likelihoods at death and birth, (n_dead,), with ties broken in the order of the labels."""
     order = np.lexsort((result.label, result.log_likelihood))
     strict = result.log_likelihood[order] + result.log_start
     for i in range(1, len(strict)):

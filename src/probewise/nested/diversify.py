@@ -1,4 +1,4 @@
-"""Break replications among posterior samples by Metropolis-Hastings steps (paper, machine learning system)."""
+"""Replace repeated posterior samples by distinct ones with Metropolis-Hastings (paper, machine learning system)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _BLOCK = 100
 
 @dataclass(frozen=True)
 class DiversifyTally:
-    """Count what the steps did.
+    """Statistics of the steps.
 
-    `acceptance`: share of accepted proposals. `n_distinct`: different samples at the end.
+    `acceptance`: share of accepted proposals. `n_distinct`: number of distinct samples at the end.
     `mixing`: mean squared displacement over its value for independent samples, averaged over the
-    parameters; near 1 when the samples have forgotten where they began.
+    parameters; near 1 when the samples no longer depend on their start.
     """
 
     n_steps: int
@@ -38,34 +38,34 @@ class DiversifyTally:
 def diversify(
     theta: FloatArray, problem: Samplable, *, rng: np.random.Generator, n_steps: int = 1000
 ) -> tuple[FloatArray, DiversifyTally]:
-    """Walk every sample through the posterior, all of them together.
+    """Run a Metropolis-Hastings chain from every sample, all chains in parallel.
 
-    Every step proposes one of three symmetric moves to each sample: a Gaussian with the cloud's
-    covariance, a difference of two samples of the cloud (which leads between modes), or a change
-    of one parameter on the scale of its prior; the step's length is drawn anew over orders of
-    magnitude. The proposals come from the cloud as it was given, so that they do not depend on
-    where a chain has gone and the posterior is left invariant.
+    Every step proposes one of three symmetric moves to each sample: a Gaussian with the samples'
+    covariance, a difference of two samples (which can lead to another mode), or a change of
+    one parameter on the scale of its prior. The step size is drawn over orders of magnitude. The
+    proposals depend only on the samples as given, not on the chains' states, so the posterior
+    is left invariant.
 
     Parameters
     ----------
     theta
-        Posterior samples, replications allowed, (n_samples, n_params).
+        Posterior samples, possibly repeated, (n_samples, n_params).
     problem
         Prior and likelihood.
     rng
         Source of randomness.
     n_steps
-        Metropolis-Hastings steps of each sample; the paper takes about 1000.
+        Metropolis-Hastings steps per sample; the paper takes about 1000.
 
     Returns
     -------
     theta, tally
-        The samples after their steps, (n_samples, n_params), and what the steps did.
+        The samples after their steps, (n_samples, n_params), and statistics of the steps.
 
     Raises
     ------
     ParameterError
-        If a sample is impossible to begin with.
+        If a sample has zero posterior density.
     """
     require_rng(rng)
     start = np.array(floats(theta, "theta"))
@@ -89,7 +89,7 @@ def diversify(
     for displacement, threshold in _steps(start, prior_sd, n_steps, rng):
         proposed = now + displacement
         proposed_height = prior.log_prob(proposed)
-        # The likelihood is not asked outside the prior, where a model may have no answer.
+        # The likelihood is not evaluated outside the prior, where a model may be undefined.
         inside = np.flatnonzero(np.isfinite(proposed_height))
         if inside.size == 0:
             continue
@@ -107,7 +107,7 @@ def diversify(
 def _steps(
     cloud: FloatArray, prior_sd: FloatArray, n_steps: int, rng: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield for every step the displacement of each sample, (n_samples, n_params), and log of a uniform number."""
+    """Yield for every step the proposed displacements, (n_samples, n_params), and log uniform numbers, (n_samples,)."""
     n_samples, n_params = cloud.shape
     covariance = np.atleast_2d(np.cov(cloud, rowvar=False)) if n_samples > 1 else np.zeros((n_params, n_params))
     values, vectors = np.linalg.eigh(covariance / np.outer(prior_sd, prior_sd))
@@ -123,7 +123,7 @@ def _steps(
         if n_samples > 1:
             a = rng.integers(n_samples, size=follow[0].size)
             b = (a + rng.integers(1, n_samples, size=follow[0].size)) % n_samples
-            # A full difference carries a sample from one mode to the other.
+            # A full difference can take a sample from one mode to another.
             length = np.where(rng.random(follow[0].size) < 0.3, 1.0, best / np.sqrt(2.0) * scale[follow])
             move[follow] = length[:, None] * (cloud[a] - cloud[b])
         single = np.nonzero(kind > 0.75)

@@ -1,4 +1,4 @@
-"""Ask a problem for likelihoods and refuse answers that no sampler could use."""
+"""Evaluate the likelihood of points, with checks of what it returns."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Bound", "Evaluator", "Points", "Samplable"]
 
 
 class Samplable(Protocol):
-    """What the sampler needs of a problem: `probewise.inference.Problem`, or anything shaped like it."""
+    """A problem as the sampler needs it: `probewise.inference.Problem`, or anything with the same attributes."""
 
     @property
     def prior(self) -> Prior:
@@ -33,11 +33,11 @@ class Samplable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Hold evaluated points.
+    """Evaluated points.
 
-    `u` in the coordinates that chains step in (see `nested.space`) and `theta` in parameters, both
-    (n, n_params); `log_density` of the prior over `u` (n,); `log_likelihood` (n,); `label` (n,): a
-    uniform number each, which orders points of equal likelihood.
+    `u` in the sampling coordinates (see `nested.space`) and `theta` in parameters, both (n, n_params);
+    `log_density` of the prior in `u`, (n,); `log_likelihood`, (n,); `label`, (n,): uniform random
+    numbers that order points of equal likelihood.
     """
 
     u: FloatArray
@@ -50,7 +50,7 @@ class Points:
         return len(self.u)
 
     def take(self, rows: IntArray | BoolArray | slice) -> Points:
-        """Keep these rows."""
+        """Select rows."""
         return Points(
             self.u[rows], self.theta[rows], self.log_density[rows], self.log_likelihood[rows], self.label[rows]
         )
@@ -66,7 +66,7 @@ class Points:
         )
 
     def put(self, rows: IntArray | BoolArray, points: Points, which: IntArray) -> None:
-        """Overwrite these rows by the rows `which` of `points`."""
+        """Overwrite `rows` with the rows `which` of `points`."""
         self.u[rows], self.theta[rows] = points.u.take(which, axis=0), points.theta.take(which, axis=0)
         self.log_density[rows], self.label[rows] = points.log_density[which], points.label[which]
         self.log_likelihood[rows] = points.log_likelihood[which]
@@ -77,7 +77,7 @@ class Points:
 
     @staticmethod
     def join(*parts: Points) -> Points:
-        """Put points behind one another."""
+        """Concatenate points."""
         return Points(
             np.concatenate([p.u for p in parts]),
             np.concatenate([p.theta for p in parts]),
@@ -89,28 +89,28 @@ class Points:
 
 @dataclass(frozen=True)
 class Bound:
-    """Admit only what lies above a dead point in the order (log likelihood, label).
+    """A lower bound in the order (log likelihood, label), set by a dead point.
 
-    The label makes the order strict, so that volume shrinks as it should where the likelihood
-    is exactly constant over a finite part of the prior (a plateau).
+    The label makes the order strict, so that the volume shrinks correctly where the likelihood is
+    constant over a finite part of the prior (a plateau).
     """
 
     log_likelihood: float
     label: float
 
     def admits(self, log_likelihood: FloatArray, label: FloatArray) -> BoolArray:
-        """Say which points lie above the bound, both arguments (n,)."""
+        """Mark the points above the bound; both arguments (n,)."""
         tie = (log_likelihood == self.log_likelihood) & (label > self.label)
         return np.asarray((log_likelihood > self.log_likelihood) | tie)
 
 
 @dataclass
 class Evaluator:
-    """Evaluate points, count them, and name the parameters of a useless answer.
+    """Evaluate and count points; errors name the parameters at which the likelihood failed.
 
-    With an `executor` (any `concurrent.futures.Executor`) a batch is dealt out in `n_parts` parts; the
-    problem must then be one that the executor's workers can be sent. Answers come back in order, so
-    the run does not depend on it where a hypothesis has the same likelihood, to the last bit, in any company.
+    With an `executor` (any `concurrent.futures.Executor`) a batch is split into `n_parts` parts; the
+    problem must then be picklable. Results come back in order, so the run does not depend on the executor
+    if a hypothesis' likelihood does not depend, to the last bit, on the rest of its batch.
     """
 
     problem: Samplable
@@ -132,7 +132,7 @@ class Evaluator:
         return self(self.space.draw(n, rng=rng), rng)
 
     def __call__(self, u: FloatArray, rng: np.random.Generator) -> Points:
-        """Evaluate `u`, (n, n_params), which lies inside the space, and give every point a fresh label.
+        """Evaluate `u`, (n, n_params), inside the space, and give every point a new label.
 
         Raises
         ------
@@ -143,9 +143,9 @@ class Evaluator:
         return self.weigh(u, theta, log_density, rng)
 
     def weigh(self, u: FloatArray, theta: FloatArray, log_density: FloatArray, rng: np.random.Generator) -> Points:
-        """Evaluate what `space.leave` made of `u`, and give every point a fresh label.
+        """Evaluate points given the result of `space.leave(u)`, and give every point a new label.
 
-        Coordinates that lead nowhere, where the prior's density is zero, are impossible: nobody is asked.
+        Where the prior's density is zero the likelihood is not evaluated and the point counts as impossible.
         """
         possible = np.isfinite(log_density)
         if possible.all():
@@ -156,16 +156,16 @@ class Evaluator:
         return Points(u, theta, log_density, log_likelihood, rng.random(len(u)))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Evaluate hypotheses, (n, n_params) -> (n,), with the checks described above."""
+        """Evaluate the likelihood of hypotheses, (n, n_params) -> (n,), with the checks described above."""
         shared = self.executor is not None and len(theta) > 1
         parts = np.array_split(theta, min(self.n_parts, len(theta))) if shared else [theta]
         answers: list[object] = []
         try:
             for answer in self._answers(parts):
-                answers.append(answer)  # one by one: how many there are tells which part failed
+                answers.append(answer)  # one by one: their number identifies the part that failed
         except Exception as error:
             raise NotConvergedError(self._why(error, parts[len(answers)])) from error
-        # A copy, since a likelihood may hand out the same array every time.
+        # Concatenation copies: a likelihood may return the same array every time.
         values = np.concatenate([self._numbers(a, part) for a, part in zip(answers, parts, strict=True)])
         fine = values < np.inf
         if not fine.all():
@@ -178,7 +178,7 @@ class Evaluator:
         return values
 
     def _answers(self, parts: list[FloatArray]) -> Iterator[object]:
-        """Ask for every part, all at once where there is more than one; give the answers in order."""
+        """Yield the likelihoods of the parts in order; the parts run in parallel where there is an executor."""
         # Copies: a likelihood that writes into its argument must not change the samples.
         if self.executor is not None and len(parts) > 1:
             yield from self.executor.map(self.problem.log_likelihood, [part.copy() for part in parts])
@@ -201,7 +201,7 @@ class Evaluator:
             values = np.asarray(answer, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise NotConvergedError(
-                f"the likelihood returned what are no numbers ({error}); {self._first(theta)}"
+                f"the likelihood returned something other than numbers ({error}); {self._first(theta)}"
             ) from error
         if values.shape == () and len(theta) == 1:
             return values.reshape(1)  # many functions drop the axis of a batch of one, scipy.stats among them
@@ -214,14 +214,14 @@ class Evaluator:
         return values
 
     def _why(self, error: Exception, theta: FloatArray) -> str:
-        """Say what went wrong with a batch, (n, n_params), and with which hypothesis of it."""
+        """Describe the failure of a batch, (n, n_params), and of which hypothesis in it."""
         said = f"{type(error).__name__}: {error}"
         if self.executor is not None and "pickle" in said.lower():
             return (
                 f"the problem cannot be sent to the executor's workers ({said}); allowed: one that pickles, so made of "
                 "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
             )
-        # A hypothesis that kills its worker would kill this process if it were asked for here.
+        # A hypothesis that killed its worker could kill this process too.
         culprit = None if isinstance(error, BrokenExecutor) else self._culprit(theta)
         if culprit is not None:
             return f"the likelihood raised {said}; at {self._show(culprit)}"
@@ -229,7 +229,7 @@ class Evaluator:
         return f"the likelihood raised {said}; {batch}; {self._first(theta)}"
 
     def _culprit(self, theta: FloatArray) -> FloatArray | None:
-        """Ask again, half by half, for a hypothesis that fails by itself; None where it is the batch that fails."""
+        """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""
         while len(theta) > 1:
             half = len(theta) // 2
             theta = theta[:half] if self._fails(theta[:half]) else theta[half:]

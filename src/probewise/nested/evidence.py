@@ -1,4 +1,4 @@
-"""Turn dead points into evidence: shrinkage, weights, errors and the insertion-rank test (Skilling 2006)."""
+"""Evidence from dead points: shrinkage, weights, errors and the insertion-rank test (Skilling 2006)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _SIMULATED_AT_A_TIME = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Hold log Z, the information (nats), normalised log weights and Kish's sample size.
+    """log Z, the information (nats), normalised log weights and Kish's effective sample size.
 
-    `spread`: sd of log Z by the chance of the shrinkage alone; `log_start_error`: of the prior's possible share.
+    `spread`: sd of log Z from the random shrinkage alone; `log_start_error`: from the prior's possible share.
     """
 
     log_z: float
@@ -30,12 +30,12 @@ class Evidence:
     n_eff: float
 
     def error(self, memory: float) -> float:
-        """Give the standard error of log Z where chains remember; see `probewise.nested.chain_memory`."""
+        """Return the standard error of log Z for correlated chains, `memory` from `probewise.nested.chain_memory`."""
         return math.hypot(math.sqrt(memory) * self.spread, self.log_start_error)
 
 
 def log_volumes(n_at_death: IntArray, log_start: float = 0.0) -> FloatArray:
-    """Give the expected log prior volume after each death, (n_dead,): E[log t] = -1/n with n points alive."""
+    """Return the expected log prior volume after each death, (n_dead,): E[log t] = -1/n with n points alive."""
     return np.asarray(log_start - np.cumsum(1.0 / n_at_death))
 
 
@@ -53,18 +53,18 @@ def integrate(
     Parameters
     ----------
     log_likelihood
-        Of the dead points in order of death, the last live points included, (n_dead,).
+        Log likelihoods of the dead points in order of death, the last live points included, (n_dead,).
     n_at_death
-        How many points were alive when each died, itself included, (n_dead,).
+        Number of points alive when each died, itself included, (n_dead,).
     rng
-        For the error: the shrinkages t ~ Beta(n, 1) are drawn `n_simulations` times and the
-        spread of log Z is taken, which needs no assumption about the posterior's form.
+        Source of randomness for the error: the sd of log Z over `n_simulations` draws of the shrinkages
+        t ~ Beta(n, 1), which makes no assumption about the posterior.
     log_start, log_start_error
         Log of the prior's share with a likelihood above zero, and its standard error.
     """
     log_x = log_volumes(n_at_death, log_start)
     log_shell = _log_shells(np.concatenate([[log_start], log_x]))
-    # Relative to the best: volumes would be lost in the rounding of a log likelihood such as -1e100.
+    # Relative to the best: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(log_likelihood.max())
     log_likelihood = log_likelihood - best
     log_mass = log_shell + log_likelihood
@@ -74,7 +74,7 @@ def integrate(
     information = float(weight @ np.where(weight > 0, log_likelihood - log_z, 0.0))
     n_dead = len(n_at_death)
     simulated = np.empty(n_simulations)
-    # A few simulations at a time: a long run's all together would fill the memory.
+    # In blocks, to bound the memory of long runs.
     size = max(1, _SIMULATED_AT_A_TIME // n_dead)
     for first in range(0, n_simulations, size):
         n = min(size, n_simulations - first)
@@ -96,7 +96,7 @@ def _log_shells(log_edges: FloatArray) -> FloatArray:
 def birth_rows(
     log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
 ) -> IntArray:
-    """Find the death above whose level each point was drawn.
+    """Find the dead point above whose level each point was drawn.
 
     Parameters
     ----------
@@ -121,20 +121,20 @@ def birth_rows(
 def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.random.Generator) -> float:
     """Test that new points were inserted uniformly among the live ones (Fowlie, Handley & Su 2020).
 
-    Each new point is ranked among those alive at its insertion, so that ranks of a right sampler
-    are independent and uniform on 0..m. The test is Kolmogorov and Smirnov's, on the whole run
-    and on its tenths (a fault may last only a while), with Bonferroni's correction.
+    Each new point is ranked among those alive at its insertion; the ranks of a correct sampler are
+    independent and uniform on 0..m. A Kolmogorov-Smirnov test is made of the whole run and of its
+    tenths (a fault may be temporary), with Bonferroni's correction.
 
     Parameters
     ----------
     rank
-        Points alive that are worse than the new one, (n_inserted,).
+        Number of live points worse than the new one, (n_inserted,).
     n_below_or_above
-        Points alive at insertion, m, (n_inserted,).
+        Number of points alive at insertion, m, (n_inserted,).
     rng
-        Spreads the discrete ranks evenly.
+        Source of randomness, for jittering the discrete ranks.
     """
-    from scipy.stats import kstest  # here, since it takes a second to import that most runs of the program do without
+    from scipy.stats import kstest  # imported here: it takes a second, and most runs of the program do not need it
 
     if len(rank) < 20:
         return 1.0

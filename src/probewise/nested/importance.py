@@ -1,10 +1,10 @@
-"""Sharpen a run by importance sampling from a density fitted to it; carry a posterior on to new readings.
+"""Importance sampling: refine the evidence of a run, or update a posterior with new readings.
 
-Nested sampling finds where the posterior is; its evidence is as uncertain as sqrt(H / n_live). A
-density fitted to its samples, drawn from and weighed, gives the same evidence and posterior by a
-route of its own, often a hundred times as sharp for a few thousand evaluations more (Cameron &
-Pettitt 2014; Lange 2023 does it with neural networks). How far its weights can be trusted is
-measured: Pareto's k of their tail (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
+Nested sampling locates the posterior; the error of its log evidence is sqrt(H / n_live). Importance
+sampling from a density fitted to its samples estimates the same evidence and posterior independently,
+often with a hundredth of the error for a few thousand more evaluations (Cameron & Pettitt 2014; Lange
+2023 does it with neural networks). The reliability of the weights is measured by the Pareto k of
+their tail (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from probewise.nested.weights import n_effective, resampled, weighted_quantiles
 
 __all__ = ["Weighted", "pareto_k", "refine", "update"]
 
-# Above it the mean of the weights converges too slowly for their sd to be its error (Vehtari et al. 2024).
+# Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 _MOST_K = 0.7
 _FEW_EFFECTIVE = 100.0
 _MOST_FITTED = 2000
@@ -39,39 +39,39 @@ _MOST_LOST = 0.2
 _HELD_BACK = 1 / 3
 _MOST_HELD = 1000
 _BRIDGE_STEPS = 20
-# Draws this many errors from the run that they refine disagree with it.
+# Draws whose log Z is this many errors from that of the refined run disagree with it.
 _APART = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Weighted(ShowsItself):
-    """Hold weighted samples of a posterior and its evidence, by importance sampling.
+    """Weighted posterior samples and the evidence, from importance sampling.
 
     Attributes
     ----------
     names
-        Parameters, one a column of theta.
+        Parameter names, one per column of theta.
     theta
-        Draws with a likelihood above zero, (n, n_params).
+        Draws with nonzero likelihood, (n, n_params).
     log_likelihood, log_weight
-        Of each, (n,); the weights sum to one.
+        Of each draw, (n,); the weights sum to one.
     log_z, log_z_error
         Natural log of the evidence and its standard error.
     n_eff
-        Kish's effective number of samples.
+        Kish's effective sample size.
     n_calls
-        Likelihood evaluations, those of the fallback included.
+        Likelihood evaluations, including those of a fallback run.
     pareto_k
-        Shape of the weights' tail; above 0.7 the error is not to be trusted.
+        Shape of the weights' tail; above 0.7 the error is unreliable.
     run
-        The run that took over because the weights could not be trusted, or None.
+        The fallback run, made where the weights were unreliable; else None.
     missed
-        Share of the posterior that the draws reach too seldom, as samples held back show; `log_z` counts it, the
-        samples lack it.
+        Share of the posterior that the draws undersample, estimated from held-out samples; `log_z` includes it, the
+        samples do not.
     lost
-        Share of the posterior that may be lost without a trace, see `refine`; the error counts it.
+        Share of the posterior that the run may have lost undetected, see `refine`; the error includes it.
     inherited
-        Doubts that come with the run that was refined, and that it disagrees.
+        Doubts about the refined run, and a disagreement with it.
     """
 
     names: tuple[str, ...]
@@ -94,12 +94,12 @@ class Weighted(ShowsItself):
 
     @property
     def sound(self) -> bool:
-        """Whether nothing speaks against the error: see `doubts`."""
+        """Whether there are no `doubts` about the error."""
         return not self.doubts
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Why the error is not to be trusted, in words; empty where nothing speaks against it."""
+        """Reasons not to trust the error, in words; empty if there are none."""
         if self.run is not None:
             return ()
         told = (
@@ -119,7 +119,7 @@ class Weighted(ShowsItself):
         return np.asarray(np.exp(self.log_weight))
 
     def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
-        """Rows of `n` equally weighted samples by systematic resampling, (n,), in random order."""
+        """Draw the rows of `n` equally weighted samples by systematic resampling, (n,), in random order."""
         require_rng(rng)
         n = require_whole("n", n)
         return np.asarray(rng.permutation(resampled(self.weight, n, rng)))
@@ -151,7 +151,7 @@ class Weighted(ShowsItself):
         """Describe evidence and posterior in plain text."""
         lines = [
             f"log Z        {self.log_z:.3f} ± {self.log_z_error:.3f}",
-            f"samples      {len(self.theta)}, worth {self.n_eff:.0f} independent ones",
+            f"samples      {len(self.theta)}, effective sample size {self.n_eff:.0f}",
             f"cost         {self.n_calls} likelihood evaluations",
             f"weights      Pareto k = {self.pareto_k:.2f}, missed {self.missed:.2g}, possibly lost {self.lost:.2g}",
         ]
@@ -168,19 +168,19 @@ Posterior: TypeAlias = NestedResult | Weighted
 def refine(
     result: Posterior, problem: Samplable, *, rng: np.random.Generator, n_draws: int = 5000, n_pilots: int = 2
 ) -> Weighted:
-    """Sharpen the evidence and the posterior of a run by importance sampling.
+    """Reduce the error of a run's evidence and posterior by importance sampling.
 
-    A density is fitted to two thirds of the run's posterior samples in two forms; a few draws of each
-    are weighed, the form with the more even weights gets the greater share, and its weighted draws join
-    the samples that the next densities are fitted to. At last `n_draws` points are drawn.
-    Only they count, so they are independent of each other.
+    Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot
+    round a few draws of each are weighted; the form with the larger effective sample size gets the larger
+    share of the mixture, and its weighted draws are added to the samples for the next fit. Finally
+    `n_draws` points are drawn. Only these count, so they are independent.
 
-    Three things are asked before the error is claimed. The samples that were held back form a bridge to
-    the draws (Meng & Wong 1996): what the density misses of them is counted as missed. A heavy tail of
-    the weights slows the mean down, and the error with it. And the run itself may have lost what no
-    sample can tell of any more: with n_live points and information H it knows a part's share of the
-    posterior as n_live / H independent samples would, so that a part of share s is lost with
-    probability exp(-s n_live / H); the sum of s times that over the parts found joins the error.
+    The error includes three corrections. The held-out third of the samples is combined with the draws by
+    bridge sampling (Meng & Wong 1996), which estimates the share of the posterior that the proposal
+    misses. A heavy tail of the weights, which slows the convergence of their mean, increases the error. And
+    the run may have lost a part of the posterior: with n_live points and information H it knows the
+    shares of the posterior's parts as precisely as n_live / H independent samples, so a part of share
+    s is lost with probability exp(-s n_live / H); the sum of s times that over the parts found is added.
 
     Parameters
     ----------
@@ -191,19 +191,19 @@ def refine(
     rng
         Source of randomness.
     n_draws
-        Draws that count; every pilot round takes a quarter of that besides.
+        Number of final draws; every pilot round takes a quarter of that in addition.
     n_pilots
-        Pilot rounds, 1 or more.
+        Number of pilot rounds, 1 or more.
 
     Returns
     -------
     Weighted
-        Ask `sound` before using it in place of the run's own evidence.
+        Check `sound` before using it instead of the run's evidence.
 
     Raises
     ------
     ParameterError
-        If an option is out of range or the run is of other parameters.
+        If an option is out of range or the run has other parameters.
     """
     evaluate = Evaluator(problem)
     if result.names != evaluate.names:
@@ -223,7 +223,7 @@ def refine(
         ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         told = pilots[first]
-        # The other form keeps a share: one may reach where the other does not.
+        # The other form keeps a share: it may cover what the better one does not.
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if told.n_eff > 2 * len(evaluate.names):
@@ -233,7 +233,7 @@ def refine(
 
 
 def _inherited(found: Weighted, result: Posterior) -> tuple[str, ...]:
-    """Give the doubts of what was refined; and one where it lies further off than the errors allow."""
+    """Return the doubts about the refined result, and one if it differs by more than the errors allow."""
     if isinstance(result, Weighted):
         return result.doubts
     routes = [("the run", result.log_z, result.log_z_error)]
@@ -256,13 +256,13 @@ def update(
     n_draws: int = 2000,
     prior_share: float = 0.1,
 ) -> Weighted:
-    """Infer again after new readings, from the posterior before them.
+    """Update a posterior with new readings by importance sampling.
 
-    The samples of the previous posterior are weighed by what the new readings add; a density is
-    fitted to them, mixed with draws from the prior, and weighed against the whole new problem, so
-    that the evidence is absolute and errors do not add up from reading to reading. Where the new
-    reading surprises (few of the old samples, or too heavy a tail of the weights, carry the new
-    posterior), `fall_back` runs from scratch.
+    The previous samples are reweighted by the new readings' likelihood, and a proposal is fitted to them.
+    Draws from a mixture of the proposal and the prior are weighted against the whole new problem, so the
+    evidence is absolute and errors do not accumulate from reading to reading. Where the new readings
+    are surprising (too few effective samples or too heavy a tail of the weights), `fall_back` starts
+    from scratch.
 
     Parameters
     ----------
@@ -273,17 +273,17 @@ def update(
     rng
         Source of randomness.
     fall_back
-        Runs the whole problem, for instance `lambda: run(problem, rng=rng)`.
+        Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`.
     n_draws
-        Draws; the cost is this many evaluations and one for each old sample, at most 1000.
+        Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
     prior_share
-        Share of the draws that come from the prior: they find what the old posterior had no samples
-        of, and bound the weights.
+        Share of the draws that come from the prior: they cover what the old posterior had no samples of, and
+        bound the weights.
 
     Returns
     -------
     Weighted
-        With the fallback's samples and `run` where it took over.
+        With the samples and `run` of the fallback where it was used.
     """
     require_rng(rng)
     if not 0 <= prior_share < 1:
@@ -296,7 +296,7 @@ def update(
     theta = previous.theta[rows]
     log_likelihood = evaluate.log_likelihood(theta)
     log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
-    # Rows of weight above 1 / 1000 were kept once: their weight stands for them.
+    # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
     log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
     n_eff, k = n_effective(log_weight), math.inf
     if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
@@ -323,9 +323,9 @@ def update(
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """Samples of the posterior held back from the fit, and how many independent ones they are worth.
+    """Posterior samples held out from the fit, and their effective number.
 
-    `x` (n, n_params) in coordinates without walls; the prior's log density there and the log likelihood, (n,).
+    `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,).
     """
 
     x: FloatArray
@@ -335,15 +335,15 @@ class _Held:
 
     @classmethod
     def nothing(cls) -> _Held:
-        """Hold nothing back."""
+        """Hold out nothing."""
         return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
 
 
 def _lines(found: Posterior) -> float:
-    """Count the independent samples that the shares of a posterior's parts are known as well as by.
+    """Effective number of independent samples for the shares of a posterior's parts.
 
-    Many samples of a run descend from one live point: ln Z of a part that n live points follow scatters by
-    sqrt(H / n) times the root of the chains' memory, as its share of n independent samples scatters by 1 / sqrt(n).
+    Many samples of a run descend from one live point: ln Z of a part followed by n live points has the error
+    sqrt(H memory / n), where a share estimated from n independent samples has the relative error 1 / sqrt(n).
     """
     if isinstance(found, Weighted):
         return found.n_eff if found.run is None else _lines(found.run)
@@ -351,7 +351,7 @@ def _lines(found: Posterior) -> float:
 
 
 def _parted(found: Posterior, lines: float, space: Space, rng: np.random.Generator) -> tuple[FloatArray, _Held]:
-    """Part samples at random: what a density is fitted to, (n, n_params), and what it is held against."""
+    """Split samples at random into those for fitting a density, (n, n_params), and held-out ones."""
     lot = rng.random(len(found.theta)) < _HELD_BACK
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
@@ -362,10 +362,10 @@ def _parted(found: Posterior, lines: float, space: Space, rng: np.random.Generat
 
 
 def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
-    """Choose samples to fit a density to: about as many as the posterior is worth, so that few occur twice.
+    """Resample for fitting a density: about the effective sample size, so that few samples are repeated.
 
-    A third more come from the posterior of the root of the likelihood's weight: a density that is
-    to be weighed by must reach further than the posterior does.
+    A third more is drawn with the square root of the weights: a proposal must have wider tails than
+    the posterior.
     """
     weight = np.exp(log_weight - log_weight.max())
     n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
@@ -374,7 +374,7 @@ def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.ran
 
 
 def _with_lost(found: Weighted, lines: float, space: Space, rng: np.random.Generator) -> Weighted:
-    """Add to the error what `lines` lines of descent may have lost of the posterior's parts."""
+    """Add to the error the share of the posterior that a run of `lines` effective samples may have lost."""
     if not found.n_eff > 1:
         return found
     n = int(min(found.n_eff, 1000))
@@ -394,11 +394,11 @@ def _weigh(
     n_draws: int,
     rng: np.random.Generator,
 ) -> Weighted:
-    """Draw, evaluate and weigh."""
+    """Draw, evaluate and weight."""
     n_prior = round(prior_share * n_draws)
 
     def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:
-        """Density that the draws come from; `log_density` is the prior's."""
+        """Log density of the mixture that the draws come from; `log_density` is the prior's."""
         log_fitted = proposal.log_density(x)
         if not n_prior:
             return log_fitted
@@ -423,7 +423,7 @@ def _weigh(
     if len(held.x):
         held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
     log_z, error, missed, log_weight = _bridged(log_ratio, n_draws, held_ratio, held.n_independent)
-    # Weights without a variance average out as n^(k - 1), no longer as n^(-1/2) (Vehtari et al. 2024).
+    # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
     n_eff = n_effective(log_weight)
     return Weighted(
@@ -434,18 +434,18 @@ def _weigh(
 def _bridged(
     log_ratio: FloatArray, n_draws: int, held_ratio: FloatArray, n_held: float
 ) -> tuple[float, float, float, FloatArray]:
-    """Estimate the evidence from draws and from posterior samples (Meng & Wong 1996).
+    """Estimate the evidence from draws and posterior samples by bridge sampling (Meng & Wong 1996).
 
     Parameters
     ----------
     log_ratio
-        Log of target over proposal density at the draws whose target is above zero, (n_alive,).
+        Log of target over proposal density at the draws with nonzero target, (n_alive,).
     n_draws
-        Draws, those included that led nowhere.
+        Number of draws, those with zero target included.
     held_ratio
-        The same at samples of the posterior, (n_samples,); plain importance sampling where there are none.
+        The same at held-out posterior samples, (n_samples,); without any this is plain importance sampling.
     n_held
-        Independent samples that those are worth.
+        Effective number of these samples.
 
     Returns
     -------
@@ -454,7 +454,7 @@ def _bridged(
     log_z = float(logsumexp(log_ratio)) - math.log(n_draws)
     missed, kept_error, cut = 0.0, 0.0, log_ratio
     if len(held_ratio):
-        # The best bridge: weights above n_draws / n_held times their mean are cut, the samples say how much that is.
+        # The optimal bridge tapers weights above n_draws / n_held times their mean; the samples correct for it.
         for _ in range(_BRIDGE_STEPS):
             limit = log_z + math.log(n_draws / n_held)
             cut = log_ratio - np.logaddexp(0.0, log_ratio - limit)
@@ -463,7 +463,7 @@ def _bridged(
             log_z = float(logsumexp(cut)) - math.log(n_draws) - math.log(kept)
         missed = float((held_ratio > limit).mean())
         kept_error = float(share.std()) / math.sqrt(n_held) / kept
-    # Draws that led nowhere count as weights of zero.
+    # Draws with zero target count as weights of zero.
     spread = max(1.0 / n_effective(cut) - 1.0 / n_draws, 0.0)
     return log_z, math.sqrt(spread + kept_error**2), missed, cut - float(logsumexp(cut))
 
@@ -471,9 +471,9 @@ def _bridged(
 def pareto_k(log_weight: FloatArray) -> float:
     """Estimate the shape of the tail of importance weights, (n,) log weights of any scale.
 
-    The greatest weights, 3 sqrt(n) of them but at most a fifth, are fitted by a generalised Pareto
-    distribution with the estimator of Zhang & Stephens (2009), as Vehtari et al. (2024) do: below
-    0.5 the weights have a variance, above 0.7 their mean converges too slowly to be used.
+    A generalised Pareto distribution is fitted to the largest weights, 3 sqrt(n) of them but at most a
+    fifth, with the estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the
+    weights have a finite variance; above 0.7 their mean converges too slowly to be used.
     """
     n = len(log_weight)
     n_tail = int(min(0.2 * n, 3.0 * math.sqrt(n)))
@@ -487,10 +487,10 @@ def pareto_k(log_weight: FloatArray) -> float:
     n_grid = 30 + int(math.sqrt(excess.size))
     quartile = excess[int(excess.size / 4 + 0.5) - 1]
     b = 1.0 / excess[-1] + (1.0 - np.sqrt(n_grid / (np.arange(1, n_grid + 1) - 0.5))) / (3.0 * quartile)
-    b[b == 0.0] = 1e-12 / quartile  # the exponential tail, whose k is 0: its neighbour stands for it
+    b[b == 0.0] = 1e-12 / quartile  # the exponential tail, k = 0, approximated by its neighbour
     k = np.log1p(-b[:, None] * excess).mean(axis=1)
     log_profile = excess.size * (np.log(-b / k) - k - 1.0)
     mean_b = float(np.exp(log_profile - logsumexp(log_profile)) @ b)
     shape = float(np.log1p(-mean_b * excess).mean())
-    # Shrunk towards 0.5 by ten prior observations, against the noise of short tails.
+    # Shrunk towards 0.5 by ten prior observations, to reduce the noise of short tails.
     return float((excess.size * shape + 10 * 0.5) / (excess.size + 10))

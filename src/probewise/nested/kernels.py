@@ -1,8 +1,8 @@
-"""Propose from kernels about known points: independent proposals, all evaluated together (Hastings 1970; Tierney 1994).
+"""Independence Metropolis-Hastings with kernel density proposals, evaluated in batches (Hastings 1970; Tierney 1994).
 
-A chain that walks asks for one likelihood after another; for a robot that must infer after
-every reading the asking costs more than the answers. Proposals that do not depend on where a
-chain stands can be drawn and evaluated in one batch, and the chain then decides by itself.
+A random walk needs one likelihood after another; for a robot that infers after every reading the overhead
+per call exceeds the cost of the likelihood. Proposals that do not depend on a chain's position can be drawn
+and evaluated in one batch, before the chain accepts or rejects them in turn.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _DENSITY_BLOCK = 1024
 
 @dataclass(frozen=True, eq=False)
 class Kernels:
-    """A density of Gaussians about points, half of them wide and half of them a third as wide.
+    """A kernel density of Gaussians about points: half of the mass with sd `width`, half with a third of it.
 
-    `centre_rows` are the points in the metric of their own covariance, (n_kernels, n_params); the
-    wide kernels have sd `width` there. The wide ones lead between modes and into corners that
-    no point stands in, the narrow ones follow a thin or bent region.
+    `centre_rows` are the points whitened by their covariance, (n_kernels, n_params); `width` is in
+    that frame. The wide kernels lead to other modes and into corners without points, the narrow ones
+    follow a thin or curved region.
     """
 
     mean: FloatArray
@@ -41,7 +41,7 @@ class Kernels:
 
     @classmethod
     def about(cls, points: FloatArray, *, rng: np.random.Generator, n_kernels: int = 100) -> Kernels:
-        """Put kernels about at most `n_kernels` of the points, (n_points, n_params), in the metric of all of them."""
+        """Place kernels at up to `n_kernels` of the points, (n_points, n_params), whitened by the covariance of all."""
         n_points, n_params = points.shape
         mean = points.mean(axis=0)
         covariance = np.atleast_2d(np.cov(points, rowvar=False))
@@ -50,7 +50,7 @@ class Kernels:
         root = scale[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(n_params))
         rows = rng.permutation(n_points)[:n_kernels]
         centre_rows = np.linalg.solve(root, (points[rows] - mean).T).T
-        # Silverman's rule: the width at which kernels about Gaussian points smear them least.
+        # Silverman's rule: the optimal width for Gaussian points.
         return cls(mean, root, centre_rows, (4 / (n_params + 2) / len(rows)) ** (1 / (n_params + 4)))
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -67,7 +67,7 @@ class Kernels:
         return np.concatenate([self._log_density(block) for block in blocks])
 
     def _log_density(self, white: FloatArray) -> FloatArray:
-        # Single precision, 1e-5 of a density that only proposes, halves the time of its exponentials.
+        # Single precision (1e-5, enough for a proposal) halves the time of the exponentials.
         centres = (self.centre_rows / (math.sqrt(2) * self.width)).astype(np.float32)
         rows = white.astype(np.float32)
         square = (rows * rows).sum(axis=1)[:, None] + (centres * centres).sum(axis=1) - 2.0 * rows @ centres.T
@@ -83,24 +83,24 @@ class Kernels:
 
 @dataclass(frozen=True)
 class KernelMove:
-    """Draw above a bound by independent proposals from kernels about the live points.
+    """Draw above a bound with independent proposals from kernels about the live points.
 
-    Every chain starts at a live point and decides on its proposals in turn, so that the uniform
-    density above the bound is left invariant; with `moves` accepted on average it has forgotten
-    its start. For few parameters, where a fair share of proposals lies above the bound. Where less
-    than one in `patience` is accepted, chains of `otherwise` take over.
+    Every chain starts at a live point and accepts or rejects its proposals in turn, so the uniform
+    density above the bound is left invariant; with `moves` accepted on average it forgets its start.
+    Suited to few parameters, where many proposals lie above the bound. Where fewer than one in
+    `patience` is accepted, chains of `otherwise` take over.
 
     Parameters
     ----------
     moves
-        Accepted proposals a chain should have on average. A chain that has none stays where it
-        is, as it may; about exp(-moves) of them do.
+        Target number of accepted proposals per chain, on average. A chain with none stays where it
+        is, which is valid; about exp(-moves) of them do.
     n_proposals
-        Proposals of each chain, tuned to that.
+        Number of proposals per chain, tuned to that target.
     patience
-        Proposals an acceptance may cost.
+        Largest number of proposals per acceptance.
     otherwise
-        What draws where kernels are wasteful.
+        The move used where kernels are inefficient.
     """
 
     moves: float = 10.0
@@ -146,7 +146,7 @@ class KernelMove:
         return ends, tally
 
     def adapted(self, tally: Tally) -> KernelMove:
-        """Change the number of proposals towards `moves` accepted ones."""
+        """Adapt the number of proposals towards `moves` accepted ones."""
         share = max(tally.n_accepted, 1) / max(tally.n_evaluated, 1)
         wanted = min(self.moves / share, 2.0 * self.n_proposals, 2.0 * self.patience)
         return replace(self, n_proposals=max(8, math.ceil(wanted)))
@@ -154,16 +154,16 @@ class KernelMove:
 
 @dataclass(frozen=True, eq=False)
 class _Decided:
-    """Where each chain ended: index of the proposal it took last, -1 where none, (n_chains,); how many were taken."""
+    """Index of the proposal each chain accepted last, -1 for none, (n_chains,), and the number of acceptances."""
 
     index: FloatArray
     n_accepted: int
 
 
 def _decide(possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray) -> _Decided:
-    """Let every chain accept or refuse its proposals in turn (Hastings' ratio, independent proposals).
+    """Let every chain accept or reject its proposals in turn (Metropolis-Hastings, independent proposals).
 
-    `possible` and `log_target`, log of target over proposal density, have one entry a proposal,
+    `possible` and `log_target`, the log of target over proposal density, have one entry per proposal,
     (n_steps * n_chains,), steps first; `log_now` (n_chains,) is that of the starts.
     """
     n_steps, n_chains = log_odds.shape
@@ -185,28 +185,28 @@ def diversify_by_kernels(
     rng: np.random.Generator,
     n_steps: int = 1000,
 ) -> tuple[FloatArray, DiversifyTally]:
-    """Break replications among posterior samples by Metropolis-Hastings steps with independent proposals.
+    """Replace repeated posterior samples by distinct ones, with independent Metropolis-Hastings proposals.
 
-    As `diversify`, but proposals come from kernels about `cloud`, so that the likelihoods of all
-    steps are evaluated together and a sample jumps between modes as easily as within one.
+    As `diversify`, but proposals come from kernels about `cloud`, so that the likelihoods of many
+    steps are evaluated together and a sample moves between modes as easily as within one.
 
     Parameters
     ----------
     theta
-        Posterior samples, replications allowed, (n_samples, n_params).
+        Posterior samples, possibly repeated, (n_samples, n_params).
     cloud
-        Equally weighted posterior samples to put kernels about, (n_cloud, n_params).
+        Equally weighted posterior samples at which the kernels are placed, (n_cloud, n_params).
     problem
         Prior and likelihood.
     rng
         Source of randomness.
     n_steps
-        Steps of each sample; the paper takes about 1000.
+        Steps per sample; the paper takes about 1000.
 
     Returns
     -------
     theta, tally
-        The samples after their steps, (n_samples, n_params), and what the steps did.
+        The samples after their steps, (n_samples, n_params), and statistics of the steps.
     """
     start = np.array(theta, dtype=np.float64)
     evaluate = Evaluator(problem)
@@ -237,7 +237,7 @@ def diversify_by_kernels(
         proposed = kernels.draw(n * n_samples, rng=rng)
         log_target = problem.prior.log_prob(proposed)
         possible = np.isfinite(log_target)
-        # The likelihood is not asked outside the prior, where a model may have no answer.
+        # The likelihood is not evaluated outside the prior, where a model may be undefined.
         if possible.any():
             log_target[possible] += evaluate.log_likelihood(proposed[possible]) - kernels.log_density(
                 proposed[possible]

@@ -1,4 +1,4 @@
-"""Join independent runs of one problem into one result, and ask whether they agree (Higson et al. 2019)."""
+"""Merge independent runs of one problem into one result, and test whether they agree (Higson et al. 2019)."""
 
 from __future__ import annotations
 
@@ -18,39 +18,38 @@ from probewise.nested.result import Agreement, Check, NestedResult, versions
 
 __all__ = ["agreement_of", "alive_at_death", "merge"]
 
-# Runs that differ more than this improbably disagree: one false alarm in 1000 merges.
+# p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
 _DOUBTFUL_P_VALUE = 1e-4
 
 
 def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
-    """Join independent runs of the same problem into one run with the live points of all.
+    """Merge independent runs of the same problem into one run with the live points of all.
 
-    A point is alive between the level it was drawn above and its own. Sorted together by level,
-    the points of all runs are a run whose number of live points is the sum of theirs at that
-    level (Higson, Handley, Hobson & Lasenby 2019, section 4), whatever the numbers of live points
-    and wherever each run stopped; the labels make the count exact on plateaus. Merged runs may be merged
-    again. The error of ln Z falls as one over the root of the number of runs.
+    A point is alive between the level above which it was drawn and its own. Sorted by level, the points
+    of all runs form a run whose number of live points at each level is the sum of theirs (Higson,
+    Handley, Hobson & Lasenby 2019, section 4), whatever the numbers of live points and the stops of the
+    runs; the labels make the count exact on plateaus. Merged runs may be merged again. The error of
+    ln Z falls as one over the root of the number of runs.
 
     Parameters
     ----------
     results
         Two runs or more, of different seeds.
     rng
-        For the error of ln Z; see `probewise.nested.evidence.integrate`.
+        Source of randomness for the error of ln Z; see `probewise.nested.evidence.integrate`.
 
     Returns
     -------
     NestedResult
-        With `agreement`, and with `check` where every run has one: what all second routes say together. Where the runs'
-        evidences lie further apart than their errors allow (p < 0.001) a warning says so and the error is no less than
-        their scatter. Where the second routes together disagree with the runs together, as they do where all runs share
-        a bias, a warning says so too.
+        With `agreement`, and with a combined `check` if every run has one. If the runs' evidences differ by more than
+        their errors allow (p < 0.001), a warning is added and the error is at least their scatter. If the combined
+        second estimates disagree with the combined runs, as they do if all runs share a bias, a warning is added too.
 
     Raises
     ------
     ParameterError
-        If there are fewer than two runs, or they have other parameters, share a seed, or hold no
+        If there are fewer than two runs, or their parameters differ, or they share a seed or lack a
         complete record of births and deaths.
     """
     parts = tuple(results)
@@ -63,7 +62,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     birth_label = np.concatenate([r.birth_label for r in parts])[order]
     n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
     parent = _joined_parents(parts, order)
-    # Each run asks its own families: between two of its rounds a run in a joined record is never whole.
+    # Each run has its own estimate: in the joined record a run is never complete between two rounds.
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _possible_share(parts)
     evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
@@ -74,7 +73,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     if agreement.p_value < _DISAGREE:
         doubts.append(
             f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
-            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}), so that some missed a part of the posterior; "
+            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
             "the error is widened to their scatter; use more n_live or longer chains"
         )
         error = max(error, agreement.scatter)
@@ -83,7 +82,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     if check is not None and abs(check.distance) > DISAGREE:
         doubts.append(
             f"{check.route} gives log Z = {check.log_z:.2f} ± {check.log_z_error:.2f}, the runs together "
-            f"{evidence.log_z:.2f} ± {error:.2f}: {abs(check.distance):.1f} errors apart; what biases every run alike "
+            f"{evidence.log_z:.2f} ± {error:.2f}: {abs(check.distance):.1f} errors apart; a bias shared by all runs "
             "does not average out; use longer chains"
         )
     for doubt in doubts:
@@ -122,7 +121,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
 
 
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:
-    """Compare the evidences of independent runs by chi-square; merged ones count as the runs they were made of."""
+    """Compare the evidences of independent runs by chi-square; a merged run counts as its single runs."""
     log_z, log_z_error = list[float](), list[float]()
     for result in results:
         runs = result.agreement
@@ -139,24 +138,24 @@ def agreement_of(results: Iterable[NestedResult]) -> Agreement:
 def alive_at_death(
     log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
 ) -> IntArray:
-    """Count the points alive at each death from levels of birth and death alone.
+    """Count the points alive at each death from the levels of birth and death.
 
     Parameters
     ----------
     log_likelihood, label
         Level of each point's death, (n_dead,); ties of likelihood are ordered by label.
     log_birth, birth_label
-        Level above which each was drawn, (n_dead,).
+        Level above which each point was drawn, (n_dead,).
 
     Returns
     -------
-    Points born strictly below each death and not yet dead, itself included, (n_dead,).
+    Number of points born strictly below each death and not yet dead, itself included, (n_dead,).
     """
     n = len(log_likelihood)
     born = np.repeat([0, 1], n)  # a death comes before the births at its own level
     levels, labels = np.concatenate([log_likelihood, log_birth]), np.concatenate([label, birth_label])
     order = np.lexsort((born, labels, levels))
-    # Itself included: the count before its death is subtracted.
+    # Add the point itself back: the cumulative sum counts it as dead.
     alive = np.cumsum(2 * born[order] - 1) + (1 - born[order])
     out = np.empty(2 * n, dtype=np.int64)
     out[order] = alive
@@ -164,7 +163,7 @@ def alive_at_death(
 
 
 def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
-    """Average what the runs' second routes found, by their errors; None where a run has none."""
+    """Average the runs' second estimates, weighted by their errors; None where a run has none."""
     checks = [r.check for r in parts if r.check is not None]
     if len(checks) < len(parts):
         return None
@@ -175,7 +174,7 @@ def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) ->
 
 
 def _joined_parents(parts: Sequence[NestedResult], order: IntArray) -> IntArray:
-    """Give the rows of parents after all rows were joined and put in order, (n_dead,)."""
+    """Rows of the parents in the joined and sorted record, (n_dead,)."""
     first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
     parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
     place = np.argsort(order)
@@ -183,7 +182,7 @@ def _joined_parents(parts: Sequence[NestedResult], order: IntArray) -> IntArray:
 
 
 def _check(parts: Sequence[NestedResult]) -> list[object]:
-    """Refuse what cannot be merged; give the seed states of all runs."""
+    """Raise ParameterError for runs that cannot be merged; return the seed states of all runs."""
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
     names = parts[0].names
@@ -213,10 +212,10 @@ def _check(parts: Sequence[NestedResult]) -> list[object]:
 
 
 def _possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
-    """Pool the shares of the prior with a likelihood above zero: hypotheses found possible over those drawn.
+    """Pool the shares of the prior with nonzero likelihood: possible hypotheses over all drawn.
 
-    A share s of m in n has the relative error sqrt((1 - s) / m), from which m follows; where all
-    were possible, as many as there are live points.
+    A share s = m / n has the relative error sqrt((1 - s) / m), from which m follows; if all were
+    possible, m is the number of live points.
     """
     found = drawn = 0.0
     for result in parts:

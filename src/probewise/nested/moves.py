@@ -16,19 +16,19 @@ from probewise.nested.space import Space
 
 __all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
 
-# Candidates drawn ahead of refusals, where few chains are left.
+# Candidates drawn ahead of their rejection, where few chains are left.
 _MOST_AHEAD = 4
-# Three steps in three dimensions left enough of the start for ln Z to scatter by 1.3 of its claimed errors.
+# With three steps in three dimensions the chains stay correlated: ln Z scattered by 1.3 of its claimed errors.
 _FEWEST_STEPS = 6
 _FRAME, _AXIS, _DIFFERENCE, _HOP = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
 class Tally:
-    """Count what a move did.
+    """Statistics of a move.
 
-    `n_evaluated`: likelihood evaluations. `n_tried`, `n_accepted`: candidates and accepted ones of the
-    kind that the move tunes itself by. `n_stuck`: chains that could not leave their start.
+    `n_evaluated`: likelihood evaluations. `n_tried`, `n_accepted`: candidates and acceptances by which
+    the move tunes itself. `n_stuck`: chains that never left their start.
     """
 
     n_evaluated: int
@@ -38,21 +38,21 @@ class Tally:
 
 
 class Move(Protocol):
-    """Diversify inside the bound."""
+    """Draw new points above a bound."""
 
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Return as many new points as `start` has, each distributed uniformly above `bound`.
+        """Return as many new points as `start` has, each distributed as the prior above `bound`.
 
         Parameters
         ----------
         start
-            Points that satisfy the bound, where chains may begin.
+            Points above the bound, at which chains may begin.
         bound
             The level and label that new points must exceed.
         live
-            All points known to satisfy the bound, in the evaluator's space, those of `start` included, (n, n_params).
+            All known points above the bound, in the evaluator's space, those of `start` included, (n, n_params).
         evaluate
             The problem.
         rng
@@ -61,15 +61,15 @@ class Move(Protocol):
         ...
 
     def adapted(self, tally: Tally) -> Move:
-        """Return the move to use next, tuned by what this one did."""
+        """Return the move to use next, tuned by the statistics of this one."""
         ...
 
 
 @dataclass(frozen=True)
 class PriorRejection:
-    """Draw from the whole prior until enough points lie above the bound: exact, and dear once the volume is small.
+    """Draw from the whole prior until enough points lie above the bound: exact, but costly for a small volume.
 
-    `volume` is the share of the prior above the bound as far as known; it only sets the size of batches.
+    `volume` estimates the share of the prior above the bound; it only sets the batch size.
     """
 
     volume: float
@@ -89,7 +89,7 @@ class PriorRejection:
         return Points.join(*parts).take(slice(wanted)), Tally(n_evaluated, wanted)
 
     def adapted(self, tally: Tally) -> PriorRejection:
-        """Return itself: nothing to tune."""
+        """Return itself: there is nothing to tune."""
         return self
 
 
@@ -98,43 +98,43 @@ class SliceMove:
     """Walk chains of slice-sampling steps (Neal 2003), all chains advancing together.
 
     A step draws a line through the chain's point, a bracket of fixed width placed at random about
-    the point, and candidates within it; a refused candidate becomes the bracket's new end. The
-    bracket is not stepped out: with a width that does not depend on the point the step is
-    reversible without it (Neal's limit m = 1), and evaluations are saved. Each chain goes to its
-    next step when its own bracket has delivered, so the batches stay full.
+    the point, and candidates within it; a rejected candidate becomes the bracket's new end. There is
+    no stepping out: with a width that does not depend on the point the step is reversible without
+    it (Neal's limit m = 1), which saves evaluations. Each chain proceeds to its next step as soon as a
+    candidate is accepted, so the batches stay full.
 
-    Where the prior is not even over the space that chains step in, a step first draws a level
-    below its density at the point, and candidates must lie above that too (Neal's auxiliary
-    height): refusing one for that reason costs no likelihood.
+    Where the prior is not uniform in the sampling space, a step first draws a level below its
+    density at the point, and candidates must lie above that too (Neal's auxiliary height): a
+    rejection for that reason costs no likelihood.
 
-    Four kinds of steps, every one reversible by itself:
+    Four kinds of steps, each reversible by itself:
 
     - along the axes of the space, each on a scale drawn between the conditional and the marginal
-      sd of the live points: a parameter that the others do not confine goes far at once;
-    - along random orthogonal frames in the metric of the live points, so that n_params successive
-      steps cover every direction. Where the live points fall into clusters, each has its own
+      sd of the live points: a parameter uncorrelated with the others moves far in one step;
+    - along random orthonormal directions in the metric of the live points, so that n_params
+      successive steps cover every direction. Where the live points form clusters, each has its own
       metric and such a step stays within its cluster's part of space;
-    - along the difference of two live points, from anywhere to anywhere;
-    - a hop, where there are clusters: the point is carried to its counterpart in another cluster
-      by the affine map between the two, accepted with the ratio of their volumes. It keeps the
-      share of live points in each mode from drifting.
+    - along the difference of two live points, within and between clusters;
+    - a hop, where there are clusters: the affine map between two clusters takes the point to its
+      counterpart in the other, accepted with the ratio of their volumes. Hops keep the share of
+      live points in each mode from drifting.
 
     Parameters
     ----------
     steps_per_param
-        Steps of a chain for each parameter, hops besides.
+        Steps of a chain per parameter, not counting hops.
     width
         Bracket width in units of the live points' sd along the line.
     axes
-        Share of the steps that follow axes.
+        Share of the steps along axes.
     differences
-        Share of the steps that follow differences of live points.
+        Share of the steps along differences of live points.
     hops
-        Hops of each chain, where there are clusters.
+        Number of hops per chain, where there are clusters.
     target
-        Candidates a step should need on average; the width is tuned to it.
+        Target number of candidates per step, on average; the width is tuned to it.
     fewest_steps
-        Steps of a chain at least, however few the parameters.
+        Least number of steps of a chain.
     """
 
     steps_per_param: float = 1.0
@@ -183,7 +183,7 @@ class SliceMove:
         n_evaluated = n_tried = n_taken = 0
 
         def begin(rows: IntArray) -> None:
-            """Lay the next step's line, bracket and level."""
+            """Set up the next step's line, bracket and level."""
             at = step[rows]
             kinds, measure = kind[rows, at], view.measure(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
@@ -199,7 +199,7 @@ class SliceMove:
                 n = len(live)
                 first = rng.integers(n - 1, size=follow.size)
                 second = (first + rng.integers(1, n - 1, size=follow.size)) % (n - 1)
-                # Counted from behind the chain's own start, so that neither is it.
+                # Counted cyclically from the row after the chain's own start, so that neither is the start.
                 behind = view.own_row[rows[follow]] + 1
                 toward[follow] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
             line[rows] = toward
@@ -229,14 +229,14 @@ class SliceMove:
                 hop = hopping[::n_ahead]
                 goal = place.copy()
                 if hop.any():
-                    # A hop has one place to go to: the first candidate takes it, the others are void.
+                    # A hop has a single candidate: the first; the others are void.
                     ok[hopping] = np.arange(chain.size)[hopping] % n_ahead == 0
                     first = (hopping & ok).nonzero()[0]
                     who = chain[first]
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
                     candidate[first], log_growth = view.hop(who, now.u[who], home[who], goal[first])
                     if around is not None:
-                        # Beyond the cut the way back would begin elsewhere.
+                        # Across the cut of a circle the reverse hop would differ.
                         ok[first] &= (around.wrapped(candidate[first]) == candidate[first]).all(axis=1)
                     least[first] -= log_growth
                     if walls is not None:
@@ -257,14 +257,14 @@ class SliceMove:
             n_needed, delivered = _needed(ok.reshape(-1, n_ahead))
             won = delivered.nonzero()[0]
             if won.size:
-                # Of a chain's candidates the first that is admitted counts.
+                # A chain takes the first of its candidates above the bound.
                 taken, which = rows[won], won * n_ahead + n_needed[won] - 1
                 now.put(taken, tried, np.searchsorted(asked, which))
                 home[taken] = place[which]
                 moved[taken] = True
             n_tried += int(n_needed[~hop].sum())
             n_taken += int(np.count_nonzero(delivered & ~hop))
-            # A bracket that has shrunk to nothing (a point alone on its line) ends the step where it began.
+            # A bracket that has shrunk to zero (a point alone on its line) ends the step at its start.
             done = rows[delivered | hop | (above - below < 1e-13)]
             step[done] += 1
             more = done[step[done] < n_steps]
@@ -277,18 +277,18 @@ class SliceMove:
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def _kinds(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
-        """Say of every step of every chain which kind it is, (n_chains, n_steps)."""
+        """Draw the kind of every step of every chain, (n_chains, n_steps)."""
         lot = rng.random((n_chains, n_steps))
         kind = np.where(lot < self.axes, _AXIS, np.where(lot < self.axes + self.differences, _DIFFERENCE, _FRAME))
         kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
         return kind
 
     def longer(self) -> SliceMove:
-        """Return the move with twice as many steps a chain."""
+        """Return the move with twice as many steps per chain."""
         return replace(self, steps_per_param=2.0 * self.steps_per_param, fewest_steps=2 * self.fewest_steps)
 
     def adapted(self, tally: Tally) -> SliceMove:
-        """Widen or narrow the bracket towards `target` candidates a step."""
+        """Adapt the bracket width towards `target` candidates per step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 
@@ -296,10 +296,10 @@ class SliceMove:
 def _candidates(
     low: FloatArray, high: FloatArray, n_ahead: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw the next candidates on each line as if all before were refused, (n, n_ahead); also the bracket if all are.
+    """Draw the next candidates on each line as if all before were rejected, (n, n_ahead), and the bracket if all are.
 
-    A refusal shrinks the bracket whatever the likelihood was, so candidates can be drawn ahead and
-    evaluated together: the chain is the same, a few evaluations are spent for batches that stay full.
+    A rejection shrinks the bracket whatever the likelihood was, so candidates can be drawn ahead and
+    evaluated together: the chain is the same, at the cost of a few evaluations for full batches.
     """
     t = np.empty((len(low), n_ahead))
     for k in range(n_ahead):
@@ -310,7 +310,7 @@ def _candidates(
 
 
 def _needed(ok: BoolArray) -> tuple[IntArray, BoolArray]:
-    """Say how many of the candidates, (n, n_ahead), a step needed, and whether it delivered, both (n,)."""
+    """Count the candidates, of (n, n_ahead), that each step used; also whether one was accepted, both (n,)."""
     delivered = np.asarray(ok.any(axis=1))
     return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
@@ -318,8 +318,8 @@ def _needed(ok: BoolArray) -> tuple[IntArray, BoolArray]:
 def _frames(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
     """Draw rows of random orthogonal matrices where `needed`, (n_chains, n_steps), is true.
 
-    Returns (n_chains, n_steps rounded up to whole matrices, n_params). Matrices of which no row is needed are left as
-    drawn: making one orthogonal is what costs.
+    Returns (n_chains, n_steps rounded up to whole matrices, n_params). Matrices of which no row is needed are not
+    orthogonalised, which is the costly part.
     """
     n_chains, n_steps = needed.shape
     first = np.arange(0, n_steps, n_params)
@@ -330,20 +330,20 @@ def _frames(needed: BoolArray, n_params: int, rng: np.random.Generator) -> Float
 
 
 def _axes(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
-    """Draw axes, (n_chains, n_steps), every one once before any comes again."""
+    """Draw axes, (n_chains, n_steps), in random order without repetition until all were used."""
     n_turns = -(-n_steps // n_params)
     return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """The clusters as each chain sees them: measured without the point where that chain began.
+    """The clusters' metrics for each chain: its own cluster is computed without the chain's starting point.
 
-    A metric that knows the start stretches the lines through it and shrinks those past it; with
+    A metric that includes the start stretches the lines through it and shrinks the others; with
     150 live points in 20 dimensions that alone raised log Z by more than one.
 
-    The measures of the clusters stand first, then each chain's own of the cluster that it began in: mean, root,
-    inverse root and log determinant, and of every axis the conditional sd and how much greater the marginal one is.
+    The rows are the clusters, then each chain's version of its starting cluster: mean, Cholesky factor, its inverse
+    and log determinant, and for every axis the conditional sd and the ratio of the marginal sd to it.
     """
 
     mean: FloatArray
@@ -354,14 +354,14 @@ class _View:
     widening: FloatArray
     n_clusters: int
     own_home: IntArray
-    own_row: IntArray  # where the start stands among the live points
+    own_row: IntArray  # row of the start among the live points
 
     @classmethod
     def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _View:
         same = np.logical_and.reduce(
             [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
         )
-        # A start that is no live point is in no cluster's measure either.
+        # A start that is not a live point is in no cluster.
         own_home = np.where(same.any(axis=1), home, -1)
         own = clusters.without(u, home)
         root, inverse = (
@@ -382,11 +382,11 @@ class _View:
         )
 
     def measure(self, rows: IntArray, home: IntArray) -> IntArray:
-        """Find the measure by which chains `rows` see cluster `home`."""
+        """Return the row of cluster `home` for the chains `rows`."""
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
     def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Map points to their counterparts in other clusters; also the log of the volume they grow by."""
+        """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
         here, there = self.measure(rows, home), self.measure(rows, goal)
         z = np.matmul(self.inverse_root[here], (u - self.mean[here])[:, :, None])
         moved = self.mean[there] + np.matmul(self.root[there], z)[:, :, 0]
@@ -395,10 +395,9 @@ class _View:
 
 @dataclass(frozen=True, eq=False)
 class _Circles:
-    """Coordinates that go round, each written down from a cut of its own on, so that no peak lies across the end.
+    """Periodic coordinates, each cut where no live points are, so that no peak is split at the ends.
 
-    Chains stay on the circle: a candidate is wrapped before anything is asked of it, so that metric and clusters of
-    the way back are those of the way there.
+    A candidate is wrapped before it is evaluated, so that a step and its reverse use the same metric and clusters.
     """
 
     columns: IntArray
@@ -417,13 +416,13 @@ class _Circles:
         return cls(columns, (place[widest, each] + 0.5 * gap[widest, each]) % 1.0)
 
     def wrapped(self, u: FloatArray) -> FloatArray:
-        """Write places down from the cut on."""
+        """Wrap coordinates into the period that begins at the cut."""
         u = u.copy()
         u[:, self.columns] = self.cut + (u[:, self.columns] - self.cut) % 1.0
         return u
 
     def home(self, u: FloatArray) -> FloatArray:
-        """Write places down from 0 on."""
+        """Wrap coordinates into 0 to 1."""
         u = u.copy()
         u[:, self.columns] %= 1.0
         return u
@@ -433,7 +432,7 @@ Walls: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 def _walls(space: Space) -> Walls | None:
-    """Least and greatest value of each coordinate; None where nothing bounds any. A circle has no walls."""
+    """Bounds of each coordinate, infinite for periodic ones; None if no coordinate is bounded."""
     low, high = space.low.copy(), space.high.copy()
     low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
     return (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
@@ -442,7 +441,7 @@ def _walls(space: Space) -> Walls | None:
 def _bracket(
     u: FloatArray, rows: IntArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Place a bracket of length one at random about each point `u[rows]`, cut where the line leaves the space."""
+    """Place a bracket of length one at random about each point `u[rows]`, truncated where the line leaves the space."""
     low = -rng.random(rows.size)
     if walls is None:
         return low, low + 1.0

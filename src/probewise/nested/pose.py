@@ -1,4 +1,4 @@
-"""Pose a problem from plain functions: a log likelihood of one point or of many, and a prior in any usual form."""
+"""Make a problem from plain functions: a log likelihood of one point or many, and a prior in any usual form."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class _Scipy:
 
 @dataclass(frozen=True)
 class _Transform:
-    """A prior that is known as a function from the unit cube alone: it has no density and no way back."""
+    """A prior given only as a function from the unit cube, without density or inverse."""
 
     names: tuple[str, ...]
     function: Callable[[FloatArray], Any]
@@ -59,24 +59,24 @@ class _Transform:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         if self.vectorized:
             return np.asarray(self.function(u.copy()), dtype=np.float64)
-        # Many transforms write into their argument and give it back.
+        # Many transforms modify their argument in place and return it.
         return np.array([np.array(self.function(row.copy()), dtype=np.float64) for row in u]).reshape(len(u), -1)
 
 
 @dataclass(frozen=True)
 class Posed:
-    """A problem of plain functions, which every function of `probewise.nested` takes; made by `pose`.
+    """A problem made of plain functions by `pose`, for every function of `probewise.nested`.
 
     Attributes
     ----------
     function
-        The log likelihood as it was given.
+        The log likelihood as given.
     prior
         The prior, with names.
     vectorized, pass_dict
         How the function is called; see `pose`.
     periodic
-        Parameters whose greatest value is next to their least.
+        Names of the periodic parameters.
     """
 
     function: Callable[..., Any]
@@ -125,26 +125,25 @@ def pose(
         that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
         `probewise.priors` or frozen continuous ones of scipy.stats.
     names
-        Names of the parameters, in order: for a function, where they are needed, or a list, where they are p0, p1, ...
-        by default.
+        Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default.
     vectorized
-        Whether the functions take many points at once, (n_samples, n_params), and answer for each. Much faster, where
-        NumPy does the work.
+        Whether the functions take many points at once, (n_samples, n_params), and return one result per point: much
+        faster with NumPy.
     pass_dict
-        Whether the likelihood is given a dict of parameters by name rather than an array.
+        Whether the likelihood takes a dict of parameters by name instead of an array.
     periodic
-        Names of parameters whose range is a circle: chains step over its ends.
+        Names of parameters whose range is periodic.
 
     Returns
     -------
     Posed
-        What `run`, `refine`, `repartitioned`, `update` and `diversify` take. A prior that is known as a function of the
-        unit cube alone serves `run`; the others need its density or its inverse, and say so.
+        A problem for `run`, `refine`, `repartitioned`, `update` and `diversify`. A prior given as a function from the
+        unit cube suffices for `run`; the others need its density or inverse and raise an error without.
 
     Raises
     ------
     ParameterError
-        If something is of the wrong kind, or names and prior do not fit.
+        If an argument has the wrong type, or names and prior do not match.
     """
     require_callable("log_likelihood", log_likelihood, "a function of a point, such as lambda x: -0.5 * (x**2).sum()")
     named = _named(prior, names, vectorized)
@@ -155,7 +154,7 @@ def pose(
 
 
 def _named(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
-    """Take a prior in any of its forms."""
+    """Convert a prior in any of its forms to one with names."""
     if isinstance(names, str):
         raise ParameterError("names", names, "a list of names: names=['x', 'y']")
     given = None if names is None else tuple(str(name) for name in names)

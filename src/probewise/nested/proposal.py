@@ -1,4 +1,4 @@
-"""Fit a density to posterior samples, to draw from and to weigh by: kernels in each cluster's own metric."""
+"""Proposal densities for importance sampling, fitted to posterior samples: Student-t kernels per cluster."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probewise.nested.clusters import Clusters, find_clusters
 
 __all__ = ["Proposal", "find_parts", "fit_proposals", "joined"]
 
-# Tails heavier than a Gaussian's, so that weights stay bounded where the fit is too narrow.
+# Heavier tails than a Gaussian's keep the weights bounded where the fit is too narrow.
 _DEGREES_OF_FREEDOM = 8.0
 _MOST_KERNELS = 400
 _FEW = 40
@@ -25,10 +25,10 @@ _LINKS = 10
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Mix Student-t kernels of one shape for each cluster.
+    """A mixture of Student-t kernels, of one shape within each cluster.
 
-    `centres` in each cluster's own metric, one array (n_kernels, n_params) a cluster; `width` of a
-    kernel there; `share` of the draws that each cluster gets, (n_clusters,).
+    `centres` in each cluster's whitened frame, one array (n_kernels, n_params) per cluster; `width` of the
+    kernels there; `share` of the draws for each cluster, (n_clusters,).
     """
 
     clusters: Clusters
@@ -68,7 +68,7 @@ class Proposal:
 
 
 def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
-    """Mix proposals, each with its share of the draws; shares need not be normalised."""
+    """Combine proposals into a mixture with these shares, which need not be normalised."""
     total = math.fsum(share)
     return Proposal(
         _all([p.clusters for p in proposals]),
@@ -79,12 +79,12 @@ def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
 
 
 def find_parts(x: FloatArray) -> Clusters:
-    """Find the parts that samples lie in, (n_samples, n_params): pieces apart from each other, and their clusters.
+    """Find the parts of a set of samples, (n_samples, n_params): its disconnected pieces, and their clusters.
 
-    Pieces are what nearest neighbours join, so they are found at any scale and in any number (a lattice of modes,
-    which no two Gaussians explain); what is too small to be measured goes to the nearest.
+    Pieces are the connected components of the nearest-neighbour graph, so they are found at any scale and in any number
+    (a lattice of modes, which no pair of Gaussians explains). Pieces too small for a covariance join the nearest one.
     """
-    # Here, since they take a quarter of a second to import that most runs of the program do without.
+    # Imported here: they take a quarter of a second, and most runs of the program do not need them.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -114,12 +114,12 @@ def _all(parts: Sequence[Clusters]) -> Clusters:
 
 
 def fit_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:
-    """Fit to samples, (n_samples, n_params), in the two forms that promise most.
+    """Fit two proposals to samples, (n_samples, n_params): the best wide form and the best narrow form.
 
-    Forms: one kernel a cluster as wide as the cluster, or kernels about the samples, Silverman's
-    width or narrower; with clusters or without. Of either kind the one whose fit to half of the
-    samples gives the other half the greatest likelihood is fitted to all. Which of the two serves
-    better is for a few weighed draws to say: likelihood rewards a close fit, weights a wide one.
+    Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's
+    width or less. Either with or without clusters. Of each form the variant with the greatest held-out
+    likelihood (fit to one half, score on the other) is fitted to all samples. The caller decides between
+    the two by weighted draws: the likelihood favours a close fit, the weights a wide one.
     """
     x = x[rng.permutation(len(x))]
     half = len(x) // 2

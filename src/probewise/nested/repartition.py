@@ -1,11 +1,11 @@
-"""Search again about what a run has found: the same evidence, from a prior that is near the posterior.
+"""Posterior repartitioning: run again from a prior near the posterior, with the same evidence.
 
-Evidence and posterior know prior and likelihood by their product alone, so that any density may stand for the prior
-if the likelihood makes up for it (posterior repartitioning: Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29,
-835; Petrosyan & Handley 2023, Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats to shrink
-by, and with them the cost of a run falls and its error. What the density reaches too seldom, where importance
-sampling lives on a handful of weights (`probewise.nested.importance`), live points climb to. A far part of the
-posterior that no sample stands for is not looked for again.
+Evidence and posterior depend only on the product of prior and likelihood, so any density may replace the prior if the
+likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835; Petrosyan & Handley 2023,
+Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats of compression, which lowers the cost
+and the error of a run. Live points climb to regions that the density undersamples, where importance sampling
+(`probewise.nested.importance`) would depend on a few weights. A distant part of the posterior without any sample
+is not searched for again.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from probewise.priors import Prior
 __all__ = ["Repartitioned", "repartitioned"]
 
 _DEGREES_OF_FREEDOM = 5.0
-_FLATTEST = 1e-12  # least variance along an axis, of the greatest
-_LEAST_SAMPLES = 2  # for each parameter, to know the axes by
+_FLATTEST = 1e-12  # least variance along an axis, relative to the greatest
+_LEAST_SAMPLES = 2  # distinct samples per parameter, to determine the axes
 
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """A product of Student t along the axes of samples of a posterior: heavy tails, and no corner left out.
+    """A prior near the posterior: a product of Student t along the principal axes of posterior samples.
 
-    Coordinates e are those axes; those without walls, x, are `center` (n_params,) + `root` (n_params, n_params) e.
+    With e the coordinates along the axes, the unbounded coordinates are x = `center` (n_params,) +
+    `root` (n_params, n_params) e.
     """
 
     plain: Prior
@@ -80,7 +81,7 @@ class _Near:
         return out
 
     def made_up(self, theta: FloatArray) -> FloatArray:
-        """Log of the density of the plain prior over that of this one, (n,): the same over theta as over x."""
+        """Log of the original prior's density over this one's, (n,): the same ratio in theta and in x."""
         x = self.space.enter(theta)
         own = _log_student(self._along(x)) - self.log_volume
         return np.asarray(self.space.leave(x)[1] - own)
@@ -98,43 +99,43 @@ class _Near:
 
 @dataclass(frozen=True, eq=False)
 class Repartitioned:
-    """A problem of the same evidence and posterior, its prior near that posterior."""
+    """A problem with the same evidence and posterior, but a prior near that posterior."""
 
     problem: Samplable
     prior: _Near
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log of the likelihood and of what makes up for the prior, (n, n_params) -> (n,)."""
-        # First what needs theta as it is: a likelihood may write into its argument.
+        """Log likelihood plus the log ratio of the priors, (n, n_params) -> (n,)."""
+        # The ratio first: a likelihood may modify its argument.
         made_up = self.prior.made_up(theta)
         return np.asarray(self.problem.log_likelihood(theta) + made_up)
 
 
 def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.4) -> Repartitioned:
-    """State a problem anew, with a prior that is near its posterior: for a second run, shorter and sharper.
+    """Repartition a problem: a prior near its posterior, for a second run that is shorter and more precise.
 
     Parameters
     ----------
     problem
         Prior and likelihood.
     theta
-        Samples of the posterior, (n_samples, n_params), such as a run's: they say where the prior is to be.
+        Posterior samples, (n_samples, n_params), such as a run's, which determine the new prior.
     widening
-        Scale of the new prior in sds of the samples, 1 or more; along each axis it is a Student t of five degrees of
+        Scale of the new prior in sds of the samples, 1 or more; along each axis it is a Student t with five degrees of
         freedom.
 
     Returns
     -------
     Repartitioned
-        Its log Z is the problem's own. The `log_likelihood` of its runs is not, so that they go with this problem
-        into `refine` or `update`, and not into `merge` with runs of the other.
+        Its log Z is that of the original problem. Its `log_likelihood` is not: use its runs with this problem in
+        `refine` or `update`, and do not `merge` them with runs of the original.
 
     Raises
     ------
     ShapeError
-        If the samples are of other parameters.
+        If the samples have other parameters.
     ParameterError
-        If `widening` is below 1, or there are too few different samples to know so many axes by.
+        If `widening` is below 1, or there are too few distinct samples to determine the axes.
     """
     n_params = len(problem.prior.names)
     if theta.ndim != 2 or theta.shape[1] != n_params:

@@ -1,4 +1,4 @@
-"""What a run of nested sampling found, with everything needed to judge it."""
+"""The result of a run of nested sampling, with everything needed to judge it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ARRAYS = ("theta", *_PER_POINT, *_COUNTS)
 
 
 def versions() -> dict[str, str]:
-    """Give the versions of all that decides a run's numbers."""
+    """Versions of the software that determines a run's numbers."""
     return {
         "probewise": __version__,
         "numpy": np.__version__,
@@ -45,16 +45,16 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Say whether independent runs of one problem agree within the errors they claim.
+    """A test whether independent runs of one problem agree within their errors.
 
     Attributes
     ----------
     log_z, log_z_error
         Of each run.
     chi_square
-        Sum of the squared distances from the weighted mean, in units of each run's error.
+        Sum of the squared deviations from the weighted mean, in units of each run's error.
     p_value
-        Probability that runs whose errors are right lie as far apart (n_runs - 1 degrees of freedom).
+        Probability of a chi-square at least as large if the errors are right (n_runs - 1 degrees of freedom).
     """
 
     log_z: tuple[float, ...]
@@ -75,18 +75,18 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Check:
-    """Say what a second route to the evidence found; see `probewise.nested.check`.
+    """A second, independent estimate of the evidence; see `probewise.nested.check`.
 
     Attributes
     ----------
     route
-        Which way was taken, in words.
+        The method, in words.
     log_z, log_z_error
-        Natural log of the evidence by that route, and its standard error.
+        Natural log of the evidence by that method, and its standard error.
     distance
-        The run's log Z less this one, in units of both errors.
+        The run's log Z minus this one, in units of the combined error.
     n_calls
-        Likelihood evaluations that the route took.
+        Likelihood evaluations used.
     """
 
     route: str
@@ -97,9 +97,9 @@ class Check:
 
 
 def few_possible(log_start: float, log_start_error: float, n_live: int) -> str | None:
-    """Say so where fewer possible hypotheses than live points were drawn from the prior; None where enough were.
+    """Return a warning if fewer possible hypotheses than live points were drawn from the prior, else None.
 
-    A share s of the prior, counted by m hypotheses, has the relative error sqrt((1 - s) / m).
+    A share s of the prior, estimated from m possible hypotheses, has the relative error sqrt((1 - s) / m).
     """
     if log_start_error <= 0:
         return None
@@ -112,54 +112,55 @@ def few_possible(log_start: float, log_start_error: float, n_live: int) -> str |
 
 @dataclass(frozen=True, eq=False)
 class NestedResult(ShowsItself):
-    """Hold the evidence, the weighted samples and the record of how they came about.
+    """The evidence, the weighted samples and the record of the run.
 
     Attributes
     ----------
     names
-        Parameters, one a column of theta.
+        Parameter names, one per column of theta.
     theta
-        Dead points in order of death, the last live ones behind them, (n_dead, n_params).
+        Dead points in order of death, followed by the last live points, (n_dead, n_params).
     log_likelihood, label, log_weight
         Of each: log likelihood, the number from 0 to 1 that orders points of equal likelihood,
         and log posterior weight (the weights sum to one), all (n_dead,).
     log_birth, birth_label
         Log likelihood and label of the dead point above which each was drawn, (n_dead,);
-        minus infinity and 1 where it was drawn from the whole prior.
+        minus infinity and 1 for draws from the whole prior.
     parent
-        Row of the point at which the chain began that led to each; -1 for draws from the prior at the start, (n_dead,).
+        Row of the point at which each point's chain began; -1 for the initial draws from the prior, (n_dead,).
     n_at_death
-        Points alive when each died, itself included, (n_dead,).
+        Number of points alive when each died, itself included, (n_dead,).
     log_start, log_start_error
-        Natural log of the share of the prior with a likelihood above zero, and its standard error.
+        Natural log of the share of the prior with nonzero likelihood, and its standard error.
     log_z, log_z_error
         Natural log of the evidence, and its standard error: from simulated shrinkages, times the root of `memory`.
     memory
-        Variance of log Z over that of independent points, 1 or more; see `probewise.nested.chain_memory`.
+        Lineage variance: variance of log Z relative to independent points, 1 or more; see
+        `probewise.nested.chain_memory`.
     information
         Kullback-Leibler divergence of posterior from prior, nats.
     n_eff
-        Kish's effective number of samples.
+        Kish's effective sample size.
     n_calls, n_live
-        Likelihood evaluations, those of the check included, and live points.
+        Numbers of likelihood evaluations, those of the check included, and of live points.
     stop_reason
         Why the run ended.
     complete
-        Whether its stop rule ended it, rather than a limit, an interruption or a failure.
+        Whether its stopping rule ended it, rather than a limit, an interruption or a failure.
     insertion_rank, insertion_n_ranked
         Rank of each new point among those alive, 0 to m, and m, both (n_inserted,).
     insertion_p_value
-        Probability that ranks of a right sampler look as uneven as these.
+        p value of the test that the insertion ranks are uniform, as for a correct sampler.
     seed_state
         State of the random generator at the start, as JSON; a list of states for merged runs.
     versions
         Of probewise, numpy, scipy and python.
     warnings
-        Why the result should not be trusted blindly; empty for a sound run.
+        Reasons to doubt the result; empty for a sound run.
     agreement
-        How far the runs agree of which this result was merged; None for a single run.
+        Agreement of the runs that were merged into this result; None for a single run.
     check
-        What a second route to the evidence found; None where none was taken.
+        A second estimate of the evidence; None if there is none.
     """
 
     names: tuple[str, ...]
@@ -197,16 +198,16 @@ class NestedResult(ShowsItself):
             raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_dead, {len(self.names)}) for {self.names}")
         object.__setattr__(self, "theta", theta)
         for name in _PER_POINT:
-            self._freeze(name, frozen(getattr(self, name)), len(theta), "a row of theta")
+            self._freeze(name, frozen(getattr(self, name)), len(theta), "row of theta")
         for name in ("parent", "n_at_death"):
-            self._freeze(name, frozen_int(getattr(self, name)), len(theta), "a row of theta")
+            self._freeze(name, frozen_int(getattr(self, name)), len(theta), "row of theta")
         rank = frozen_int(self.insertion_rank)
-        self._freeze("insertion_rank", rank, rank.size, "an inserted point")
-        self._freeze("insertion_n_ranked", frozen_int(self.insertion_n_ranked), rank.size, "an inserted point")
+        self._freeze("insertion_rank", rank, rank.size, "inserted point")
+        self._freeze("insertion_n_ranked", frozen_int(self.insertion_n_ranked), rank.size, "inserted point")
 
     def _freeze(self, name: str, values: FloatArray | IntArray, n: int, one: str) -> None:
         if values.shape != (n,):
-            raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n},), one {one}")
+            raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n},), one per {one}")
         object.__setattr__(self, name, values)
 
     @property
@@ -221,15 +222,15 @@ class NestedResult(ShowsItself):
 
     @property
     def log_volume(self) -> FloatArray:
-        """Natural log of the share of the prior expected above each sample, ln X, (n_dead,)."""
+        """Expected natural log of the prior share above each sample, ln X, (n_dead,)."""
         return log_volumes(self.n_at_death, self.log_start)
 
     @property
     def calls_per_live_point_and_nat(self) -> float:
-        """Likelihood evaluations for each live point and nat of information.
+        """Likelihood evaluations per live point and nat of information.
 
-        A live point costs at least one evaluation a nat, since n_live deaths shrink the volume by
-        one nat and each must be replaced; what exceeds one is the price of drawing above a bound.
+        At least one: n_live deaths compress the volume by one nat, and each dead point is replaced.
+        The excess is the cost of drawing above a bound.
         """
         return self.n_calls / (self.n_live * self.information) if self.information > 0 else math.inf
 
@@ -244,8 +245,8 @@ class NestedResult(ShowsItself):
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
 
-        Systematic resampling: a point of weight w occurs n w times, rounded up or down, so
-        replications occur only where a weight exceeds 1 / n; `diversify` breaks them.
+        Systematic resampling: a point of weight w occurs n w times, rounded up or down, so points
+        repeat only where a weight exceeds 1 / n; `diversify` makes repeated samples distinct.
         """
         return np.asarray(self.theta[self.rows(n, rng=rng)])
 
@@ -255,15 +256,14 @@ class NestedResult(ShowsItself):
         Parameters
         ----------
         f
-            From rows of theta, (n, n_params), to their values, (n, ...): an SSF field on pixels,
-            (n, n_v, n_u), say. The parameters themselves where not given.
+            Function from rows of theta, (n, n_params), to values, (n, ...), for instance an SSF field
+            (n, n_v, n_u); by default the parameters themselves.
         block
-            Most rows that `f` is handed at a time, so that memory is bounded by one block's
-            values; all at once where not given.
+            Largest number of rows passed to `f` at a time, to bound memory; by default all.
 
         Returns
         -------
-        The posterior mean, of the shape of one row's value; (n_params,) without `f`.
+        The posterior mean, with the shape of one row's value; (n_params,) without `f`.
         """
         if block is not None and block < 1:
             raise ParameterError("block", block, "1 or more")
@@ -275,9 +275,7 @@ class NestedResult(ShowsItself):
             theta, weight = self.theta[first : first + size], self.weight[first : first + size]
             values = np.asarray(f(theta))
             if values.shape[:1] != (len(theta),):
-                raise ShapeError(
-                    f"f(theta) has shape {values.shape}; allowed: {len(theta)} rows, as many as it was handed"
-                )
+                raise ShapeError(f"f(theta) has shape {values.shape}; allowed: {len(theta)} rows, as many as theta has")
             part = np.asarray(np.tensordot(weight, values, axes=(0, 0)))
             total = part if total is None else total + part
         return np.zeros(0) if total is None else total
@@ -312,7 +310,7 @@ class NestedResult(ShowsItself):
         lines = [
             f"log Z        {self.log_z:.2f} ± {self.log_z_error:.2f}",
             f"information  {self.information:.2f} nats",
-            f"samples      {self.n_dead}, worth {self.n_eff:.0f} independent ones",
+            f"samples      {self.n_dead}, effective sample size {self.n_eff:.0f}",
             f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points{self._efficiency()}",
             f"memory       {self.memory:.2f} times the variance of independent points",
             f"stopped      {self.stop_reason}",
@@ -353,7 +351,7 @@ class NestedResult(ShowsItself):
         return conversions.to_arviz(self, rng=rng, n=n)
 
     def save(self, path: str | Path) -> None:
-        """Write everything to one .npz file, in one piece or not at all."""
+        """Write the result to one .npz file, atomically."""
         path = require_path("path", path)
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
@@ -367,12 +365,12 @@ class NestedResult(ShowsItself):
 
     @classmethod
     def load(cls, path: str | Path) -> NestedResult:
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
         Raises
         ------
         FileError
-            If the file is damaged, or no result of this version of the format.
+            If the file is damaged, or is not a result in this version of the format.
         """
         path = require_path("path", path)
         try:
@@ -380,12 +378,12 @@ class NestedResult(ShowsItself):
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
                 head = json.loads(str(file["head"]))
                 found = head.pop("format", None) if isinstance(head, dict) else None
-                # Before the arrays, which another version may store under other names.
+                # Check before reading the arrays, which another version may store under other names.
                 arrays = {name: file[name] for name in _ARRAYS} if found == _FORMAT else {}
         except FileNotFoundError as error:
             raise FileError(path, "there is no such file", "a file written by NestedResult.save") from error
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            # NumPy takes whatever is no archive for a pickle, and says how to load one all the same.
+            # NumPy takes any other file for a pickle, and its message would advise to load it.
             why = "no NumPy archive" if "pickle" in str(error) else error
             raise FileError(path, f"unreadable ({why})", "a file written by NestedResult.save") from error
         if found != _FORMAT:

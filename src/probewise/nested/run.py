@@ -1,4 +1,4 @@
-"""Run nested sampling and check what it found: the door that users come through."""
+"""`run`: nested sampling with a check of the evidence, the entry point for users."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from probewise.nested.moves import Move, SliceMove
 from probewise.nested.pose import AnyPrior, pose
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, search
-from probewise.nested.stop import State, StopRule
+from probewise.nested.stop import RoundSummary, StopRule
 
 __all__ = ["run"]
 
@@ -38,7 +38,7 @@ def run(
     stop: StopRule | None = None,
     move: Move | None = None,
     n_replaced: int | None = None,
-    progress: Callable[[State], None] | None = None,
+    progress: Callable[[RoundSummary], None] | None = None,
     max_calls: int | None = None,
     max_cost: float = 5.0,
     checkpoint: str | Path | None = None,
@@ -47,56 +47,57 @@ def run(
     n_workers: int | None = None,
     return_interrupted: bool = True,
 ) -> NestedResult:
-    """Compute the evidence of a problem and draw from its posterior (paper, section on SSF estimation).
+    """Compute the evidence and posterior samples of a problem (paper, section on SSF estimation).
 
     Parameters
     ----------
     problem
-        Prior and likelihood in one, whose likelihood is asked in batches; or a log likelihood, a function of one point.
+        A problem with prior and log likelihood, which is evaluated in batches; or a log likelihood, a function of one
+        point.
     prior
-        The prior of a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
+        With a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
     names, vectorized, pass_dict, periodic
-        How the functions are called; see `pose`. Not for a problem in one.
+        With a log likelihood: how the functions are called; see `pose`.
     rng
         Source of randomness; its state is stored in the result.
     n_live
-        Live points: the error of log Z falls as its root, the cost rises in proportion.
+        Number of live points: the error of log Z falls as its root, the cost rises in proportion.
     stop
-        When to stop; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
+        Stopping rule; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
     move
         How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior
         is alive, points are drawn from the prior itself.
     n_replaced
-        Points replaced in one round; default half of `n_live`. The volume lost is counted exactly
-        whatever it is; with half, batches are large, 28 % fewer points are drawn than one by one
-        and the variance of log Z is 44 % greater.
+        Points replaced per round; default half of `n_live`. The shrinkage is counted exactly for any
+        number. With half, batches are large; compared with one at a time, 28 % fewer points are drawn and
+        the variance of log Z is 44 % greater.
     progress
-        Called with a `State` after every round.
+        Called with a `RoundSummary` after every round.
     max_calls
-        Likelihood evaluations after which the run ends early with what it has.
+        Limit of likelihood evaluations; at the limit the run ends with a warning.
     max_cost
-        Evaluations in all, in units of those of the search itself; 1: no check. What exceeds 1 goes into a second
-        route to the evidence, about a fifth of the search, and where the two disagree into a sharper second
-        route and a search with chains twice as long. What cannot be cured so is told as a warning.
+        Limit of all evaluations in units of those of the first run; 1 means no check. The rest is spent on a second
+        estimate of the evidence, about a fifth of the first run, and where the two disagree on a more precise second
+        estimate and a run with chains twice as long. A disagreement that remains is reported as a warning.
     checkpoint
-        File that the search is saved to as it goes, whole or not at all, in a folder that is made if missing. Where it
-        exists already the run resumes, and ends bit for bit as if it had never been interrupted, also by a kill;
-        `rng` must be as it was at the run's start, made anew from its seed. `max_calls` may be another.
+        File to which the state is saved atomically as the run proceeds; its folder is created if missing. If the file
+        exists, the run resumes and ends bit for bit as if it had not been interrupted or killed; `rng` must be in
+        the state of the run's start, made from the same seed. `max_calls` may differ.
     checkpoint_every_s
-        Seconds between savings, at least; ten times as long as a saving takes if that is more. 0: after every round.
+        Least seconds between savings, but no less than ten times the saving time. 0: save after every round.
     executor
-        Where the likelihood is evaluated, for one that is slow; by default here. Each batch is
-        dealt out in `n_workers` parts. The result is the same to the last bit if the likelihood of
-        a hypothesis is, whatever others are in the batch (matrix products in NumPy need not be).
+        Evaluates a slow likelihood in parallel; by default it is evaluated in this process. Each batch is
+        split into `n_workers` parts. The result is the same to the last bit if a hypothesis' likelihood
+        does not depend on its batch (for matrix products in NumPy it may).
     n_workers
         Parts of a batch; default the number of processors.
     return_interrupted
-        Whether Ctrl-C returns the result so far, doubtful and saying so; else it raises `KeyboardInterrupt`.
+        Whether Ctrl-C returns the result so far, with a warning; otherwise it raises `KeyboardInterrupt`.
 
     Returns
     -------
     NestedResult
-        With a warning, stored in it too, where it should not be trusted blindly.
+        A doubtful result comes with warnings, which it also stores.
 
     Raises
     ------
@@ -106,8 +107,8 @@ def run(
         If the likelihood fails (`partial` holds the result so far, if there is one), or every
         hypothesis drawn from the prior is impossible.
     FileError
-        If the checkpoint is damaged, or of a run with another problem, other settings or another seed, or
-        cannot be written: before anything is evaluated. Where a later saving fails, the run goes on and warns.
+        Before anything is evaluated: if the checkpoint is damaged, belongs to another problem, other settings or
+        another seed, or cannot be written. If a later saving fails, the run goes on with a warning.
     """
     require_rng(rng)
     posed = _posed(problem, prior, names, vectorized, pass_dict, periodic)
@@ -129,7 +130,7 @@ def run(
         checkpoint_every_s=checkpoint_every_s,
     )
     if max_cost > 1 and result.names and result.complete:
-        # A generator of its own, which depends on the state after the search: so also after a resumption.
+        # A separate generator that depends only on the state after the run, hence is the same after a resumption.
         checking = np.random.default_rng(rng.integers(2**63, size=4))
         try:
             result = checked(
@@ -145,7 +146,7 @@ def run(
         except KeyboardInterrupt:
             if not return_interrupted:
                 raise
-            note = "interrupted while the evidence was checked by a second route"
+            note = "interrupted while a second estimate checked the evidence"
             result = replace(result, warnings=(*result.warnings, note))
     for note in result.warnings:
         warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
@@ -160,7 +161,7 @@ def _posed(
     pass_dict: bool,
     periodic: Sequence[str],
 ) -> Samplable:
-    """Take a problem in one, or make one of a function and its prior."""
+    """Return a problem as it is, or make one of a log likelihood and its prior."""
     if hasattr(problem, "log_likelihood") or isinstance(problem, type):
         if prior is not None or names is not None or vectorized or pass_dict or periodic:
             raise ParameterError(

@@ -1,4 +1,4 @@
-"""Run nested sampling (Skilling 2006): remove the worst live points, count the volume lost, draw new ones above."""
+"""The nested sampling loop (Skilling 2006): remove the worst live points, shrink the volume, draw new ones above."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import birth_rows, insertion_p_value, integrate, log_volumes
-from probewise.nested.families import chain_memory
+from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult, few_possible, versions
-from probewise.nested.stop import RemainingEvidence, State, StopRule
+from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
 __all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "search", "step"]
 
 LIVE_PER_PARAM = 2
-"""Live points for each parameter, at least."""
+"""Least number of live points per parameter."""
 
 # Draw from the whole prior while a point costs fewer evaluations than a chain would.
 _PRIOR_VOLUME = 0.05
-# Below this probability of a run's insertion ranks the result is called doubtful: one false alarm in 10 000 runs.
+# p value of the insertion ranks below which the result is doubtful: one false alarm in 10 000 runs.
 _DOUBTFUL_P_VALUE = 1e-4
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
 
 
 def least_live(n_params: int) -> int:
-    """Count the fewest live points that a run accepts."""
+    """Least number of live points for a problem."""
     return max(LIVE_PER_PARAM * n_params, 10)
 
 
@@ -55,7 +55,7 @@ def step(
 ) -> tuple[Live, Dead, Tally]:
     """Replace the `n_replaced` worst points by new ones above the best of them.
 
-    The points die one after another, so that the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ...,
+    The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is
     counted exactly; their successors are drawn together.
     """
     n_live = len(live.points)
@@ -94,7 +94,7 @@ def search(
     stop: StopRule | None = None,
     move: Move | None = None,
     n_replaced: int | None = None,
-    progress: Callable[[State], None] | None = None,
+    progress: Callable[[RoundSummary], None] | None = None,
     max_calls: int | None = None,
     checkpoint: str | Path | None = None,
     checkpoint_every_s: float = 10.0,
@@ -102,9 +102,9 @@ def search(
     n_workers: int | None = None,
     return_interrupted: bool = True,
 ) -> NestedResult:
-    """Search the prior once, from its whole volume to the peaks, without asking whether the result is right.
+    """Run nested sampling once, without the check of the evidence.
 
-    `probewise.nested.run` has the parameters, what is raised, and the check; here a doubt is only stored in the result.
+    `probewise.nested.run` documents the parameters and errors; here doubts are stored in the result without a warning.
     """
     require_rng(rng)
     _require_options(
@@ -129,7 +129,7 @@ def search(
     keeper = None
     if checkpoint is not None:
         settings = settings_of(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
-        with contextlib.suppress(OSError):  # what cannot be made is told when the first saving fails
+        with contextlib.suppress(OSError):  # `Keeper` reports a folder that cannot be created
             Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
         keeper = Keeper(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
@@ -144,8 +144,8 @@ def search(
     def finish(reason: str, *more_notes: str) -> NestedResult:
         save()
         noted = replace(now, notes=(*now.notes, *more_notes))
-        # From the state after the last round alone, so that the sums depend neither on where in a round an
-        # interruption came nor on what the generator was spawned from, which its state does not tell.
+        # Depends only on the state after the last round: not on where in a round an interruption came, nor on
+        # the generator's seed sequence, which its state does not include.
         rng.bit_generator.state = now.rng_state
         summing = np.random.default_rng(rng.integers(2**63, size=4))
         return _result(evaluate, noted, n_live, reason, seed_state, summing)
@@ -155,13 +155,13 @@ def search(
             if now.ended is not None:
                 result = finish(now.ended)
                 break
-            # A round can cost twice the one before: the volume halves while points come from the prior.
+            # A round can cost twice the last one: the volume halves while points are drawn from the prior.
             if max_calls is not None and evaluate.n_calls + 2 * now.last_cost > max_calls:
                 reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
                 result = finish(reason, f"{reason}; log Z lacks what a full run would have found")
                 break
             after, state = _round(now, evaluate, n_replaced, rng)
-            # At once, so that a round is done and judged, or not done at all, wherever an interruption comes.
+            # One assignment, so that an interruption leaves a round either complete or not begun.
             now = replace(after, ended=rule(state))
             if progress is not None:
                 progress(state)
@@ -182,7 +182,7 @@ def search(
         else:
             result = finish("interrupted", "interrupted; log Z lacks what a full run would have found")
     except BaseException:
-        # `progress` or `stop` raised, or somebody's signal handler did.
+        # `progress`, `stop` or a signal handler raised.
         save()
         raise
     return result
@@ -212,13 +212,13 @@ def _require_options(
     executor: object,
     return_interrupted: object,
 ) -> None:
-    """Refuse options of the wrong kind before anything is evaluated."""
+    """Check the types of the options before anything is evaluated."""
     if stop is not None:
         require_callable("stop", stop, "a rule such as RemainingEvidence(dlogz=0.1), of probewise.nested, or None")
     if move is not None:
         require_like("move", move, ("draw", "adapted"), "a move such as SliceMove(), of probewise.nested, or None")
     if progress is not None:
-        allowed = "a function that is called with a State after every round, or None; a run shows no bar by itself"
+        allowed = "a function called with a RoundSummary after every round, or None; a run shows no bar by itself"
         require_callable("progress", progress, allowed)
     if checkpoint is not None:
         require_path("checkpoint", checkpoint)
@@ -232,8 +232,8 @@ def _require_options(
     require_flag("return_interrupted", return_interrupted)
 
 
-def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, State]:
-    """Replace points once and add up what died; nothing is changed before it is complete."""
+def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, RoundSummary]:
+    """Replace points once and add the dead ones to the evidence; returns new values and changes none."""
     live, moving = now.live, now.moving
     whole = math.exp(live.log_volume)
     chains = whole <= _PRIOR_VOLUME
@@ -241,13 +241,13 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
         live, moving if chains else PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng
     )
     edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
-    # Relative to the best likelihood: volumes would be lost in the rounding of a log likelihood such as -1e100.
+    # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(fresh.points.log_likelihood.max())
     log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + (gone.points.log_likelihood - best)
     so_far = now.log_z_over_best + (now.best - best) if now.dead else -math.inf
     before = float(logsumexp(np.concatenate([[so_far], log_mass[:-1]])))
     log_z = float(np.logaddexp(before, log_mass[-1]))
-    state = State(
+    state = RoundSummary(
         n_dead=(len(now.dead) + 1) * n_replaced,
         n_calls=evaluate.n_calls,
         log_z=best + log_z,
@@ -273,10 +273,10 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
 
 
 def _first(evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator) -> Run:
-    """Draw live points from the possible part of the prior.
+    """Draw the first live points from the part of the prior with nonzero likelihood.
 
-    Impossible hypotheses (zero likelihood) are counted and thrown away: the share m / n of
-    possible ones is where the volume starts. Where they are rare, chains fill up what is missing.
+    Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share
+    m / n of possible ones. Where these are rare, chains supply the missing live points.
     """
     most = max(100 * n_live, 20_000) if max_calls is None else min(max(100 * n_live, 20_000), max_calls)
     n_params = len(evaluate.names)
@@ -315,7 +315,7 @@ def _first(evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, 
 def _result(
     evaluate: Evaluator, now: Run, n_live: int, reason: str, seed_state: str, rng: np.random.Generator
 ) -> NestedResult:
-    """Let the live points die where they are and sum up."""
+    """Let the remaining live points die and compute the result."""
     live, dead, notes = now.live, now.dead, now.notes
     n_dead = sum(len(d.points) for d in dead)
     few = few_possible(now.log_start, now.log_start_error, n_live)
@@ -414,7 +414,7 @@ def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> Ne
 
 
 def _plain(value: object) -> object:
-    """Turn a generator's state into what JSON can hold."""
+    """Convert a generator's state to JSON types."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

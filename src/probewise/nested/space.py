@@ -1,4 +1,4 @@
-"""Say in which coordinates chains step: the unit cube, or those that the prior says are better."""
+"""Sampling coordinates: the unit cube, or coordinates supplied by the prior."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _EDGE = 1e-15
 
 
 class Space(Protocol):
-    """Where chains step; the prior has a density there."""
+    """The coordinates in which chains move, with the prior's density in them."""
 
     @property
     def periodic(self) -> tuple[int, ...]:
-        """Columns of the coordinates that go round, with period one from 0 on."""
+        """Columns of the periodic coordinates, which have range 0 to 1."""
         ...
 
     @property
@@ -37,11 +37,11 @@ class Space(Protocol):
         ...
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to coordinates, (n, n_params) both ways."""
+        """Map parameters to coordinates, both (n, n_params)."""
         ...
 
     def leave(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters, (n, n_params); also the prior's log density over them, (n,)."""
+        """Map coordinates to parameters, (n, n_params); also return the prior's log density in them, (n,)."""
         ...
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -51,7 +51,7 @@ class Space(Protocol):
 
 @dataclass(frozen=True)
 class _Cube:
-    """The unit cube, where every prior is even; `periodic` columns go round, so that any number is a place there."""
+    """The unit cube, in which the prior is uniform; `periodic` columns are wrapped."""
 
     prior: Prior
     periodic: tuple[int, ...] = ()
@@ -79,7 +79,7 @@ class _Cube:
 
 @dataclass(frozen=True)
 class _Normal:
-    """The unit cube drawn out: every coordinate has a standard normal prior, and no walls."""
+    """Normal scores of the unit cube: unbounded coordinates with a standard normal prior."""
 
     prior: Prior
 
@@ -145,18 +145,18 @@ class _HasCoordinates(Protocol):
 
 @runtime_checkable
 class _Draws(Protocol):
-    """Coordinates of which some lead nowhere: no parameters stand for those, and they have to be drawn themselves."""
+    """Coordinates that draw from the prior themselves, because some of them match no parameters."""
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
 
 
 def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
-    """Choose where chains step: the prior's own coordinates if it has any, else the unit cube.
+    """Choose the sampling coordinates: the prior's own if it has any, else the unit cube.
 
     Raises
     ------
     ParameterError
-        If parameters are `periodic` that the prior does not have, or that it has in coordinates of its own.
+        If `periodic` names parameters that the prior does not have, or the prior has its own coordinates.
     """
     own = isinstance(prior, _HasCoordinates)
     if periodic and (own or not set(periodic) <= set(prior.names)):
@@ -168,7 +168,7 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
 
 
 def unbounded(prior: Prior) -> Space:
-    """Choose coordinates without walls, for densities that know none: the prior's own, else normal scores.
+    """Choose unbounded coordinates, as fitted densities need them: the prior's own, else normal scores.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Say when a run is done: rules that look at its state and give a reason, or None to go on."""
+"""Stopping rules: functions of a round's summary that return a reason to stop, or None to go on."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import TypeAlias
 
 from probewise.errors import ParameterError
 
-__all__ = ["EvidenceChange", "RemainingEvidence", "State", "StopRule"]
+__all__ = ["EvidenceChange", "RemainingEvidence", "RoundSummary", "StopRule"]
 
 
 @dataclass(frozen=True)
-class State:
-    """Show how far a run has come; handed to `progress` and to the stop rule after every round.
+class RoundSummary:
+    """Summary of a run after a round, passed to `progress` and to the stopping rule.
 
-    `log_z` counts the dead points alone; `log_z_remaining` is the most that the live points can
-    add, the best likelihood times the volume left, and `log_ratio_remaining` the log of its ratio to what
-    `log_z` counts; `last_change` is what the last dead point added to `log_z`; `log_volume` the log share
-    of the prior still alive.
+    `log_z` counts the dead points only. `log_z_remaining` is the log of an upper bound on the live
+    points' evidence, the best likelihood times the remaining volume; `log_ratio_remaining` is the log of
+    its ratio to the evidence so far. `last_change` is the increase of `log_z` by the last dead point;
+    `log_volume` the log of the remaining share of the prior.
     """
 
     n_dead: int
@@ -32,12 +32,15 @@ class State:
     best_log_likelihood: float
 
 
-StopRule: TypeAlias = Callable[[State], "str | None"]
+State = RoundSummary
+"""The old name of `RoundSummary`."""
+
+StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
 
 
 @dataclass(frozen=True)
 class RemainingEvidence:
-    """Stop when the live points can raise log Z by less than `dlogz` (their own share is added at the end)."""
+    """Stop when the live points can raise log Z by less than `dlogz` (their contribution is added at the end)."""
 
     dlogz: float = 0.05
 
@@ -45,8 +48,8 @@ class RemainingEvidence:
         if not 0 < self.dlogz < math.inf:
             raise ParameterError("dlogz", self.dlogz, "greater than 0, finite")
 
-    def __call__(self, state: State) -> str | None:
-        """Give the reason, or None."""
+    def __call__(self, state: RoundSummary) -> str | None:
+        """Return the reason to stop, or None."""
         excess = state.log_ratio_remaining
         gain = math.log1p(math.exp(excess)) if excess < 700 else excess
         return f"live points can raise log Z by less than {self.dlogz:g}" if gain < self.dlogz else None
@@ -62,8 +65,8 @@ class EvidenceChange:
         if not 0 < self.tolerance < math.inf:
             raise ParameterError("tolerance", self.tolerance, "greater than 0, finite")
 
-    def __call__(self, state: State) -> str | None:
-        """Give the reason, or None."""
+    def __call__(self, state: RoundSummary) -> str | None:
+        """Return the reason to stop, or None."""
         if state.last_change < self.tolerance:
             return f"consecutive values of log Z differ by less than {self.tolerance:g}"
         return None

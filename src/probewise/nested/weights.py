@@ -1,4 +1,4 @@
-"""What weighted samples are worth, and equally weighted ones from them."""
+"""Weighted samples: effective sample size, resampling and quantiles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["n_effective", "resampled", "weighted_quantiles"]
 
 
 def n_effective(log_weight: FloatArray) -> float:
-    """Kish's effective number of samples, of weights that need not be normalised, (n,); 0 where all are zero."""
+    """Kish's effective sample size of unnormalised log weights, (n,); 0 where all weights are zero."""
     most = float(np.max(log_weight))
     if not math.isfinite(most):
         return 0.0
@@ -22,7 +22,7 @@ def n_effective(log_weight: FloatArray) -> float:
 
 
 def resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
-    """Draw rows by weight, (n_weights,) -> (n,), systematically: each as often as its share of n, up or down."""
+    """Draw rows by weight with systematic resampling, (n_weights,) -> (n,): counts are n w rounded up or down."""
     ladder = np.cumsum(weight)
     rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
     return np.asarray(np.minimum(rows, len(ladder) - 1))

@@ -194,7 +194,7 @@ MISTAKES = {
     "an unknown pattern to predict": (lambda: probewise.predict(SENSOR, UNDESCRIBED), "'edge' is named but not"),
     "readings twice": (
         lambda: probewise.calibration.predict(SENSOR, RECORDING, RECORDING.readings),
-        "none beside a recording",
+        "none together with a recording",
     ),
     # audit
     "a path to audit": (lambda: probewise.audit("plan.csv"), f"plan is 'plan.csv'; {A_PLAN}"),

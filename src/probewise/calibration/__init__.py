@@ -1,4 +1,4 @@
-"""Find a sensor's spatial sensitivity from a recording: its order by evidence, its field as posterior mean.
+"""Calibrate a sensor's SSF from a recording: its number of Gaussians by evidence, its field as posterior mean.
 
 Paper, sections "Estimating SSF MoG Model Parameters" and "Light Sensor SSF MoG Model": eqs. "Evidence1"
 and "studentT", the table of log evidences, and the weighted mean of sampled SSF fields.

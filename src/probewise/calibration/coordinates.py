@@ -1,4 +1,4 @@
-"""Coordinates in which a scan speaks plainly of the SSF: moments instead of A, B and C."""
+"""Sampling coordinates for calibration: moments of the SSF instead of A, B and C."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ __all__ = ["MomentCoordinates"]
 
 @dataclass(frozen=True)
 class MomentCoordinates:
-    """Describe a mixture by its moments, which readings fix one by one (`probewise.priors.Coordinates`).
+    """Moments of a mixture as sampling coordinates, each determined by few readings (`probewise.priors.Coordinates`).
 
-    A scan across an edge fixes the variance along its direction, so one combination of A, B and C
-    that is bent through all three. Here the coordinates of each Gaussian are its centre, log
-    variances along x' and y', and the area tangent of its correlation; for the first its amplitude
-    in the prior's unit (log) and, in place of its own centre, that of the whole footprint; for the
-    others the log ratio of their mass to the first one's. Then I_min and I_max.
+    A scan across an edge determines the variance along its direction, which is a nonlinear combination of
+    A, B and C. Here the coordinates of each Gaussian are its centre, the log variances along x' and y',
+    and the inverse hyperbolic tangent of its correlation. The first Gaussian also has its log
+    amplitude in the prior's unit and, instead of its own centre, that of the whole footprint; the others
+    have the log ratio of their mass to the first one's. I_min and I_max follow.
 
-    The Gaussians are sorted by mass, greatest first, and the prior's density there is N! times as
-    great: readings know no labels, so N! equal modes become one and the evidence is the same.
+    The Gaussians are sorted by mass, greatest first, and the prior's density is multiplied by N!: the
+    readings do not depend on the labels, so N! equal modes become one and the evidence is unchanged.
     """
 
     prior: SSFPrior
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to coordinates, (n_samples, 6 N + 2) both ways."""
+        """Map parameters to coordinates, both (n_samples, 6 N + 2)."""
         n = self.prior.n_gaussians
         g = theta[:, : 6 * n].reshape(len(theta), n, 6)
         det = g[..., 3] * g[..., 4] - g[..., 5] ** 2
@@ -55,11 +55,11 @@ class MomentCoordinates:
         return np.concatenate([out.reshape(len(theta), 6 * n), theta[:, 6 * n :]], axis=1)
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters, (n_samples, 6 N + 2); also the prior's log density over them, (n_samples,)."""
+        """Map coordinates to parameters, (n_samples, 6 N + 2); also return the prior's log density, (n_samples,)."""
         n = self.prior.n_gaussians
-        # A row for each kind of coordinate: every operation then runs along memory.
+        # One contiguous row per kind of coordinate, for speed.
         g = np.ascontiguousarray(kinds_of(x))
-        # A sampler asks far outside too; nothing there may overflow.
+        # A sampler may try extreme values, which must not overflow.
         log_variance = g[3:5].clip(-100.0, 100.0)
         log_first, log_ratio = g[0, 0].clip(-100.0, 50.0), g[0, 1:].clip(-100.0, 0.0)
         r = np.tanh(g[5])
@@ -80,7 +80,7 @@ class MomentCoordinates:
         out[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
         theta = x.copy()
         kinds_of(theta)[...] = out
-        # d(A, B, C) / d(log variances, area tangent), d a / d log a, and the first centre from the whole's.
+        # d(A, B, C) / d(log variances, arctanh r), d a / d log a, and the first centre from that of the whole.
         jacobian = log_a - 1.5 * both - 2.0 * log_rest
         log_density = self.prior.log_prob_by_kind(out, theta[:, -2], theta[:, -1])
         log_density += jacobian.sum(axis=0)
@@ -92,11 +92,11 @@ class MomentCoordinates:
 
 
 def kinds_of(columns: FloatArray) -> FloatArray:
-    """View the Gaussians among parameters or coordinates, (n_samples, 6 N + 2), by kind, (6, N, n_samples)."""
+    """View the Gaussians' parameters or coordinates, (n_samples, 6 N + 2), as (6 kinds, N, n_samples)."""
     return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
 
 
 def _shares(g: FloatArray) -> FloatArray:
-    """Share of the light that each Gaussian holds, from coordinates (n_samples, N, 6) -> (n_samples, N)."""
+    """Each Gaussian's share of the mass, from coordinates (n_samples, N, 6) -> (n_samples, N)."""
     ratio = np.concatenate([np.ones((len(g), 1)), np.exp(np.clip(g[:, 1:, 0], -100.0, 0.0))], axis=1)
     return np.asarray(ratio / ratio.sum(axis=1, keepdims=True))

@@ -1,7 +1,7 @@
-"""Check calibration against hidden truth: whether the 95 % intervals hold it, and evidence finds the order.
+"""Validate calibration against known truth: coverage of the 95 % intervals, and the order found by evidence.
 
-Recordings come from the independent pixel world, by the paper's plan, each with a single Gaussian of
-its own; calibration sees the readings alone.
+Recordings of the paper's plan are simulated by the independent pixel world, each with a random
+single-Gaussian SSF; calibration gets only the readings.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class Truth:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How many of `n_recordings` had the truth inside the 95 % interval, by quantity."""
+    """How often the 95 % interval of each quantity held the truth, in `n_recordings` recordings."""
 
     n_recordings: int
     held: dict[str, int]
     n_live: int
 
     def to_json(self, **about: object) -> str:
-        """Write the counts with their Wilson intervals as JSON; `about` says how they were made."""
+        """Return the counts with their Wilson intervals as JSON; `about` is added to it, such as the command."""
         rows = {
             name: {"held": k, "of": self.n_recordings, "wilson95": list(wilson_interval(k, self.n_recordings))}
             for name, k in self.held.items()
@@ -65,12 +65,12 @@ class Coverage:
         return json.dumps({**about, **document}, indent=1, allow_nan=False) + "\n"
 
     def save(self, path: str | os.PathLike[str], **about: object) -> None:
-        """Write `to_json` to a file, in one piece or not at all."""
+        """Write `to_json` to a file, atomically."""
         write_text_atomically(path, self.to_json(**about))
 
 
 def draw_truth(*, rng: np.random.Generator) -> Truth:
-    """Draw a sensor like the paper's: offset by a few mm, wider one way, a span of 45 to 55 units."""
+    """Draw a sensor like the paper's: offset by a few mm, anisotropic, with I_max - I_min of 45 to 55 units."""
     black = float(rng.uniform(8, 12))
     return Truth(
         center_mm=(float(rng.uniform(-3, 3)), float(rng.uniform(-3, 3))),
@@ -83,7 +83,7 @@ def draw_truth(*, rng: np.random.Generator) -> Truth:
 
 
 def simulate_truth(truth: Truth, *, rng: np.random.Generator) -> Recording:
-    """Let the pixel world carry out the paper's plan with this sensor."""
+    """Simulate the paper's plan with this sensor in the pixel world."""
     spot = gaussian_spot([Blob(1.0, truth.center_mm, truth.sd_mm, truth.correlation)])
     world = World(spot, black=truth.black, white=truth.white, noise_sd=truth.noise_sd)
     return world.simulate(paper_plan(), rng=rng)
@@ -102,13 +102,13 @@ def coverage(
     Parameters
     ----------
     n_recordings
-        How many.
+        Number of recordings.
     rng
-        Source of randomness for truths, noise and fits: a stream for each recording.
+        Source of randomness for truths, noise and fits; spawned for each recording.
     n_live
         Live points of each fit.
     executor
-        Where the fits run; by default here, one after another. The counts do not depend on it.
+        Runs the fits; by default they run here, one by one. The counts do not depend on it.
     progress
         Called after each recording with the counts so far.
     """
@@ -124,7 +124,7 @@ def coverage(
 
 
 def _held(rng: np.random.Generator, n_live: int) -> dict[str, bool]:
-    """Simulate and calibrate one recording; tell for each quantity whether its interval holds the truth."""
+    """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
     truth = draw_truth(rng=rng)
     samples = calibrate(simulate_truth(truth, rng=rng), orders=(1,), n_live=n_live, rng=rng).sensor.samples
     found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
@@ -136,7 +136,7 @@ def _held(rng: np.random.Generator, n_live: int) -> dict[str, bool]:
 
 
 def order_lead(truth: Truth, *, rng: np.random.Generator, n_live: int = 300) -> tuple[float, float]:
-    """Simulate a single-Gaussian recording; return log Z of one Gaussian less that of two, and its error."""
+    """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
     one, two = calibrate(simulate_truth(truth, rng=rng), orders=(1, 2), n_live=n_live, rng=rng).orders
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
 
@@ -194,7 +194,7 @@ def main() -> None:
 
 
 def wilson_interval(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's interval of a probability from k successes in n trials."""
+    """Wilson's interval for a probability, from k successes in n trials."""
     if not 0 <= k <= n or n == 0:
         raise ParameterError("(k, n)", (k, n), "0 <= k <= n, n above 0")
     middle, half = (k + z * z / 2) / (n + z * z), z * math.sqrt(k * (n - k) / n + z * z / 4) / (n + z * z)

@@ -1,4 +1,4 @@
-"""Predict equal rows of a plan once: scans out and back, and several scans alike, cost one."""
+"""Predict repeated rows of a plan only once, as in scans out and back."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["DistinctRows"]
 
 
 class DistinctRows:
-    """Wrap a model whose prediction of a row depends on place, orientation and pattern alone.
+    """Wrapper of a model whose predictions depend only on a row's place, orientation and pattern.
 
-    True of every chain without effects: time, order and covariates play no part. It predicts the
-    one plan it was made for.
+    This holds for every chain without effects, which ignores time, order and covariates. It predicts
+    only the plan it was made for.
     """
 
     def __init__(self, model: SensorModel, plan: Plan) -> None:
@@ -34,12 +34,12 @@ class DistinctRows:
         return self._model.names
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points).
+        """Predict noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points).
 
         Raises
         ------
         ParameterError
-            If asked for another plan.
+            If `plan` is another plan.
         """
         if plan is not self._plan:
             raise ParameterError("plan", plan, "the plan that DistinctRows was made for")

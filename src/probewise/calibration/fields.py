@@ -1,4 +1,4 @@
-"""The posterior mean of SSF fields on a grid fit for the footprint (paper, section on MoG estimation)."""
+"""The posterior mean SSF field, on a grid chosen for the footprint (paper, section on MoG estimation)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["by_mass", "choose_pixel_mm", "mean_field", "mixture_moments"]
 _SIGMAS = 5.0
 _MAX_PIXELS_A_SIDE = 301
 _SERIES = (1.0, 0.5, 0.2, 0.1)
-# The sum over pixels of width p is a trapezium or midpoint rule in the distance to an edge (coverage one half, or
-# nothing, at the pixel in question): it errs by at most p^2 / 12 times the steepest slope of the profile of a
-# footprint of sd s, 0.242 / s^2. That is 1.0e-3 of the span where 4.5 pixels make an sd.
+# The sum over pixels of width p is a trapezoidal or midpoint rule in the distance to an edge (depending on whether the
+# edge halves a pixel or lies between two): its error is at most p^2 / 12 times the greatest slope of the profile of a
+# footprint of sd s, 0.242 / s^2. With 4.5 pixels per sd that is 1.0e-3 of I_max - I_min.
 _PIXELS_PER_SD = 4.5
 _LEAST_SHARE = 0.05
 
 
 def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray]:
-    """Compute what a person would ask of each hypothesis' SSF as a whole: centre, widths, correlation.
+    """Compute centre, widths and correlation of the whole SSF of each sample.
 
     Parameters
     ----------
@@ -55,10 +55,10 @@ def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray
 
 
 def by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
-    """Sort the Gaussians of each sample by falling mass; field and predictions stay what they are.
+    """Sort the Gaussians of each sample by decreasing mass; field and predictions do not change.
 
-    The prior is exchangeable, so a posterior sample says nothing about which Gaussian is the first;
-    numbered by mass, means and intervals of single columns make sense.
+    The prior is exchangeable, so the labels of a posterior sample are arbitrary; sorted by mass, means
+    and intervals of single columns are meaningful.
     """
     order = np.argsort(-_footprint(theta, n_gaussians).weight[:, 0], axis=1, kind="stable")
     out = theta.copy()
@@ -68,11 +68,11 @@ def by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> float:
-    """Choose the pixel of the mean field: 1 mm, or finer where scan step or footprint ask for it.
+    """Choose the pixel size of the mean field: 1 mm, or finer where scan step or footprint require it.
 
-    Never coarser than the scan step, nor than the sd of the narrowest Gaussian that holds a
-    twentieth of the mass (median over the samples) over 4.5, so that the sum over pixels errs by
-    a thousandth of the span at most; rounded down to 1, 0.5, 0.2, 0.1 times a power of ten.
+    It is at most the scan step and 1/4.5 of the sd of the narrowest Gaussian that holds a twentieth
+    of the mass (median over the samples), so that the sum over pixels errs by at most a thousandth of
+    I_max - I_min; rounded down to 1, 0.5, 0.2 or 0.1 times a power of ten.
 
     Parameters
     ----------
@@ -110,17 +110,17 @@ def mean_field(
     n_gaussians
         Order N.
     pixel_mm
-        Width of a pixel; a footprint that would need more than `max_pixels` a side gets wider ones.
+        Width of a pixel; enlarged for a footprint that would need more than `max_pixels` per side.
     weight
-        Posterior weights, (n_samples,); equal where not given.
+        Posterior weights, (n_samples,); by default equal.
     max_pixels
-        Most pixels along one side, 3 or more.
+        Largest number of pixels per side, 3 or more.
 
     Returns
     -------
     SSFField
-        The mean of fields, not the field of mean parameters. It reaches five sds beyond every
-        centre but those of the outermost thousandth of the mass.
+        The mean of the fields, not the field of the mean parameters. It extends five sds beyond all
+        centres except the outermost thousandth of the mass.
     """
     if not (pixel_mm > 0 and math.isfinite(pixel_mm)):
         raise ParameterError("pixel_mm", pixel_mm, "greater than 0")
@@ -128,8 +128,8 @@ def mean_field(
         raise ParameterError("max_pixels", max_pixels, "3 or more")
     weight = np.full(len(theta), 1 / len(theta)) if weight is None else weight / weight.sum()
     if weight.shape != (len(theta),):
-        raise ShapeError(f"weight has shape {weight.shape}; allowed: ({len(theta)},), one a sample")
-    # Samples that hold a thousandth of the weight between them cost most of the time and change nothing.
+        raise ShapeError(f"weight has shape {weight.shape}; allowed: ({len(theta)},), one per sample")
+    # The samples with the last thousandth of the weight would cost most of the time and change nothing.
     order = np.argsort(-weight)
     kept = order[: int(np.searchsorted(np.cumsum(weight[order]), 0.999)) + 1]
     f, shares = _footprint(theta[kept], n_gaussians), weight[kept]
@@ -148,13 +148,13 @@ def _footprint(theta: FloatArray, n_gaussians: int) -> Footprint:
 
 
 def _centers(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray:
-    """Multiples of the pixel from `low_mm` or just below to `high_mm` or just above."""
+    """Pixel centres, multiples of the pixel size, that cover `low_mm` to `high_mm`."""
     numbers = np.arange(math.floor(low_mm / pixel_mm), math.ceil(high_mm / pixel_mm) + 1, dtype=np.float64)
     return pixel_mm * numbers
 
 
 def _reach(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
-    """Bounds that hold five sds about all centres but those of the outermost thousandth of the mass, either side."""
+    """Bounds five sds beyond all centres except the outermost thousandth of the mass on either side."""
     return -_upper(_SIGMAS * sd - center, mass), _upper(center + _SIGMAS * sd, mass)
 
 

@@ -33,17 +33,17 @@ __all__ = ["Calibration", "OrderFit", "calibrate", "problem_for"]
 
 _N_SAMPLES = 1000
 _N_DRAWS = 8000
-# Routes to the evidence this many errors apart disagree: one false alarm in 16 000.
+# Two estimates of the evidence this many errors apart disagree: one false alarm in 16 000.
 _DISAGREE = 4.0
-# A posterior this close to the prior's own sd was not narrowed by the recording.
+# Ratio of posterior to prior sd above which the recording is not informative.
 _UNINFORMED = 0.7
 
 
 @dataclass(frozen=True, eq=False)
 class OrderFit:
-    """What the recording says if the SSF has `n_gaussians` Gaussians: nested run, sensor, prior.
+    """The fit of an SSF of `n_gaussians` Gaussians: prior, nested sampling run, fitted sensor.
 
-    `refined` holds the evidence by importance sampling, a route of its own and sharper where it is sound.
+    `refined` holds the evidence by importance sampling, an independent estimate, more precise where it is sound.
     """
 
     n_gaussians: int
@@ -54,7 +54,7 @@ class OrderFit:
 
     @property
     def log_z(self) -> float:
-        """Natural log of the evidence: the refined one where it is sound."""
+        """Natural log of the evidence: the refined estimate where it is sound."""
         return self.refined.log_z if self.refined.sound else self.result.log_z
 
     @property
@@ -70,7 +70,7 @@ class OrderFit:
 
 @dataclass(frozen=True, eq=False)
 class Calibration(ShowsItself):
-    """Hold every order that was tried, and which one the evidence prefers."""
+    """The fits of all orders that were tried; the evidence chooses one."""
 
     recording: Recording
     fits: tuple[OrderFit, ...]
@@ -87,7 +87,7 @@ class Calibration(ShowsItself):
 
     @property
     def orders(self) -> tuple[OrderEvidence, ...]:
-        """The paper's table: log evidence with its error, and parameter counts, one row an order."""
+        """The paper's table: log evidence with its error, and parameter counts, one row per order."""
         return self.sensor.orders
 
     @property
@@ -101,7 +101,7 @@ class Calibration(ShowsItself):
         return self.chosen.prior.describe()
 
     def probabilities(self) -> dict[int, float]:
-        """Posterior probability of each order, all orders equally probable beforehand."""
+        """Posterior probability of each order, with equal prior probabilities."""
         log_z = np.array([fit.log_z for fit in self.fits])
         weight = np.exp(log_z - log_z.max())
         return {fit.n_gaussians: float(w) for fit, w in zip(self.fits, weight / weight.sum(), strict=True)}
@@ -112,7 +112,7 @@ class Calibration(ShowsItself):
 
 
 def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
-    """Pose the calibration of one order: chain over the known patterns, Student-t with one sigma a data set.
+    """Make the inference problem of one order: a chain over known patterns, Student-t with one sigma per data set.
 
     Parameters
     ----------
@@ -126,8 +126,8 @@ def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | 
     plan = recording.plan
     groups = plan.scan if data_sets is None else np.asarray(data_sets)
     if groups.shape != (len(plan),):
-        raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one a row")
-    # Curved edges to 1e-4 of the span: below a tenth of the least noise sd that is believed in.
+        raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
+    # The error at curved edges, 1e-4 of I_max - I_min, is below a tenth of the least noise sd of the prior.
     chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
     return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)
 
@@ -145,7 +145,7 @@ def calibrate(
     n_samples: int = _N_SAMPLES,
     executor: Executor | None = None,
 ) -> Calibration:
-    """Fit SSFs of several orders to a recording and weigh them by their evidence (paper, section on MoG estimation).
+    """Fit SSFs of several orders to a recording and compare their evidences (paper, section on MoG estimation).
 
     Parameters
     ----------
@@ -156,35 +156,35 @@ def calibrate(
     n_live
         Live points of nested sampling.
     rng
-        Source of randomness; every order draws from a stream of its own.
+        Source of randomness; spawned for each order.
     progress
-        Called with the order and the sampler's state after every round; not across processes.
+        Called with the order and a `RoundSummary` after every round; not with a process pool.
     prior
-        Makes the prior from the recording and an order.
+        Function that makes the prior from the recording and an order.
     data_sets
-        Data set of each row, which has a noise sd of its own, (n_points,) from 0; default: its scan.
+        Data set of each row, each with its own noise sd, (n_points,) from 0; default: its scan.
     pixel_mm
-        Pixel of the mean fields; default by `choose_pixel_mm`, 1 mm or finer.
+        Pixel size of the mean fields; default by `choose_pixel_mm`, 1 mm or finer.
     n_samples
-        Equally weighted posterior samples to keep, 500 or more.
+        Number of equally weighted posterior samples to keep, 500 or more.
     executor
-        Where the orders run; by default here, one after another. The result does not depend on it.
+        Runs the orders in parallel; by default they run here, one by one. The result does not depend on it.
 
     Returns
     -------
     Calibration
-        With a `sensor` for each order; the chosen one is that of the greatest evidence.
+        With a `sensor` for each order; the chosen order has the greatest evidence.
 
     Raises
     ------
     ParameterError
-        If no order is asked for, the recording has no contrast (see `scan_geometry`), or a name in it is one that
-        no file can hold.
+        If `orders` is empty, the recording has no contrast (see `scan_geometry`), or a name in it cannot be written
+        to a file.
 
     Warns
     -----
     DoubtfulResultWarning
-        If there are fewer usable readings than parameters, or the sampler doubts its run.
+        If there are fewer usable readings than parameters, or the sampler warns of a doubtful run.
     """
     require_recording(recording)
     require_described(recording.plan)
@@ -206,7 +206,7 @@ def calibrate(
     if executor is None:
         fits = [one(n, stream) for n, stream in streams.items()]
     else:
-        # The dearest order first, so that no worker waits for it at the end.
+        # The costliest order first, so that no worker waits for it at the end.
         running = {n: executor.submit(one, n, streams[n]) for n in sorted(wanted, reverse=True)}
         fits = [running[n].result() for n in wanted]
     table = tuple(OrderEvidence(fit.n_gaussians, fit.log_z, fit.log_z_error) for fit in fits)
@@ -220,7 +220,7 @@ def calibrate(
 
 
 def _orders(orders: object) -> tuple[int, ...]:
-    """Take the numbers of Gaussians, each once."""
+    """Return the numbers of Gaussians without duplicates."""
     allowed = "one or more whole numbers from 1, such as (1, 2)"
     if isinstance(orders, str) or not isinstance(orders, Iterable):
         raise ParameterError("orders", orders, allowed)
@@ -242,12 +242,12 @@ def _fit_order(
     pixel_mm: float | None,
     n_samples: int,
 ) -> OrderFit:
-    """Fit one order; a function of the module, so that another process can run it."""
+    """Fit one order; at module level, so that another process can run it."""
     geometry = scan_geometry(recording)
     n_usable = int(recording.usable.sum())
     notes: tuple[str, ...] = ()
     if n_usable < 6 * n_gaussians + 2:
-        notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the prior decides much",)
+        notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the result depends on the prior",)
         warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
     belief = prior(recording, n_gaussians)
     problem = problem_for(recording, belief, data_sets=data_sets)
@@ -258,7 +258,7 @@ def _fit_order(
     if apart > _DISAGREE and set(refined.doubts) <= set(refined.inherited):
         notes = (
             *notes,
-            f"two routes to the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
+            f"two estimates of the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
             f"{result.log_z_error:.2f} and {refined.log_z:.2f} ± {refined.log_z_error:.2f}; use more live points",
         )
     sensor = _fitted(
@@ -289,7 +289,7 @@ def _fitted(
     notes: tuple[str, ...],
     rng: np.random.Generator,
 ) -> FittedSensor:
-    """Turn a nested run into the sensor it found."""
+    """Make the fitted sensor of a nested sampling run."""
     prior = problem.prior
     if not isinstance(prior, SSFPrior):
         raise ParameterError("prior", prior, "an SSFPrior")
@@ -330,7 +330,7 @@ def _fitted(
 
 
 def _uninformed(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
-    """Name the centre, widths and correlation whose spread the recording did not narrow."""
+    """Names of the moments (centre, widths, correlation) that the recording did not constrain."""
     before = mixture_moments(prior.from_unit_cube(rng.random((2000, len(prior.names)))), prior.n_gaussians)
     after = mixture_moments(samples, prior.n_gaussians)
     return tuple(
@@ -339,7 +339,7 @@ def _uninformed(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) 
 
 
 def _close_call(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
-    """Say so where the two best orders cannot be told apart within the errors of their evidence."""
+    """Return a note if the evidences of the two best orders agree within their errors."""
     if len(table) < 2:
         return ()
     first, second = sorted(table, key=lambda order: -order.log_z)[:2]

@@ -1,4 +1,4 @@
-"""The noise that a calibration leaves: sd of each scan, and one pooled over scans for readings to come."""
+"""Posterior of the noise sd of a calibration: of each scan, and pooled over scans for new readings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["ScanNoise", "draw_sd", "noise_by_scan", "pooled_sd"]
 
 @dataclass(frozen=True)
 class ScanNoise:
-    """Noise of one scan: how many readings it rests on, posterior mean and sd of its sd, in the reading's unit."""
+    """Noise of one scan: number of readings, posterior mean and sd of the noise sd, in the reading's unit."""
 
     scan: str
     n_readings: int
@@ -26,17 +26,17 @@ class ScanNoise:
 def draw_sd(
     sum_of_squares: FloatArray, n_readings: int, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw the sd of Gaussian noise given residuals, under the proper 1/sd prior of the Student-t likelihood.
+    """Draw the sd of Gaussian noise given residuals, under the bounded 1/sd prior of the Student-t likelihood.
 
     The posterior is sd^(-1 - n) exp(-Q / (2 sd^2)) on [floor, ceiling], so Q / (2 sd^2) follows a
-    gamma distribution of shape n / 2 cut off at both ends, and is drawn by its quantile function.
+    truncated gamma distribution of shape n / 2, which is drawn by its quantile function.
 
     Parameters
     ----------
     sum_of_squares
         Q, the sum of squared residuals of each hypothesis, shape (n_samples,).
     n_readings
-        How many residuals each sum holds.
+        Number of residuals in each sum.
     sd_floor, sd_ceiling
         Bounds of the prior, in the reading's unit.
     rng
@@ -56,12 +56,12 @@ def draw_sd(
     if not 0 < sd_floor < sd_ceiling < np.inf:
         raise ParameterError("(sd_floor, sd_ceiling)", (sd_floor, sd_ceiling), "0 < floor < ceiling, finite")
     shape = n_readings / 2
-    # With Q = 0 the likelihood is sd^-n and the posterior piles up at the floor, as tiny residuals do.
+    # At Q = 0 the posterior is concentrated at the floor, as for tiny residuals.
     q = np.maximum(sum_of_squares, n_readings * (1e-6 * sd_floor) ** 2)
     least, most = q / (2 * sd_ceiling**2), q / (2 * sd_floor**2)
     low, high = gammainc(shape, least), gammainc(shape, most)
     drawn = gammaincinv(shape, low + (high - low) * rng.random(q.shape))
-    # Where the whole posterior lies in a tail too thin for the incomplete gamma, it sits at the nearer bound.
+    # Where the interval lies in a tail too thin for the incomplete gamma, use the nearer bound.
     thin = ~(high - low > 1e-280) | ~np.isfinite(drawn) | (drawn <= 0)
     at_bound = np.where(most < shape, sd_floor, sd_ceiling)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -70,12 +70,12 @@ def draw_sd(
 
 
 def pooled_sd(residuals: FloatArray, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator) -> FloatArray:
-    """Draw one sd for each hypothesis from all residuals together: the noise of a new scan.
+    """Draw one noise sd per sample from the residuals of all scans: the noise of a new scan.
 
     Parameters
     ----------
     residuals
-        Reading less prediction of the usable rows, shape (n_samples, n_points).
+        Reading minus prediction of the usable rows, shape (n_samples, n_points).
     sd_floor, sd_ceiling
         Bounds of the prior, in the reading's unit.
     rng
@@ -94,12 +94,12 @@ def noise_by_scan(
     sd_ceiling: float,
     rng: np.random.Generator,
 ) -> tuple[ScanNoise, ...]:
-    """Sum up the posterior of every scan's own sd, in the order of scans.
+    """Summarise the posterior of every scan's noise sd, in the order of the scans.
 
     Parameters
     ----------
     residuals
-        Reading less prediction of the usable rows, shape (n_samples, n_points).
+        Reading minus prediction of the usable rows, shape (n_samples, n_points).
     scan
         Data set of each row, an index into `scan_names`, shape (n_points,).
     scan_names
@@ -111,7 +111,7 @@ def noise_by_scan(
     """
     if residuals.shape[1:] != scan.shape:
         raise ShapeError(
-            f"residuals have shape {residuals.shape}; allowed: (n_samples, {scan.size}), one a row of scan"
+            f"residuals have shape {residuals.shape}; allowed: (n_samples, {scan.size}), one per row of scan"
         )
     out = []
     for k, name in enumerate(scan_names):

@@ -1,4 +1,4 @@
-"""Predict the readings of any plan by a fitted sensor (paper, eq. "modelI" and its figure of predicted readings)."""
+"""Predict the readings of any plan with a fitted sensor (paper, eq. "modelI" and its figure of predicted readings)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from probewise.scene import KnownScene
 
 __all__ = ["predict"]
 
-# Numbers held at once by one pass over a block of samples: about 30 MB.
+# Numbers held in memory by one block of samples: about 30 MB.
 _BLOCK = 4_000_000
 
 
@@ -30,52 +30,51 @@ def predict(
     *,
     progress: Progress = silent,
 ) -> Prediction:
-    """Predict every row of a plan, and score its readings where there are any.
+    """Compute the predictive distribution of every row of a plan, and score its readings if there are any.
 
-    Mean and sd are those of one new reading that is not lost, parameter uncertainty and noise together.
-    The density is the mixture, over the posterior samples, of the law of that sample's noise about its
-    prediction: normal with the pooled sd, and as the sensor's effects on the noise have it (a tail,
-    losses, a spread that follows the signal). Where the plan declares a quantisation step, or the sensor
-    has one, it is the mass of the reading's cell divided by the step. Each row is scored alone. New
-    patterns, scans and angles are predicted like any other; an effect that belongs to one scan plays no
-    part (see `FittedSensor.chain`).
+    Mean and sd are those of a new reading that is not lost, with parameter uncertainty and noise. The
+    density is a mixture over the posterior samples of each sample's noise distribution: normal with the
+    pooled sd, modified by the sensor's effects on the noise (outliers, losses, signal dependence). If
+    the plan or the sensor has a quantisation step, the density is the mass of the reading's cell divided
+    by the step. Each row is scored by its marginal density. New patterns, scans and angles are
+    predicted like any other; effects of single scans are left out (see `FittedSensor.chain`).
 
     Parameters
     ----------
     sensor
         The fitted sensor.
     plan
-        Where, when and over what to read, n_points rows; or a recording, whose readings are then scored.
+        Pose, time and pattern of every reading, n_points rows; or a recording, whose readings are then scored.
     readings
-        What was read, shape (n_points,), NaN where missing; `None` for a plan, and where a recording is given.
+        Measured readings, shape (n_points,), NaN where missing; `None` for a plan or a recording.
     progress
-        Told how many posterior samples have predicted.
+        Called with the number of posterior samples done.
 
     Returns
     -------
     Prediction
-        `log_density` is NaN where a reading is missing or out of the plan's declared range.
+        `log_density` is NaN where a reading is missing or outside the plan's declared range.
 
     Raises
     ------
     ShapeError
-        If there are not as many readings as rows.
+        If readings and rows differ in number.
 
     Warns
     -----
     DoubtfulResultWarning
-        If the plan declares another unit than the sensor was calibrated in, or lacks a column that an effect reads.
+        If the plan's unit is not that of the calibration, or the plan lacks a column that an effect reads.
     """
     require_sensor(sensor, "in the order predict(sensor, plan)")
     if isinstance(plan, Recording):
         if readings is not None:
-            raise ParameterError("readings", readings, "none beside a recording, which has its own")
+            raise ParameterError("readings", readings, "none together with a recording, which has its own")
         readings, plan = plan.readings, plan.plan
     require_plan(plan)
     require_described(plan)
     recorded = np.full(len(plan), np.nan) if readings is None else floats(readings, "readings")
     if recorded.shape != (len(plan),):
-        raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one a row of the plan")
+        raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one per row of the plan")
     if plan.instrumentation.unit != sensor.instrumentation.unit:
         warnings.warn(
             f"the plan's readings are in {plan.instrumentation.unit!r}, "

@@ -1,13 +1,12 @@
-"""What is believed of a sensor before its recording: proper priors from scan step, span and reading range.
+"""Priors of the SSF and the levels: proper, with bounds from scan step, span and range of the readings.
 
-The paper assigns uniform priors and prints no bounds. Uniform belief in A and B puts almost all
-of it on footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A lies within
-a factor 1.4 of the smallest sd), and the evidence for an order then weighs that accident. Here a
-width is a scale that is unknown by orders of magnitude, so A and B are log-uniform; every bound
-comes from what the scans can resolve and contain. Likewise a uniform amplitude a gives a narrow Gaussian
-next to no light, and an order one Gaussian too high hides it there at little cost; so here the light that
-a Gaussian holds (its mass, a pi / sqrt(A B - C^2)) is uniform. `SSFPrior(precision=Uniform(...),
-unit_mass_mm2=None)` is the paper's.
+The paper assigns uniform priors and prints no bounds. A uniform prior of A and B puts almost all of its
+mass on footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A lies within a factor
+1.4 of the smallest sd), and the evidence of an order then depends on the bounds. Here the order of magnitude
+of a width is unknown, so A and B are log-uniform, with bounds from what the scans can resolve and
+contain. Likewise, with a uniform amplitude a, a narrow Gaussian has almost no mass, so a superfluous
+Gaussian is hidden there at little cost in evidence; here the mass of a Gaussian,
+a pi / sqrt(A B - C^2), is uniform. `SSFPrior(precision=Uniform(...), unit_mass_mm2=None)` is the paper's.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from probewise.scene import KnownScene
 __all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "blind_axis_rad", "default_prior", "scan_geometry"]
 
 _MAX_CORRELATION = 0.98
-_SAME_AXIS = 0.01  # chord of the doubled angle: 0.3 degrees
+_SAME_AXIS = 0.01  # chord of the doubled angle; it equals 0.3 degrees
 _TINY = float(np.finfo(float).tiny)
 _AMPLITUDE = Uniform(0.0, 1.0)
 _PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
@@ -37,7 +36,7 @@ _PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
 
 @dataclass(frozen=True)
 class PriorRow:
-    """One line of the report's table of priors."""
+    """One row of the report's table of priors."""
 
     parameter: str
     unit: str
@@ -47,17 +46,16 @@ class PriorRow:
 
 @dataclass(frozen=True)
 class SSFPrior:
-    """Believe the same of each of `n_gaussians` Gaussians, independently, and of the two levels (paper, 6 N + 2).
+    """Independent, identical priors of `n_gaussians` Gaussians, and priors of the two levels (paper, 6 N + 2).
 
-    The Gaussians are exchangeable: no ordering is imposed, so each of the N! labellings of a
-    footprint holds the same evidence, and the evidence of the order counts them all, as it must.
-    C = r sqrt(A B) with r uniform on (-max_correlation, max_correlation): every draw is a
-    positive definite Gaussian.
+    The Gaussians are exchangeable: no ordering is imposed, and the evidence of the order counts all
+    N! labellings of a footprint, as it must. C = r sqrt(A B) with r uniform on
+    (-max_correlation, max_correlation), so every draw is positive definite.
 
     Parameters
     ----------
     n_gaussians
-        How many Gaussians make up the SSF.
+        Number of Gaussians in the SSF.
     offset_mm
         Prior of each centre coordinate u, v in the sensor frame.
     precision
@@ -65,10 +63,10 @@ class SSFPrior:
     i_min, i_max
         Priors of the readings over albedo 0 and 1, in the reading's unit.
     amplitude
-        Prior of each Gaussian's mass in units of pi `unit_mass_mm2`, so of a / (unit_mass_mm2 sqrt(A B - C^2));
-        only ratios reach the data.
+        Prior of each Gaussian's mass in units of pi `unit_mass_mm2`, that is of a / (unit_mass_mm2 sqrt(A B - C^2));
+        the readings depend only on ratios.
     unit_mass_mm2
-        That unit, mm^2; `None`: `amplitude` is the prior of a itself, as in the paper.
+        That unit, mm^2; if `None`, `amplitude` is the prior of a itself, as in the paper.
     max_correlation
         Largest abs(C) / sqrt(A B), below 1.
     """
@@ -98,7 +96,7 @@ class SSFPrior:
         return (*gaussians, "I_min", "I_max")
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the unit cube to parameters, (n_samples, 6 N + 2) both ways."""
+        """Map the unit cube to parameters, both (n_samples, 6 N + 2)."""
         self._require_columns(u)
         out = np.empty(u.shape)
         for n in range(self.n_gaussians):
@@ -115,7 +113,7 @@ class SSFPrior:
         return out
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to the unit cube, (n_samples, 6 N + 2) both ways."""
+        """Map parameters to the unit cube, both (n_samples, 6 N + 2)."""
         self._require_columns(theta)
         out = np.empty(theta.shape)
         for n in range(self.n_gaussians):
@@ -134,11 +132,11 @@ class SSFPrior:
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
         self._require_columns(theta)
-        # A row for each kind of parameter: every operation then runs along memory.
+        # One contiguous row per kind of parameter, for speed.
         return self.log_prob_by_kind(np.ascontiguousarray(kinds_of(theta)), theta[:, -2], theta[:, -1])
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
-        """Give `log_prob` of Gaussians laid out by `kinds_of`, (6, N, n_samples), with their levels, (n_samples,)."""
+        """Return `log_prob` for Gaussians arranged by `kinds_of`, (6, N, n_samples), and their levels, (n_samples,)."""
         precisions = np.maximum(g[3:5], 0.0)
         product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)
@@ -155,11 +153,11 @@ class SSFPrior:
 
     @property
     def coordinates(self) -> MomentCoordinates:
-        """The coordinates that a sampler should step in."""
+        """The sampling coordinates for nested sampling."""
         return MomentCoordinates(self)
 
     def describe(self) -> tuple[PriorRow, ...]:
-        """Return the table of priors for the report, one row a kind of parameter."""
+        """Return the table of priors for the report, one row per kind of parameter."""
         why = dict(self.reasons)
         by_mass = self.unit_mass_mm2 is not None
         rows = (
@@ -167,7 +165,7 @@ class SSFPrior:
                 "a_n",
                 "1",
                 f"{self.amplitude}" + (f" times {self.unit_mass_mm2:.3g} sqrt(A_n B_n - C_n^2)" if by_mass else ""),
-                ("the light that each Gaussian holds is uniform; " if by_mass else "") + "only ratios reach the data",
+                ("the mass of each Gaussian is uniform; " if by_mass else "") + "readings depend only on ratios",
             ),
             ("u_n, v_n", "mm", str(self.offset_mm), why.get("offset_mm", "given")),
             ("A_n, B_n", "mm^-2", str(self.precision), why.get("precision", "given")),
@@ -195,11 +193,11 @@ class SSFPrior:
 
 @dataclass(frozen=True)
 class ScanGeometry:
-    """What the design of a recording can resolve and contain.
+    """Lengths and ranges that bound what a recording can resolve and contain.
 
-    `step_mm` is the median move within scans, `span_mm` the median length of the scans that
+    `step_mm` is the median step within scans, `span_mm` the median length of the scans that
     move; `low`, `high` the extreme readings; `albedo_low`, `albedo_high` the extreme albedo
-    under the commanded places; `inverted` where dark places read high.
+    at the commanded places; `inverted` is True if dark places give high readings.
     """
 
     step_mm: float
@@ -242,7 +240,7 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     if not lengths and extent == 0:
         raise ParameterError("recording", "every reading taken at one place", "scans that move over an edge")
     span = float(np.median(lengths)) if lengths else extent
-    # Places far apart, such as a robot's own choice, bound no footprint from below: keep a factor of 50.
+    # Places far apart, such as those a robot chooses, do not bound the footprint from below: use a factor of 50.
     step = min(float(np.median(np.concatenate(moves))) if moves else span, span / 50)
     albedo = _albedo_under(recording)[usable]
     albedo_low, albedo_high = float(albedo.min()), float(albedo.max())
@@ -255,13 +253,14 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
 
 
 def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
-    """Derive the prior of an SSF of `n_gaussians` from the recording's step, span and reading range.
+    """Make the prior of an SSF of `n_gaussians` from the recording's step, span and range of readings.
 
     Centres lie within a quarter of the span from the mechanical origin, so that a scan centred on
-    an edge contains the transition; conditional sds from half a step (nothing finer is resolved) to
-    a quarter of the span (nothing wider is contained); each level within half the reading range of
-    where the readings, scaled to albedo 0 and 1, place it. Directions in which the recording says
-    nothing, such as along a single edge, keep this prior. The mass of each Gaussian is uniform.
+    an edge contains the transition. Conditional sds range from half a step (nothing finer is
+    resolved) to a quarter of the span (nothing wider is contained). Each level lies within half the range
+    of the readings from its estimate, the readings extrapolated to albedo 0 and 1. The mass of each
+    Gaussian is uniform. In directions without information, such as along a single edge, the
+    posterior equals this prior.
 
     Raises
     ------
@@ -299,15 +298,15 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
 
 
 def blind_axis_rad(recording: Recording) -> float | None:
-    """Find the axis of the sensor frame along which no edge told one part of the SSF from another.
+    """Find the axis of the sensor frame along which the recording has no information on the SSF.
 
-    Straight edges, stripes and ramps show the SSF's projection on their normal alone, turned into
-    the sensor frame. Where the normals of all usable rows agree, the recording says nothing of the
-    SSF along the axis at right angles to them: there the posterior is the prior.
+    Straight edges, stripes and ramps measure only the SSF's projection on their normal, in the sensor
+    frame. If the normals of all usable rows agree, the recording contains no information along the
+    perpendicular axis, and the posterior equals the prior there.
 
     Returns
     -------
-    The axis, radians anticlockwise from x', 0 to pi; `None` where two directions or more were seen.
+    The axis, radians anticlockwise from x', 0 to pi; `None` if there are two directions or more.
     """
     plan = recording.plan
     angles: list[FloatArray] = []
@@ -319,7 +318,7 @@ def blind_axis_rad(recording: Recording) -> float | None:
             return None
     if not any(part.size for part in angles):
         return None
-    seen = np.exp(2j * np.concatenate(angles))  # doubled angles: a normal and its opposite are one axis
+    seen = np.exp(2j * np.concatenate(angles))  # doubled angles identify a normal with its opposite
     if np.abs(seen - seen[0]).max() > _SAME_AXIS:
         return None
     return float((np.angle(seen[0]) / 2 + math.pi / 2) % math.pi)

@@ -1,4 +1,4 @@
-"""A fitted sensor, and sensor.json, the file that carries it to prediction, robot and diagnosis."""
+"""A fitted sensor and its file, sensor.json, which prediction, robot and diagnosis read."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ T = TypeVar("T")
 FORMAT = "sensor/1"
 MIN_SAMPLES = 500
 _ALLOWED = "a sensor.json as `probewise calibrate` writes"
-# Effects of single scans or mountings: they explain the recording, and say nothing of the next scan.
+# Effects of single scans or mountings: they explain the recording but do not apply to new scans.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
-_FOR_A_FREE_FORM = 4  # Gaussians that stand for it where only a mixture will do
-# Effects that may act on some patterns alone.
+_FOR_A_FREE_FORM = 4  # Gaussians that approximate a free-form SSF where a mixture is required
+# Effects that may be restricted to some patterns.
 _BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
 
 
 @dataclass(frozen=True)
 class OrderEvidence:
-    """One line of the paper's table: log evidence of an order, its error, and the counts 6 N and 6 N + 2."""
+    """One row of the paper's table: log evidence of an order, its error, and the counts 6 N and 6 N + 2."""
 
     n_gaussians: int
     log_z: float
@@ -72,40 +72,40 @@ class OrderEvidence:
 
     @property
     def n_ssf_parameters(self) -> int:
-        """Parameters of the SSF alone, as the paper's table counts them: 6 N."""
+        """Number of parameters of the SSF, as in the paper's table: 6 N."""
         return 6 * self.n_gaussians
 
     @property
     def n_parameters(self) -> int:
-        """Parameters estimated, I_min and I_max included: 6 N + 2."""
+        """Number of estimated parameters, with I_min and I_max: 6 N + 2."""
         return 6 * self.n_gaussians + 2
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSensor(ShowsItself):
-    """Hold what a recording taught about a sensor: its posterior, its noise, its mean SSF field.
+    """A calibrated sensor: posterior samples, noise, and mean SSF field.
 
     Attributes
     ----------
     names
-        Parameters, one a column of `samples`: a_1 ... C_N, I_min, I_max, then "<effect>.<parameter>".
+        Parameter names, one per column of `samples`: a_1 ... C_N, I_min, I_max, then "<effect>.<parameter>".
     samples
         Equally weighted posterior samples, (n_samples, n_params), at least 500.
     n_gaussians
         Order N of the SSF.
     noise_sd
-        sd of one new reading in a new scan, one for each sample, (n_samples,): pooled over scans.
+        Noise sd of a reading in a new scan for each sample, pooled over scans, (n_samples,).
     field
         Posterior mean of the SSF fields, the discrete SSF that the robot uses (paper, eq. "discreteR").
     instrumentation
-        Unit, range and step of the readings, and what took them.
+        The instrument: unit, range and step of the readings, sensor, controls.
     effects
         Names of the effects in the model, in the order of their columns.
     patterns
-        Names of the patterns that an effect is bound to, by the effect; one that is not here acts on all.
+        By effect, the names of the patterns to which it is restricted; other effects act on all patterns.
     absent
-        Samples that do without an effect, (n_samples,), by the effect: a diagnosis has left open whether it is there.
-        One that is not here acts in all.
+        By effect, the samples without it, (n_samples,), where a diagnosis is uncertain whether it is present; other
+        effects act in all samples.
     scan_noise
         Noise of each scan of the recording.
     fingerprint, source
@@ -115,9 +115,9 @@ class FittedSensor(ShowsItself):
     priors
         The table of priors.
     notes
-        Why the result should be used with care; empty where nothing stands against it.
+        Reasons to use the result with care; empty if there are none.
     version
-        The package's.
+        Version of the package.
     """
 
     names: tuple[str, ...]
@@ -144,7 +144,7 @@ class FittedSensor(ShowsItself):
         if len(samples) < MIN_SAMPLES:
             raise ParameterError("n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
         if noise_sd.shape != (len(samples),):
-            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one a sample")
+            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one per sample")
         require_finite("samples", samples)
         require_finite("noise_sd", noise_sd)
         if not (noise_sd > 0).all():
@@ -178,7 +178,7 @@ class FittedSensor(ShowsItself):
 
     @property
     def carried_effects(self) -> tuple[AnyEffect, ...]:
-        """The effects that act on new scans too."""
+        """The effects that also apply to new scans."""
         return tuple(
             _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
             for name in self.effects
@@ -187,32 +187,32 @@ class FittedSensor(ShowsItself):
 
     @property
     def carried_samples(self) -> FloatArray:
-        """Samples in the order of the columns of `chain`, without effects that belong to single scans."""
+        """Samples with the columns of `chain`, without the effects of single scans."""
         return self.samples[:, [self.names.index(name) for name in self.chain(KnownScene({})).names]]
 
     def chain(self, scene: Scene) -> Chain:
-        """Build the model that predicts new readings over a scene, with the effects that carry over.
+        """Build the model that predicts new readings over a scene, with the effects that apply to new scans.
 
-        Its parameters are the columns of `carried_samples`, if the scene has none of its own.
+        Its parameters are the columns of `carried_samples`, unless the scene has parameters.
         """
         return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.carried_effects)
 
     @property
     def free_form(self) -> bool:
-        """Whether its SSF is one Gaussian bent to any form, and no mixture of a few."""
+        """Whether its SSF is a free form (`probewise.sensor.free_form`) rather than a mixture of a few Gaussians."""
         return is_free_form(self.samples[:, : 6 * self.n_gaussians])
 
     def mixture(self) -> FixedMixture:
-        """Give the mean SSF as a mixture of Gaussians of positive mass: as many as it has, a few for a free form."""
+        """Return the mean SSF as a mixture of `n_gaussians` positive Gaussians; four for a free form."""
         if self.free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
         n = self.n_gaussians
         return mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
 
     def leading(self) -> FittedSensor:
-        """Give the most probable of the hypotheses that a diagnosis has left open: a mean over all is true of none.
+        """Return the sensor under the most probable combination of effects, where a diagnosis left several open.
 
-        As many samples as it has, those of that hypothesis repeated; itself where it holds but one.
+        Its samples are repeated to the original number; the sensor itself if there is only one combination.
         """
         if not self.absent:
             return self
@@ -242,11 +242,11 @@ class FittedSensor(ShowsItself):
         return dict(zip(self.names, self.samples.std(axis=0).tolist(), strict=True))
 
     def median(self) -> dict[str, float]:
-        """Posterior median by parameter: unlike the mean, no single sample far off moves it."""
+        """Posterior median by parameter, robust against single outlying samples."""
         return dict(zip(self.names, np.median(self.samples, axis=0).tolist(), strict=True))
 
     def ssf(self) -> tuple[Quantity, ...]:
-        """Sum up the SSF by its centre, widths and angle; of a few Gaussians also each of them."""
+        """Summarise the SSF by centre, widths and angle; also each Gaussian, unless it is a free form."""
         return ssf_quantities(self.samples, self.n_gaussians, each=not self.free_form)
 
     def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
@@ -259,7 +259,7 @@ class FittedSensor(ShowsItself):
     def summary(self) -> str:
         """Describe the sensor in plain text."""
         unit, n = self.instrumentation.unit, self.n_gaussians
-        bending = frozenset(mixture_names(n)[6:] if self.free_form else ())  # nobody reads twenty Gaussians one by one
+        bending = frozenset(mixture_names(n)[6:] if self.free_form else ())  # twenty Gaussians would not be readable
         form = "an SSF of free form" if bending else f"{n} Gaussian{'s' if n > 1 else ''}"
         lines = [
             f"{form}, {len(self.samples)} posterior samples"
@@ -289,7 +289,7 @@ class FittedSensor(ShowsItself):
         return effect if share == 1.0 else f"{effect} in {share:.0%} of them"
 
     def to_json(self) -> str:
-        """Write the sensor as strict JSON, format "sensor/1"."""
+        """Return the sensor as strict JSON, format "sensor/1"."""
         mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
         document = {
             "format": FORMAT,
@@ -342,12 +342,12 @@ class FittedSensor(ShowsItself):
 
     @classmethod
     def from_json(cls, text: str, path: str | os.PathLike[str] = "sensor.json") -> FittedSensor:
-        """Read what `to_json` wrote; `path` is what error messages call it.
+        """Parse the text written by `to_json`; `path` is its name in error messages.
 
         Raises
         ------
         FileError
-            If the text is damaged, incomplete, or of another format or version of it.
+            If the text is damaged, incomplete, or of another format or version.
         """
         document = json_of(path, text, _ALLOWED)
         found = document.get("format") if isinstance(document, dict) else None
@@ -383,7 +383,7 @@ class FittedSensor(ShowsItself):
         except FileError:
             raise
         except (ProbewiseError, ValueError, TypeError) as error:
-            raise FileError(path, f"contents that do not fit together ({error})", "an undamaged sensor.json") from error
+            raise FileError(path, f"inconsistent contents ({error})", "an undamaged sensor.json") from error
         return sensor
 
     def unit(self, name: str) -> str:
@@ -398,12 +398,12 @@ class FittedSensor(ShowsItself):
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
-    """Write sensor.json in one piece or not at all.
+    """Write sensor.json atomically.
 
     Raises
     ------
     ParameterError
-        If it is no FittedSensor: a Calibration has one, its `sensor`.
+        If `sensor` is not a FittedSensor; that of a Calibration is its `sensor`.
     FileError
         If the file cannot be written.
     """
@@ -425,7 +425,7 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
 
 
 def require_sensor(sensor: object, more: str = "") -> None:
-    """Raise ParameterError unless `sensor` is a FittedSensor, saying how to come by one."""
+    """Raise ParameterError unless `sensor` is a FittedSensor; the message says how to get one."""
     allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
     if isinstance(getattr(sensor, "sensor", None), FittedSensor):
         allowed = f"a FittedSensor: take its .sensor, this is the {type(sensor).__name__}"
@@ -442,7 +442,7 @@ def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 class _Reader:
-    """Take typed values out of a parsed document, naming file and place where one is missing or wrong."""
+    """Reads typed values from a parsed document; errors name the file and the entry."""
 
     def __init__(self, path: object, document: Mapping[str, Any]) -> None:
         self.path, self.document = path, document
@@ -499,7 +499,7 @@ class _Reader:
         return array
 
     def marks(self, n: int, *keys: str) -> BoolArray:
-        """Read the numbers of some of n rows as truth values, (n,)."""
+        """Read a list of row numbers as a mask, (n,)."""
         found = self.array(*keys, ndim=1)
         if not np.isin(found, np.arange(n)).all():
             raise self.wrong(".".join(keys), found.tolist(), f"whole numbers from 0 to {n - 1}")
@@ -522,7 +522,7 @@ def _pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
 
 
 def _record(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -> T:
-    """Build one of the small values of texts, numbers and counts, by the types of its fields."""
+    """Build a dataclass of texts, numbers and counts, checked by the types of its fields."""
     kinds: dict[str, type | tuple[type, ...]] = {"str": str, "int": int, "float": (int, float)}
     values: dict[str, object] = {}
     for field in fields(kind):  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""What a person would ask of an SSF: its centre, its widths and how it lies, beside A, B and C."""
+"""Summary of an SSF by quantities easier to read than A, B and C: centre, widths and angle."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Quantity", "ssf_quantities"]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number with its posterior: name, which ends in its unit, unit, median and central 95 % interval."""
+    """A quantity's posterior: name (ending in the unit), unit, median and central 95 % interval."""
 
     name: str
     unit: str
@@ -23,11 +23,11 @@ class Quantity:
 
 
 def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) -> tuple[Quantity, ...]:
-    """Sum up the SSF as a whole and, of several Gaussians, each: medians and 95 % intervals.
+    """Summarise the whole SSF and, if there are several, each Gaussian: medians and 95 % intervals.
 
-    `centre_u_mm` and `centre_v_mm`; `sd_long_mm` and `sd_short_mm` along the axes of its covariance; `angle_deg` of
-    the long axis from the u axis, anticlockwise, an axis having no direction: within 90 degrees of 0 in the
-    median. Of Gaussian n also its share of the light, names as "gaussian_n.share".
+    `centre_u_mm` and `centre_v_mm`; `sd_long_mm` and `sd_short_mm` along the axes of the covariance; `angle_deg` of the
+    long axis from the u axis, anticlockwise, defined up to 180 degrees, with a median within 90 degrees of 0.
+    For Gaussian n also its share of the mass; its names are as "gaussian_n.share".
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
     n_gaussians
         Order N.
     each
-        Whether each of several Gaussians is summed up, too.
+        Whether to summarise each of several Gaussians too.
     """
     f = footprint_of(samples[:, : 6 * n_gaussians], n_gaussians)
     found = _quantities("", *_whole(f))
@@ -50,7 +50,7 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
 
 
 def _whole(f: Footprint) -> tuple[FloatArray, ...]:
-    """Take the moments of the whole mixture, (n_samples,) each: u, v, their variances and covariance."""
+    """Compute the moments of the whole mixture, (n_samples,) each: u, v, their variances and covariance."""
     u, v = ((f.weight * centre).sum(axis=-1)[:, 0] for centre in (f.u_mm, f.v_mm))
     du, dv = f.u_mm[:, 0] - u[:, None], f.v_mm[:, 0] - v[:, None]
     spread = ((f.var_u, du * du), (f.var_v, dv * dv), (f.cov_uv, du * dv))
@@ -62,7 +62,7 @@ def _quantities(
 ) -> tuple[Quantity, ...]:
     middle, half = (var_u + var_v) / 2, np.hypot((var_u - var_v) / 2, cov_uv)
     angle = 0.5 * np.arctan2(2 * cov_uv, var_u - var_v)
-    # Angles of an axis repeat after half a turn: unwrapped about their mean direction.
+    # An axis' angle is defined up to half a turn: unwrap about the mean direction.
     about = 0.5 * np.angle(np.exp(2j * angle).mean())
     unwrapped = about + (angle - about + np.pi / 2) % np.pi - np.pi / 2
     return (

@@ -15,7 +15,7 @@ from probewise.emulator import (
     Bench,
     EmulatedArm,
     Geometry,
-    Sight,
+    LightModel,
     Stand,
     Table,
     VirtualClock,
@@ -98,9 +98,9 @@ def test_a_joint_stops_beyond_its_limits(geometry: Geometry) -> None:
     assert min(abs(end_deg - base.low_deg), abs(end_deg - base.high_deg)) == pytest.approx(3.0)
 
 
-def sight(stand: Stand, clock: VirtualClock, *, albedo: float = 1.0) -> Sight:
+def sight(stand: Stand, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
     world = replace(WORLD, noise_sd=0.0)
-    return Sight(world, Table(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
+    return LightModel(world, Table(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
 
 
 def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock: VirtualClock) -> None:
@@ -124,7 +124,7 @@ def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetr
 def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualClock) -> None:
     """As on the simulated arm with the same seed, however often it is read at one stand."""
     at = [Stand(0, 0, 14.0, 0)]
-    look = Sight(WORLD, Table(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
+    look = LightModel(WORLD, Table(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
     for number in range(4):
         at[0] = Stand(10.0 * number, 0, 14.0, 0)
         expected = 60.5 + 0.6 * np.random.default_rng([7, number]).standard_normal()
@@ -168,7 +168,7 @@ def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClo
     """Over an edge the spot's centre, 6 mm along v, is on the white side, then on the black one."""
     table = Table(HalfPlane(math.pi / 2, 0.0))
     world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
-    look = Sight(world, table, lambda: Stand(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
+    look = LightModel(world, table, lambda: Stand(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
     assert look(True) == pytest.approx(60.5)
     table.obey("turn 180")
     assert look(True) == pytest.approx(10.5)

@@ -1,7 +1,7 @@
-"""A LEGO NXT brick in software, with the arm of the paper's test bed hanging on it ("Robotic Arm Test Bed").
+"""An emulated LEGO NXT brick with the arm of the paper's test bed (section "Robotic Arm Test Bed").
 
-It answers LEGO's Bluetooth protocol byte for byte, turns motors that run on past their goal, and reads a
-light sensor over a `world`. It shares no code with the driver in `arm`: each is the other's proof.
+It answers LEGO's Bluetooth protocol byte for byte, simulates motors that overshoot, and reads a light
+sensor over a `world`. It shares no code with the driver in `arm`, so each tests the other.
 """
 
 from probewise.emulator.arm import EmulatedArm, Joint, Stand
@@ -10,13 +10,16 @@ from probewise.emulator.brick import Battery, Brick
 from probewise.emulator.clock import Clock, VirtualClock
 from probewise.emulator.faults import Faults
 from probewise.emulator.geometry import Geometry, JointNumbers, read_geometry, shipped_geometry
+from probewise.emulator.light_model import LightModel
 from probewise.emulator.line import VirtualLine
 from probewise.emulator.motor import Motor, MotorNature
 from probewise.emulator.radio import Radio, Trace
 from probewise.emulator.scenes import parse_scene
 from probewise.emulator.sensors import Analog, Digital, Light, NothingAnalog, sonar
-from probewise.emulator.sight import Sight
 from probewise.emulator.table import Table
+
+Sight = LightModel
+"""The old name of `LightModel`."""
 
 __all__ = [
     "Analog",
@@ -31,11 +34,11 @@ __all__ = [
     "Joint",
     "JointNumbers",
     "Light",
+    "LightModel",
     "Motor",
     "MotorNature",
     "NothingAnalog",
     "Radio",
-    "Sight",
     "Stand",
     "Table",
     "Trace",

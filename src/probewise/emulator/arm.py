@@ -1,4 +1,4 @@
-"""Where the sensor hangs: motors through gears and their play to joints, joints to a place over the field."""
+"""Forward kinematics of the arm: from motors through gears with backlash to joints and the sensor's pose."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from probewise.emulator.motor import Motor, MotorNature
 
 __all__ = ["EmulatedArm", "Joint", "Stand"]
 
-_BEYOND_LIMITS_DEG = 3.0  # a joint's own stops lie this far outside the limits of the file
+_BEYOND_LIMITS_DEG = 3.0  # a joint's mechanical stops lie this far outside the file's limits
 
 
 @dataclass(frozen=True)
 class Stand:
-    """Where the sensor is: lab frame, height of its face above the surface, its u axis to the x axis."""
+    """Pose of the sensor in the lab frame: place, height of its face above the surface, angle from x to its u axis."""
 
     x_mm: float
     y_mm: float
@@ -26,41 +26,41 @@ class Stand:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint and the motor that drives it through gears, whose play counts on the motor's side."""
+    """A joint and the motor that drives it through gears; backlash is measured at the motor."""
 
     numbers: JointNumbers
     motor: Motor
 
     @classmethod
     def at_home(cls, numbers: JointNumbers) -> Self:
-        """Make the motor, so that the joint is at home where the motor begins."""
+        """Make a joint at its home position, with the motor at 0."""
         ends = sorted(
             (angle_deg - numbers.home_deg) * numbers.gear_ratio
             for angle_deg in (numbers.low_deg - _BEYOND_LIMITS_DEG, numbers.high_deg + _BEYOND_LIMITS_DEG)
         )
         play_deg = numbers.play_deg * abs(numbers.gear_ratio)
-        # The stops are the joint's: its motor gets there half the play later.
+        # The stops are the joint's: its motor turns half the backlash further.
         stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
         return cls(numbers, Motor(MotorNature(stops_deg=stops_deg, play_deg=play_deg)))
 
     @property
     def angle_rad(self) -> float:
-        """Where the joint is."""
+        """Angle of the joint."""
         return math.radians(self.numbers.home_deg + self.motor.driven_deg / self.numbers.gear_ratio)
 
     def bring_to(self, angle_deg: float) -> None:
-        """Turn it by hand: the motor turns with it and comes to rest in the middle of the play."""
+        """Turn the joint by hand; the motor follows and rests in the middle of the backlash."""
         self.motor.angle_deg = self.motor.driven_deg = (angle_deg - self.numbers.home_deg) * self.numbers.gear_ratio
         self.motor.speed_deg_s = 0.0
 
 
 class EmulatedArm:
-    """Three joints, and the sensor at the end of them.
+    """The arm: three joints and the sensor at its end.
 
     Parameters
     ----------
     geometry
-        The arm's numbers; every joint begins at home.
+        Dimensions of the arm; every joint starts at home.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class EmulatedArm:
         return tuple(by_port[port] for port in "ABC")
 
     def stand(self) -> Stand:
-        """Return where the sensor is (the paper's arm: two links over a base that turns)."""
+        """Return the sensor's pose (the paper's arm: two links on a turning base)."""
         g = self._geometry
         base, shoulder, elbow = (joint.angle_rad for joint in self.joints)
         lower = elbow if g.elbow_is_absolute else shoulder + elbow

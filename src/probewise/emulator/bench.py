@@ -1,4 +1,4 @@
-"""The whole bench in one call: arm, light sensor, brick and radio link over a surface."""
+"""The whole emulated bench: arm, light sensor, brick and radio link over a surface."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from probewise.emulator.clock import Clock
 from probewise.emulator.faults import Faults
 from probewise.emulator.geometry import Geometry
 from probewise.emulator.inputs import Sensor
+from probewise.emulator.light_model import LightModel
 from probewise.emulator.radio import Radio, Trace, no_trace
 from probewise.emulator.sensors import Light, NothingAnalog, sonar
-from probewise.emulator.sight import Sight
 from probewise.emulator.table import Table
 from probewise.world import Surface, World
 
@@ -25,7 +25,7 @@ _WALL_CM = 42
 
 @dataclass(frozen=True)
 class Bench:
-    """An arm over a table and the link to its brick; `arm` and `radio.brick` show what goes on."""
+    """The emulated bench; `arm` and `radio.brick` give access to its state."""
 
     table: Table
     arm: EmulatedArm
@@ -49,34 +49,34 @@ def set_up(
     Parameters
     ----------
     geometry
-        The arm's numbers.
+        Dimensions of the arm.
     world
-        How the sensor reads at the height that geometry gives.
+        Simulates the sensor at the reading height of the geometry.
     surface
-        What lies there at first.
+        The surface at the start.
     clock
-        Seconds: `time.monotonic`, or a VirtualClock.
+        Time in seconds: `time.monotonic`, or a VirtualClock.
     seed
-        Of the sensor's noise and of the link's mishaps.
+        Seed of the sensor's noise and of the link's faults.
     name, sleep_min
-        The brick's.
+        The brick's name, and minutes until it switches itself off.
     faults
-        What goes wrong; None: nothing.
+        Rates of faults; None for none.
     trace
-        Where a record of all telegrams goes.
+        Function that records all telegrams.
 
     Raises
     ------
     ParameterError
-        If the name or the time to sleep is none.
+        If the name or `sleep_min` is invalid.
     """
     faults = Faults() if faults is None else faults
     arm = EmulatedArm(geometry)
     table = Table(surface)
-    sight = Sight(world, table, arm.stand, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
+    light = LightModel(world, table, arm.stand, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
     sensors: list[Sensor] = [NothingAnalog() for _ in range(4)]
     at = geometry.sensor_port - 1
-    sensors[at] = Light(sight, clock)
+    sensors[at] = Light(light, clock)
     sensors[0 if at == 3 else 3] = sonar(_WALL_CM)
     brick = Brick(
         clock,

@@ -1,4 +1,4 @@
-"""The brick: what it holds, its battery and its sleep, and an answer to every telegram."""
+"""The brick: ports, files, battery and sleep timer, and its replies to telegrams."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ __all__ = ["ADDRESS", "SLEEP_MIN", "Battery", "Brick"]
 
 ADDRESS = bytes.fromhex("0016530A0B0C")
 SLEEP_MIN = (0, 2, 5, 10, 30, 60)
-"""What the brick's menu offers; 0 is never."""
+"""The sleep times of the brick's menu, in minutes; 0 is never."""
 
 _FLASH_BYTES = 61440
 _VERSIONS = bytes((124, 1, 31, 1))  # protocol 1.124, firmware 1.31, the smaller number first
 _LONGEST_NAME = 14
-_LONGEST_POLL = 121  # over Bluetooth; more is an error, not a shorter answer
+_LONGEST_POLL = 121  # over Bluetooth; more is an error
 
 
 @dataclass(frozen=True)
 class Battery:
-    """Voltage at the start, and what it loses a minute."""
+    """Voltage at the start, and its loss per minute."""
 
     full_mv: float = 7412.0
     sag_mv_min: float = 0.0
 
     def at(self, seconds: float) -> float:
-        """Return the voltage in mV after some time; a brick ends at 5.5 V."""
+        """Return the voltage in mV after some time, at least 5.5 V."""
         return max(self.full_mv - self.sag_mv_min * seconds / 60, 5500.0)
 
 
 class Brick:
-    """A brick that is switched on now.
+    """An NXT brick, switched on at construction.
 
     Parameters
     ----------
     clock
-        Seconds; motors turn and timers run by it.
+        Time in seconds, for motors and timers.
     motors
         At ports A, B, C.
     sensors
@@ -54,16 +54,16 @@ class Brick:
     name
         Up to 14 characters of Latin-1.
     battery
-        What drives it.
+        The battery.
     sleep_min
-        After so many minutes without KEEPALIVE it switches itself off.
+        Minutes without KEEPALIVE after which it switches itself off.
     files
-        What lies in flash. Any of them runs as a program that sends messages back.
+        Files in flash. Each of them runs as a program that echoes messages.
 
     Raises
     ------
     ParameterError
-        If the name or the time to sleep is none that a brick can have.
+        If the name or `sleep_min` is not one that a brick can have.
     """
 
     def __init__(
@@ -120,20 +120,20 @@ class Brick:
 
     @property
     def is_off(self) -> bool:
-        """Whether it has gone to sleep; only its orange button would wake it."""
+        """Whether it has gone to sleep; only its orange button could wake it."""
         return self._sleep_s > 0 and self._clock() - self._awake_s >= self._sleep_s
 
     def advance(self) -> None:
-        """Bring everything that moves up to the clock's time."""
+        """Simulate the motors up to the clock's time."""
         if self.is_off:
             self.outputs.advance(self._awake_s + self._sleep_s, self.battery_mv)
             self.outputs.release()
         self.outputs.advance(self._clock(), self.battery_mv)
 
     def answer(self, telegram: bytes) -> bytes | None:
-        """Carry out a telegram and return the reply, None where none is due.
+        """Execute a telegram and return the reply, or None for no reply.
 
-        A command that was sent with the bit for no reply gets none, not even for an error.
+        A command with the no-reply bit gets none, not even for an error.
         """
         self.advance()
         request = None if self.is_off else parse(telegram)

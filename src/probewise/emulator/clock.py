@@ -1,4 +1,4 @@
-"""What time it is: the wall's, or one that only moves when it is waited for."""
+"""Clocks: real time, or a virtual clock that advances only by `sleep`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Clock: TypeAlias = Callable[[], float]
 
 
 class VirtualClock:
-    """Stand still but for `sleep`, which takes no time: minutes of an arm's work pass in seconds.
+    """A clock that advances only by `sleep`, which returns at once: minutes of simulated work take seconds.
 
-    It stands in for the module `time` where that is asked for `monotonic` and `sleep`.
+    It replaces the module `time` in code that uses only `monotonic` and `sleep`.
     """
 
     def __init__(self) -> None:
@@ -29,12 +29,12 @@ class VirtualClock:
     monotonic = __call__
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass.
+        """Advance the clock.
 
         Raises
         ------
         ParameterError
-            If it were to go back.
+            If `seconds` is negative.
         """
         if seconds < 0:
             raise ParameterError("seconds", seconds, "0 or more")

@@ -1,4 +1,4 @@
-"""What may go wrong on the radio link, each with its rate; read from texts such as `late=0.1,3`."""
+"""Faults of the radio link and their rates; parsed from texts such as `late=0.1,3`."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ __all__ = ["Faults"]
 
 @dataclass(frozen=True)
 class Faults:
-    """Rates of mishaps; all 0 is a link without any.
+    """Rates of faults; by default a link without faults.
 
     Parameters
     ----------
     fragment
         Probability that a reply comes in pieces, up to 30 ms apart.
     merge
-        Probability that a reply waits for the next one and comes in one piece with it.
+        Probability that a reply is delayed and delivered together with the next one.
     double
         Probability that a reply comes twice, the second time up to 0.1 s later.
     corrupt
-        Probability that one byte of a reply, its length included, is another.
+        Probability that one byte of a reply, its length included, is changed.
     late, late_s
-        Probability that a reply comes so many seconds late.
+        Probability that a reply is late, and by how many seconds.
     drop
-        Probability that a byte of a reply is lost, for each byte.
+        Probability, per byte, that a byte of a reply is lost.
     half
-        Probability that the end of a telegram is lost: of a request, or of a reply, which is as likely.
+        Probability that the end of a telegram is lost, equally likely of a request or of a reply.
     error
-        Probability that a request is refused with an error status, and not carried out.
+        Probability that a request is refused with an error status and not executed.
     silence
-        Probability that a request is carried out and never answered.
+        Probability that a request is executed but never answered.
     deaf
         Probability that a request is lost on the way to the brick.
     unasked
         Probability that the brick sends a message of its own before a reply.
     disconnect
-        Probability that the link ends as a request arrives, which is carried out; motors go on.
+        Probability that the link ends when a request arrives; the request is executed and motors run on.
     sag
-        Millivolts that the battery loses a minute.
+        Millivolts that the battery loses per minute.
     """
 
     fragment: float = 0.0
@@ -71,21 +71,21 @@ class Faults:
 
     @classmethod
     def parse(cls, texts: Iterable[str]) -> Self:
-        """Read NAME, NAME=RATE or late=RATE,SECONDS, each of which adds one fault.
+        """Parse texts NAME, NAME=RATE or late=RATE,SECONDS, one fault each.
 
-        Without a rate, fragments come always, a byte in 200 is dropped, other mishaps befall one request
-        in 20, a disconnection one in 500, and the battery loses 60 mV a minute.
+        Default rates: every reply fragmented, one byte in 200 dropped, other faults in one request in 20,
+        disconnection in one in 500, and a battery loss of 60 mV per minute.
 
         Raises
         ------
         ParameterError
-            If there is no fault of a name, or its rate is none.
+            If a name is unknown or its rate is invalid.
         """
         faults = cls()
         for text in texts:
             name, equals, value = text.partition("=")
             if name not in _USUAL:
-                raise ParameterError("--fault", text, f"one of {', '.join(_USUAL)}, =RATE behind it if you like")
+                raise ParameterError("--fault", text, f"one of {', '.join(_USUAL)}, optionally followed by =RATE")
             names = ("late", "late_s") if name == "late" else (name,)
             try:
                 numbers = [float(part) for part in value.split(",")] if equals else [_USUAL[name]]

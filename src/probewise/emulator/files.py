@@ -1,4 +1,4 @@
-"""The brick's flash: files by handle, and the commands that reach them."""
+"""The brick's flash file system, and the file commands."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _LONGEST_READ = 122  # what fits a Bluetooth message of 128 bytes
 class _Open:
     name: str
     at: int = 0
-    size: int | None = None  # what a writer has asked for; None: it reads
-    matches: tuple[str, ...] = ()  # what a search has still to tell
+    size: int | None = None  # size requested by a writer; None for a reader
+    matches: tuple[str, ...] = ()  # remaining results of a search
 
 
 class Files:
@@ -30,7 +30,7 @@ class Files:
     Parameters
     ----------
     contents
-        What lies there at first, by name.
+        The files at the start, by name.
     capacity
         Bytes of flash.
     """
@@ -56,12 +56,12 @@ class Files:
 
     @property
     def free(self) -> int:
-        """Bytes of flash that are left, promised ones counted as taken."""
+        """Free bytes of flash; those reserved by open files count as used."""
         promised = sum(opened.size - opened.at for opened in self._open.values() if opened.size is not None)
         return self._capacity - promised - sum(len(content) for content in self._files.values())
 
     def exists(self, name: str) -> bool:
-        """Tell whether there is a file of a name; the brick does not mind case."""
+        """Whether a file exists; names are not case-sensitive."""
         return self._found(name) is not None
 
     def _open_read(self, name: bytes) -> bytes:

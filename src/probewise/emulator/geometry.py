@@ -1,6 +1,6 @@
-"""The arm's numbers, read from its TOML file.
+"""Dimensions of the arm, read from its TOML file.
 
-The reader is the emulator's own, so that driver and emulator cannot share a mistake.
+The emulator has its own reader, so that driver and emulator cannot share a mistake.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LARGEST = 1e6
 
 @dataclass(frozen=True)
 class JointNumbers:
-    """One joint: its motor's port, turns of the motor for one of the joint, where it stands at count 0, its play."""
+    """One joint: motor port, gear ratio (motor turns per joint turn), angle at count 0, limits, backlash."""
 
     port: str
     gear_ratio: float
@@ -34,7 +34,7 @@ class JointNumbers:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Lengths in mm, angles in degrees; the TOML file of format "arm/1" says what each is."""
+    """Dimensions of the arm, in mm and degrees; the TOML file of format "arm/1" explains each."""
 
     base_mm: tuple[float, float]
     shoulder_mm: tuple[float, float]  # forward of the base's axis, above the surface
@@ -48,7 +48,7 @@ class Geometry:
 
 
 def shipped_geometry() -> Path:
-    """Find the file of the arm that ships with the package."""
+    """Return the path of the arm file shipped with the package."""
     return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
 
 
@@ -58,12 +58,12 @@ def read_geometry(path: Path) -> Geometry:
     Raises
     ------
     FileError
-        If it is no TOML file or lacks a number.
+        If it is not a TOML file or lacks a number.
     """
     text = read_text(path, "an arm's file of format arm/1")
     try:
         table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # not TOML, a number of thousands of digits, or nested as deep
+    except (ValueError, RecursionError) as error:  # not TOML, a number of thousands of digits, or nested too deep
         raise FileError(path, f"not TOML: {error}", "an arm's file of format arm/1") from error
 
     def number(*keys: str) -> float:

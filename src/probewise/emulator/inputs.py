@@ -1,4 +1,4 @@
-"""The four input ports as the firmware runs them: types, modes, what is valid when, I2C."""
+"""The firmware's four input ports: sensor types, modes, times of validity, I2C."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class _Port:
     sensor: Sensor
     kind: int = _NONE
     mode: int = _RAW
-    valid_s: float = 0.0  # from when on readings count
-    shown: tuple[int, int, int] = (0, 0, 0)  # raw, normalized, scaled: what was converted last
+    valid_s: float = 0.0  # time from which readings are valid
+    shown: tuple[int, int, int] = (0, 0, 0)  # raw, normalized, scaled: the last conversion
     boolean: int = 0
     answer: bytes = b""
     answered_s: float = 0.0
@@ -42,9 +42,9 @@ class Inputs:
     Parameters
     ----------
     sensors
-        What is plugged in, in this order.
+        The sensors at ports 1 to 4.
     clock
-        Seconds.
+        Time in seconds.
     """
 
     sensors: Sequence[Sensor]
@@ -64,7 +64,7 @@ class Inputs:
         }
 
     def release(self) -> None:
-        """Forget all types, as the start or the end of a program does."""
+        """Reset all sensor types, as the start or end of a program does."""
         for port in self._ports:
             self._configure(port, _NONE, _RAW)
 
@@ -73,7 +73,7 @@ class Inputs:
         return b""
 
     def _configure(self, port: _Port, kind: int, mode: int) -> None:
-        """Set type and mode; readings are invalid for a while, and the old ones stay on show."""
+        """Set type and mode; readings are invalid for a while, and the old values stay."""
         self._convert(port)
         now_s = self.clock()
         if kind != port.kind:
@@ -96,7 +96,7 @@ class Inputs:
         return b""
 
     def _convert(self, port: _Port) -> bool:
-        """Bring what the port shows up to date, if it is valid at all."""
+        """Update the port's values; return whether they are valid."""
         if self.clock() < port.valid_s:
             return False
         if port.kind not in (_NONE, *_DIGITAL):
@@ -133,7 +133,7 @@ class Inputs:
         return _told(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
 
     def _bus(self, port: _Port) -> tuple[Status, bytes]:
-        """Say how the bus stands, and what there is to read."""
+        """Return the status of the bus and the bytes to read."""
         if port.kind not in _DIGITAL or self.clock() < port.valid_s:
             return Status.CHANNEL_NOT_READY, b""
         if self.clock() < port.answered_s:
@@ -153,7 +153,7 @@ def _told(status: Status, payload: bytes) -> bytes:
 
 
 def _normalized(raw: int, kind: int) -> int:
-    """Scale to 0..1023 as the firmware does, in whole numbers, more light or sound giving more."""
+    """Scale to 0..1023 in integers as the firmware does; more light or sound gives a larger value."""
     if kind in (_LIGHT_ON, _LIGHT_OFF):
         zero, percent = _LIGHT_SCALE
     elif kind in _SOUND:
@@ -164,14 +164,14 @@ def _normalized(raw: int, kind: int) -> int:
 
 
 def _switched(normalized: int, before: int) -> int:
-    """Decide with hysteresis, at 45 % and 55 %; low is on, as a pressed touch sensor is."""
+    """Return the boolean value with hysteresis at 45 % and 55 %; low is on, as for a pressed touch sensor."""
     if normalized < AD_MAX * 45 // 100:
         return 1
     return 0 if normalized > AD_MAX * 55 // 100 else before
 
 
 def _scaled(normalized: int, mode: int, boolean: int) -> int:
-    """Convert by mode; the counting modes stay at 0, for no sensor here makes edges to count."""
+    """Convert by mode; the counting modes stay at 0, since no emulated sensor makes edges."""
     match mode & 0xE0:
         case 0x00:
             return normalized

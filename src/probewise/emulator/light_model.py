@@ -1,4 +1,4 @@
-"""What the light sensor sees from where it hangs: the world's reading, dimmed by height and without the LED."""
+"""The light at the sensor's pose: the world's reading, corrected for height and for the LED."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from probewise.emulator.clock import Clock
 from probewise.emulator.table import Table
 from probewise.world import World
 
-__all__ = ["Sight"]
+__all__ = ["LightModel"]
 
-_BRIGHTEST_MM = 8.0  # nearer than this the divider between LED and diode shades the surface
+_BRIGHTEST_MM = 8.0  # closer than this the divider between LED and photodiode shades the surface
 _SAME_STAND_MM = 1.0
 _CUT_OFF = 0.5
 
 
-class Sight:
-    """A scale 0 to 100 without steps, LED on or off.
+class LightModel:
+    """Unrounded reading on the scale 0 to 100, with the LED on or off.
 
-    A world's readings are whole steps as the brick shows them, and the brick cuts fractions off: so behind
-    a reading of 40 on average stands light of 40.5.
+    A world's readings are whole steps like the brick's, and the brick truncates: a reading of 40 means
+    light of 40.5 on average.
 
     Without the LED everything is half as bright, as measured in two rooms (58 and 32 % over white and
-    black with it, 30 and 17 % without). The LED's share is whole at the height of the world's readings,
-    rises towards 8 mm, falls to nothing on contact, and is gone at a few centimetres.
+    black with it, 30 and 17 % without). Relative to the world's reading height the LED's light increases
+    towards 8 mm, falls to zero on contact, and vanishes at a few centimetres.
 
     Parameters
     ----------
     world
-        How the sensor reads at `read_height_mm`.
+        Simulates the sensor at `read_height_mm`.
     table
-        What lies there.
+        The surface, and the sensor's rotation in its mount.
     stand
-        Where the sensor is now.
+        Function that returns the sensor's present pose.
     read_height_mm
-        Height that the world's readings are taken at.
+        Height at which the world's readings are taken.
     seed
-        Of the noise. Readings at the n-th stand, however many, come from the n-th generator, as they do on
-        the simulated arm, so that both give the same first reading.
+        Seed of the noise. All readings at the n-th pose come from the n-th generator, as on the simulated
+        arm, so that both give the same first reading.
     clock
-        Seconds, for what drifts.
+        Time in seconds, for drifts.
     """
 
     def __init__(
@@ -80,6 +80,6 @@ class Sight:
 
 
 def _led(height_mm: float) -> float:
-    """Return the LED's share of the light at a height, 1 at the brightest."""
+    """Return the relative brightness of the LED at a height, 1 at the brightest."""
     steps = max(height_mm, 0.0) / _BRIGHTEST_MM
     return steps * math.exp(1 - steps)

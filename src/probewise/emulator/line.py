@@ -1,4 +1,4 @@
-"""The link without a device: a line to the emulated brick within one process, on a clock of its own."""
+"""A link to the emulated brick within one process, on a virtual clock, without a device."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["VirtualLine"]
 
 
 class VirtualLine:
-    """A serial line whose waiting moves the clock on instead of taking time.
+    """A serial line that advances the virtual clock instead of waiting.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class VirtualLine:
         radio.reconnect()
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Return up to `size` bytes, fewer where no more come within `timeout_s`.
+        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`.
 
         Raises
         ------
@@ -61,7 +61,7 @@ class VirtualLine:
         self._radio.send(data)
 
     def close(self) -> None:
-        """Let go of the line; the brick stays as it is."""
+        """Close the line; the state of the brick does not change."""
         self._closed = True
 
     def _check(self) -> None:

@@ -1,8 +1,8 @@
-"""A motor as a thing that turns: inertia, friction, coasting, stops, play behind it; no firmware in it.
+"""Mechanics of a motor, without firmware: inertia, friction, coasting, stops and backlash.
 
-Orders of magnitude are those measured on the NXT motor: 170 revolutions a minute at full power and 9 V
-without load, speed proportional to power and to voltage, too weak to start below some 8 % of power,
-about 60 degrees of run-on from a plain limited run at power 75.
+The magnitudes are those measured on the NXT motor: 170 revolutions per minute at full power and 9 V
+without load, speed proportional to power and voltage, no start below about 8 % of power, and an
+overshoot of about 60 degrees after an unregulated limited run at power 75.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ __all__ = ["Motor", "MotorNature"]
 
 @dataclass(frozen=True)
 class MotorNature:
-    """What one motor under its load is like.
+    """Parameters of a motor under its load.
 
     Parameters
     ----------
     full_speed_deg_s
         Speed without load at power 100 and `rated_mv`.
     driven_s
-        Time constant towards the speed that is asked for, and of the electric brake.
+        Time constant of the approach to the commanded speed, and of the electric brake.
     coasting_s
         Time constant of slowing down without current.
     friction_deg_s2
-        Slowing down by dry friction; it also keeps a weakly driven motor from starting.
+        Deceleration by dry friction; it also keeps a weakly driven motor from starting.
     stops_deg
-        Angles of the shaft that it cannot pass.
+        Angles of the shaft at its mechanical stops.
     play_deg
-        How far the shaft turns, after it has reversed, before what it drives follows.
+        Backlash: angle the shaft turns after a reversal before its load follows.
     """
 
     full_speed_deg_s: float = 1020.0
@@ -44,7 +44,7 @@ class MotorNature:
 
 @dataclass
 class Motor:
-    """Where a motor's shaft is, how fast it turns, and how far it has driven what hangs on it."""
+    """State of a motor: angle and speed of the shaft, and angle of its load."""
 
     nature: MotorNature = field(default_factory=MotorNature)
     angle_deg: float = 0.0
@@ -52,18 +52,18 @@ class Motor:
     driven_deg: float = 0.0
 
     def step(self, seconds: float, power: float, *, brake: bool, battery_mv: float) -> None:
-        """Turn for a short while, much shorter than the time constants.
+        """Simulate a time step, much shorter than the time constants.
 
         Parameters
         ----------
         seconds
-            How long.
+            Length of the step.
         power
             -100 to 100.
         brake
-            At power 0: shorted rather than without current.
+            Whether the motor is shorted at power 0, instead of without current.
         battery_mv
-            What drives it.
+            Voltage of the battery.
         """
         nature = self.nature
         if power or brake:
@@ -71,7 +71,7 @@ class Motor:
             speed = self.speed_deg_s + (asked - self.speed_deg_s) * seconds / nature.driven_s
         else:
             speed = self.speed_deg_s * (1 - seconds / nature.coasting_s)
-        # Dry friction takes speed away whichever way it goes, and never turns it round.
+        # Dry friction reduces the speed towards zero and never reverses it.
         lost = nature.friction_deg_s2 * seconds
         self.speed_deg_s = speed - lost if speed > lost else speed + lost if speed < -lost else 0.0
         low, high = nature.stops_deg

@@ -1,11 +1,11 @@
-"""An output port as the firmware runs it, a millisecond at a time: limits, ramps, regulation, counters.
+"""The firmware's output port, simulated in steps of a millisecond: limits, ramps, regulation, counters.
 
-Written after the behaviour of LEGO's firmware 1.28 to 1.31. What a host has to know of it:
+It reproduces the behaviour of LEGO's firmware 1.28 to 1.31. Important for a host:
 
-- The tacho limit moves a running *goal*, which is where the last limited run should have ended, not where
-  it did. So the overshoot of one run is taken off the next one. A run without a limit draws the goal along.
-- At the limit the port falls idle: power fades by 1 a millisecond and the motor coasts past the limit.
-- Speed regulation acts every 101 ms; one unit of power stands for one count in 100 ms, 10 degrees a second.
+- The tacho limit is added to a running *goal*, where the last limited run should have ended, not where it
+  did. So the overshoot of one run is subtracted from the next. A run without a limit carries the goal along.
+- At the limit the port becomes idle: power decreases by 1 per millisecond and the motor coasts past the limit.
+- Speed regulation acts every 101 ms; one unit of power is one count per 100 ms, 10 degrees per second.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _GAIN_P, _GAIN_I, _GAIN_D = 3, 1, 1
 
 
 class RunState(IntEnum):
-    """What a port is doing."""
+    """Run state of a port."""
 
     IDLE = 0x00
     RAMP_UP = 0x10
@@ -36,7 +36,7 @@ class RunState(IntEnum):
 
 @dataclass(frozen=True)
 class Setting:
-    """What SETOUTPUTSTATE says, in the order of its bytes; a GETOUTPUTSTATE reply begins with it."""
+    """The fields of SETOUTPUTSTATE, in byte order; a GETOUTPUTSTATE reply begins with them."""
 
     power: int = 0
     mode: int = 0
@@ -48,7 +48,7 @@ class Setting:
 
 @dataclass
 class Output:
-    """One port, its motor and the firmware's numbers for it."""
+    """One output port: its motor and the firmware's state."""
 
     motor: Motor = field(default_factory=Motor)
     setting: Setting = field(default_factory=Setting)
@@ -57,9 +57,9 @@ class Output:
     block_count: int = 0
     rotation_count: int = 0
 
-    set_power: int = 0  # where a ramp leads
-    target_power: int = 0  # what it has come to; the speed that is regulated
-    power: int = 0  # what the motor gets
+    set_power: int = 0  # commanded power, the end of a ramp
+    target_power: int = 0  # current point of a ramp, the set point of the speed regulation
+    power: int = 0  # power applied to the motor
     _brake: bool = False
     _regulation: int = 0
     _goal: int = 0
@@ -68,7 +68,7 @@ class Output:
     _moved: int = 0  # counts since the last regulation
     _error: int = 0
     _error_sum: int = 0
-    _ramp_counts: int = 0  # between two steps of a ramp; 0: not worked out yet
+    _ramp_counts: int = 0  # counts between two steps of a ramp; 0: not computed yet
     _ramp_from: int = 0
     _ramp_last: int = 0
     _seen_deg: int = 0
@@ -78,7 +78,7 @@ class Output:
         self._seen_deg = self._shown_deg
 
     def apply(self, setting: Setting) -> None:
-        """Take an order, in the firmware's sequence: speed, then regulation, then limit."""
+        """Apply a command in the firmware's sequence: speed, then regulation, then limit."""
         self.setting, self._settled = setting, False
         self._brake = bool(setting.mode & _BRAKE)
         if setting.mode & _ON:
@@ -101,13 +101,13 @@ class Output:
             self.rotation_count = 0
 
     def report(self) -> tuple[Field, ...]:
-        """Return what GETOUTPUTSTATE says after the port's number."""
+        """Return the fields of a GETOUTPUTSTATE reply after the port's number."""
         s = self.setting
         asked = (s.power, s.mode, s.regulation, s.turn_ratio, self.run_state, s.tacho_limit)
         return (*asked, self.tacho_count, self.block_count, self.rotation_count)
 
     def tick(self, battery_mv: float) -> None:
-        """Let a millisecond pass: the motor turns, the firmware looks and acts."""
+        """Simulate a millisecond of motor and firmware."""
         self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
         seen = self._shown_deg
         turned, self._seen_deg = seen - self._seen_deg, seen
@@ -126,37 +126,37 @@ class Output:
             self._fade()
 
     def regulate(self) -> bool:
-        """Regulate the speed, if the time for it has come, and tell whether it had."""
+        """Regulate the speed if it is due; return whether it was."""
         if self._clock_ms <= _REGULATION_MS:
             return False
         if self._regulation & _SPEED:
             before = (self.power, self._error, self._error_sum)
             self.power = self._regulated(self._error - self._moved + self.target_power)
-            # Held off its place by less than friction lets it move: so it stays.
+            # A remaining error too small to overcome friction: the motor stays.
             self._settled = not self._moved and before == (self.power, self._error, self._error_sum)
         self._clock_ms = self._moved = 0
         return True
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether nothing will happen without an order, or a hand that turns the motor."""
+        """Whether nothing will change without a command or a hand that turns the motor."""
         if self.motor.speed_deg_s or self.target_power or self.set_power or self._seen_deg != self._shown_deg:
             return False
         return self._settled and not self._moved if self._regulation else not self.power
 
     @property
     def is_at_limit(self) -> bool:
-        """Whether a limited run has come to its end."""
+        """Whether a limited run has reached its limit."""
         return not self._endless and self.set_power != 0 and (self.tacho_count - self._goal) * self.set_power >= 0
 
     @property
     def is_synchronised(self) -> bool:
-        """Whether it is to turn in step with another port."""
+        """Whether it is synchronised with another port."""
         return self._regulation & (_SYNC | _SPEED) == _SYNC
 
     @property
     def _shown_deg(self) -> int:
-        """What the motor's encoder shows: whole degrees."""
+        """Reading of the motor's encoder, in whole degrees."""
         return int(self.motor.angle_deg // 1)
 
     def _order(self, run_state: int, power: int) -> None:
@@ -168,7 +168,7 @@ class Output:
             self._regulation = 0
         elif run_state == RunState.RUNNING:
             self.set_power = self.target_power = power
-            if not power:  # hold: from now on, and from here
+            if not power:  # hold the present position
                 self.power = self._clock_ms = self._moved = 0
         elif self._is_past(run_state, power):
             run_state = RunState.RUNNING
@@ -177,13 +177,13 @@ class Output:
         self.run_state = run_state
 
     def _is_past(self, ramp: int, power: int) -> bool:
-        """Tell whether a ramp to this power, up or down, has nothing left to do."""
+        """Whether a ramp to this power, up or down, has already reached it."""
         if ramp == RunState.RAMP_UP:
             return self.set_power != 0 and (self.set_power >= power if power > 0 else self.set_power <= power)
         return self.set_power <= power if self.target_power >= 0 else self.set_power >= power
 
     def _ramp_up(self) -> None:
-        """Raise the power by 1 each so many counts, so as to be there at the limit."""
+        """Raise the power in steps of 1 so that the set power is reached at the limit."""
         sign = 1 if self.set_power > 0 else -1
         if not self.target_power:
             self.target_power = sign * _LEAST_RAMP_POWER
@@ -201,7 +201,7 @@ class Output:
         self._drive_unregulated()
 
     def _ramp_down(self) -> None:
-        """Lower the power by 1 each so many counts, to 10 and no less, until the limit."""
+        """Lower the power in steps of 1, not below 10, until the limit."""
         sign = 1 if self.target_power > 0 else -1
         if not self._ramp_counts:
             steps = abs(self.target_power - self.set_power) - (0 if self.set_power else _LEAST_RAMP_POWER)
@@ -217,7 +217,7 @@ class Output:
         self._drive_unregulated()
 
     def _run(self) -> None:
-        """Look for the limit, or draw the goal along where there is none."""
+        """Check for the limit; without one, carry the goal along."""
         if self._endless:
             if self.target_power:
                 self._goal = self.tacho_count
@@ -230,14 +230,14 @@ class Output:
             self.power = bounded(self.target_power, 100)
 
     def _fade(self) -> None:
-        """Coast: power goes by 1 a millisecond, so that a host sees IDLE well before the motor rests."""
+        """Coast: the power decreases by 1 per millisecond, so a host sees IDLE well before the motor rests."""
         self._brake = False
         self.power -= _sign(self.power)
         self.target_power -= _sign(self.target_power)
         self.set_power -= _sign(self.set_power)
 
     def _regulated(self, error: int) -> int:
-        """Return the power that the firmware's regulator gives for a distance behind its plan, in counts."""
+        """Return the power of the firmware's PID regulator for a position error in counts."""
         steepness, self._error = error - self._error, error
         self._error_sum = bounded(quotient(3 * self._error_sum + error, 4), 800)
         wanted = bounded(_GAIN_P * error, 100) + bounded(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness

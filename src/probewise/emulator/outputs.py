@@ -1,4 +1,4 @@
-"""The three output ports: time for all of them, synchronised pairs, and the commands that reach them."""
+"""The three output ports: simulation in time, synchronised pairs, and the motor commands."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _TICK_S = 1e-3
 
 @dataclass
 class _Step:
-    """What the firmware remembers of a pair that turns in step."""
+    """The firmware's state of a synchronised pair of motors."""
 
-    lead: int = 0  # by how many counts the first is ahead of where the turn ratio wants it
+    lead: int = 0  # counts by which the first is ahead of the position given by the turn ratio
     lead_sum: int = 0
-    turn: int = 0  # counts by which the turn ratio has parted them so far
+    turn: int = 0  # difference in counts demanded by the turn ratio so far
 
     def correct(self, one: Output, two: Output) -> None:
-        """Slow the one that leads and drive the one that lags (P 3, I 1, D 1, over 4)."""
+        """Slow the motor that leads and speed up the one that lags (PID gains 3, 1, 1, over 4)."""
         inner = two if (one.setting.turn_ratio > 0) == (one.target_power >= 0) else one
         self.turn += 2 * quotient(inner.setting.turn_ratio * abs(inner.target_power), 100)
         lead = bounded(one.block_count - two.block_count + self.turn, 500)
@@ -42,7 +42,7 @@ class Outputs:
     Parameters
     ----------
     motors
-        What is plugged in, in this order.
+        The motors at ports A, B, C.
     now_s
         The clock's time.
     """
@@ -58,7 +58,7 @@ class Outputs:
         }
 
     def advance(self, now_s: float, battery_mv: float) -> None:
-        """Let all milliseconds up to now pass."""
+        """Simulate all milliseconds up to now."""
         n_ticks = int((now_s - self._ticked_s) / _TICK_S + 1e-6)
         self._ticked_s += n_ticks * _TICK_S
         for _ in range(n_ticks):
@@ -68,7 +68,7 @@ class Outputs:
             self._tick(moving, battery_mv)
 
     def release(self) -> None:
-        """Let all motors coast, as the start or the end of a program does."""
+        """Let all motors coast, as the start or end of a program does."""
         for port in self.ports:
             port.apply(Setting())
 

@@ -1,4 +1,4 @@
-"""A program that runs on the brick, as far as a host can tell: its name and its mailboxes."""
+"""A program running on the brick, as a host sees it: its name and its mailboxes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _SIZE = 59
 
 
 class Programs:
-    """Start, stop, and swap messages. Every program here does the same: it sends each message back.
+    """Start and stop programs and exchange messages; every emulated program echoes each message.
 
     Parameters
     ----------
     exists
-        Whether there is a program of a name.
+        Whether a program of this name exists.
     on_change
-        What starting or stopping one does to motors and sensors.
+        Called when a program starts or stops, to reset motors and sensors.
     """
 
     def __init__(self, exists: Callable[[str], bool], on_change: Callable[[], None]) -> None:

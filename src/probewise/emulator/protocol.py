@@ -1,7 +1,7 @@
-"""The brick's side of LEGO's Bluetooth protocol: requests taken apart, replies put together.
+"""The brick's side of LEGO's Bluetooth protocol: parsing requests and building replies.
 
-Layouts follow LEGO's direct and system commands; all numbers are little-endian. A frame on the wire
-is the length of a telegram in two bytes, then the telegram.
+Layouts follow LEGO's direct and system commands; all numbers are little-endian. A frame is the
+length of a telegram in two bytes, then the telegram.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _DIRECT, _SYSTEM = 0x00, 0x01
 
 
 class Status(IntEnum):
-    """The status bytes that this brick answers with."""
+    """Status bytes of this brick's replies."""
 
     OK = 0x00
     BUS_PENDING = 0x20
@@ -50,7 +50,7 @@ class Status(IntEnum):
 
 
 class Refused(Exception):
-    """Carry a status other than OK; `payload` None stands for zeros at the command's full length."""
+    """A status other than OK; `payload` None means zeros at the command's full length."""
 
     def __init__(self, status: Status, payload: bytes | None = None) -> None:
         self.status, self.payload = status, payload
@@ -59,10 +59,10 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Command:
-    """How one command's telegram goes on after the opcode, and its error reply after the status.
+    """Layout of a command's telegram after the opcode, and length of its error reply after the status.
 
-    `layout` is that of `struct`; with `more` any bytes follow and come as the last field. `error_bytes`
-    zeros follow the status of an error, as the firmware sends them.
+    `layout` is a `struct` format; with `more`, any further bytes are the last field. After the status of an
+    error follow `error_bytes` zeros, as in the firmware.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Command:
     more: bool = False
 
     def fields(self, body: bytes) -> tuple[Field, ...]:
-        """Take the bytes after the opcode apart.
+        """Parse the bytes after the opcode.
 
         Raises
         ------
@@ -134,7 +134,7 @@ COMMANDS: dict[int, Command] = {
 
 @dataclass(frozen=True)
 class Request:
-    """One telegram from the host; `command` is None where the opcode is unknown."""
+    """One telegram from the host; `command` is None for an unknown opcode."""
 
     opcode: int
     wants_reply: bool
@@ -143,42 +143,42 @@ class Request:
 
 
 def parse(telegram: bytes) -> Request | None:
-    """Take a telegram apart; None for what the firmware passes over: replies, unknown types, stumps."""
+    """Parse a telegram; None for those the firmware ignores: replies, unknown types, incomplete ones."""
     if len(telegram) < 2:
         return None
     kind, opcode = telegram[0] & ~_NO_REPLY, telegram[1]
     if kind not in (_DIRECT, _SYSTEM):
         return None
-    # Direct opcodes are below 0x80, system opcodes are not: one asked for as the other is unknown.
+    # Direct opcodes are below 0x80, system opcodes above; sent with the wrong type they are unknown.
     command = COMMANDS.get(opcode) if (kind == _SYSTEM) == (opcode >= 0x80) else None
     return Request(opcode, not telegram[0] & _NO_REPLY, command, telegram[2:])
 
 
 def reply(opcode: int, status: int, payload: bytes = b"") -> bytes:
-    """Put a reply telegram together."""
+    """Build a reply telegram."""
     return bytes((_REPLY, opcode, status)) + payload
 
 
 def framed(telegram: bytes) -> bytes:
-    """Put the length in front, as Bluetooth has it and USB has not."""
+    """Prepend the length, as Bluetooth requires (USB does not)."""
     return struct.pack("<H", len(telegram)) + telegram
 
 
-_PATIENCE_S = 0.61  # after so long a silence the firmware gives a half frame up
+_PATIENCE_S = 0.61  # the firmware discards an incomplete frame after this silence
 
 
 @dataclass
 class Frames:
-    """Collect bytes as they come, in any pieces, and give back whole telegrams."""
+    """Collect bytes in pieces of any size into whole telegrams."""
 
     _held: bytearray = field(default_factory=bytearray)
     _last_s: float = 0.0
 
     def feed(self, received: bytes, now_s: float) -> Iterator[bytes]:
-        """Yield every telegram that is complete now."""
+        """Add bytes and yield every telegram that is complete."""
         if now_s - self._last_s > _PATIENCE_S:
             self._held.clear()
-        if received:  # looking for bytes that have not come is silence too
+        if received:  # a call without bytes does not end the silence
             self._last_s = now_s
         self._held += received
         while len(self._held) >= 2:

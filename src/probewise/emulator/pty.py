@@ -1,4 +1,4 @@
-"""The link as a serial device: a pseudo-terminal that behaves like /dev/rfcomm0."""
+"""The emulated link as a serial device: a pseudo-terminal that behaves like /dev/rfcomm0."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Terminal:
     Parameters
     ----------
     link
-        A symbolic link to keep on it, which outlives disconnections as /dev/rfcomm0 does; None: none.
+        A symbolic link to the terminal that survives disconnections, as /dev/rfcomm0 does; None for none.
 
     Raises
     ------
     FileError
-        If something other than a symbolic link is in the way.
+        If the path exists and is not a symbolic link.
     """
 
     def __init__(self, link: Path | None = None) -> None:
@@ -49,26 +49,26 @@ class Terminal:
 
     @property
     def path(self) -> str:
-        """Where clients open it."""
+        """Path at which clients open it."""
         return self._slave_path if self._link is None else str(self._link)
 
     def hang_up(self) -> None:
-        """End the connection, so that clients find the device gone, and come back as a new one."""
+        """End the connection, so that clients lose the device, and open a new one."""
         self._close()
         self._open()
 
     def read(self, wait_s: float) -> bytes:
-        """Return what a client has written, waiting for it no longer than this."""
+        """Return what a client has written, waiting at most `wait_s`."""
         ready, _, _ = select.select([self._master], [], [], wait_s)
         return os.read(self._master, 4096) if ready else b""
 
     def write(self, data: bytes) -> None:
-        """Hand bytes over in one piece, for a client may take each read for a frame; lost if it never reads."""
+        """Write bytes in one piece, since a client may take each read for a frame; lost if it never reads."""
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 
     def _open(self) -> None:
-        # The slave stays open here too: without it the master fails as soon as the last client leaves.
+        # The slave stays open here too: otherwise the master fails when the last client leaves.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -91,18 +91,18 @@ def serve(
     on_move: Callable[[str], None],
     meanwhile: Callable[[], None],
 ) -> None:
-    """Carry bytes between client and brick until the brick goes to sleep.
+    """Pass bytes between client and brick until the brick goes to sleep.
 
     Parameters
     ----------
     terminal, radio
-        What is joined.
+        The terminal and the link to connect.
     clock
-        The brick's clock, which must be the wall's.
+        The brick's clock, which must run in real time.
     on_move
-        Told the device's new path where a disconnection has changed it.
+        Called with the device's new path if a disconnection has changed it.
     meanwhile
-        Called again and again, at least every 50 ms.
+        Called repeatedly, at least every 50 ms.
     """
     while not radio.brick.is_off:
         due_s = radio.next_s

@@ -1,7 +1,7 @@
-"""The Bluetooth link as the host meets it: frames in, replies out when their time has come, mishaps on the way.
+"""The Bluetooth link as seen by the host: it takes frames, delivers replies at their time, and injects faults.
 
-Nothing here waits: bytes carry the time at which they reach the host, and whoever runs the link, a
-pseudo-terminal or a test with a clock of its own, hands them over then.
+Nothing here waits: bytes carry the time at which they reach the host, and the caller, a pseudo-terminal or a
+test with a virtual clock, delivers them then.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ __all__ = ["Event", "Radio", "Trace", "no_trace"]
 
 Event: TypeAlias = Literal[">", "<", "!"]
 Trace: TypeAlias = Callable[[float, Event, str], None]
-"""Called with the time in s, what happened (a telegram to the brick, one from it, a mishap) and its text."""
+"""Called with the time in s, the event (> telegram to the brick, < telegram from it, ! fault) and its text."""
 
-_TURNAROUND_S = 0.060  # the radio turns from receiving to sending and back
+_TURNAROUND_S = 0.060  # time of the radio to switch between receiving and sending
 _PIECE_S = 0.03
 _DOUBLED_S = 0.1
 _STATUSES = (Status.UNDEFINED_ERROR, Status.MALFORMED, Status.OUT_OF_RANGE, Status.NO_ROOM)
@@ -41,24 +41,24 @@ class Radio:
     Parameters
     ----------
     brick
-        Who answers.
+        The brick.
     clock
         The brick's clock.
     rng
-        Where mishaps come from.
+        Source of randomness for the faults.
     faults
-        How often.
+        Rates of the faults.
     turnaround_s
-        From the end of a request to its reply.
+        Time from the end of a request to its reply.
     trace
-        Where a record goes.
+        Function that records telegrams and faults.
 
     Attributes
     ----------
     faults
-        Another value may be put here at any time.
+        May be replaced at any time.
     mishaps
-        How often each has befallen the link.
+        Number of occurrences of each fault.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Radio:
         self.reconnect()
 
     def reconnect(self) -> None:
-        """Begin a new connection: what was under way is lost, the brick is as it was."""
+        """Begin a new connection: bytes under way are lost, the brick's state is kept."""
         self._frames = Frames()
         self._coming: deque[tuple[float, bytes]] = deque()
         self._held = b""  # a reply that waits for the next one
@@ -87,16 +87,16 @@ class Radio:
 
     @property
     def is_open(self) -> bool:
-        """Whether the link stands; a mishap or the brick's sleep ends it."""
+        """Whether the link is open; a fault or the brick's sleep closes it."""
         return not self._ended and not self.brick.is_off
 
     @property
     def next_s(self) -> float | None:
-        """When the next bytes reach the host, None where nothing is on its way."""
+        """Time at which the next bytes reach the host, None if there are none."""
         return self._coming[0][0] if self._coming else None
 
     def send(self, data: bytes) -> None:
-        """Take bytes from the host, in any pieces; what comes at once may be cut at its end."""
+        """Take bytes from the host, in pieces of any size; a fault may cut off the end of a piece."""
         if len(data) > 1 and self._happens("half", self.faults.half / 2):
             data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
@@ -138,7 +138,7 @@ class Radio:
             self._deliver(at_s + self._rng.uniform(0.0, _DOUBLED_S), frame)
 
     def _refusal(self, telegram: bytes) -> bytes | None:
-        """Return a refusal of a request that the brick never sees."""
+        """Return an error reply to a request, without passing it to the brick."""
         request = parse(telegram)
         if request is None or not request.wants_reply:
             return None
@@ -146,7 +146,7 @@ class Radio:
         return reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
 
     def _harmed(self, frame: bytes) -> bytes:
-        """Return what is left of a frame on its way to the host."""
+        """Apply faults to a frame on its way to the host."""
         if self._happens("corrupt", self.faults.corrupt):
             at, change = int(self._rng.integers(len(frame))), int(self._rng.integers(1, 256))
             frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
@@ -162,7 +162,7 @@ class Radio:
         return [frame[begin:end] for begin, end in pairwise(cuts)]
 
     def _deliver(self, at_s: float, data: bytes) -> None:
-        """Put bytes on their way; none overtakes another, so a late reply holds up those after it."""
+        """Schedule bytes in order: a late reply delays those after it."""
         self._last_s = max(at_s, self._last_s)
         self._coming.append((self._last_s, data))
 

@@ -1,4 +1,4 @@
-"""What lies on the field, read from a text such as `circle:524,300,100`."""
+"""Scenes on the field, parsed from texts such as `circle:524,300,100`."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FORMS = (
     "corner:X,Y,DX,DY",
     "uniform:ALBEDO",
 )
-"""How a scene is written; mm and degrees. White is inside, at the edge's far side, or towards DX, DY = +1 or -1."""
+"""Forms of a scene; mm and degrees. White is inside, beyond the edge, or towards DX, DY = +1 or -1."""
 
 
 def parse_scene(text: str) -> Surface:
-    """Read a scene in one of its forms.
+    """Parse a scene in one of its forms.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What may be plugged into an input port: it gives a voltage, or it speaks I2C."""
+"""Sensors for an input port: analog ones, and digital ones with I2C."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ AD_MAX = 1023
 
 
 class Analog(Protocol):
-    """A sensor that makes a voltage."""
+    """A sensor with a voltage output."""
 
     def counts(self, *, lit: bool) -> int:
-        """Return the voltage as the converter sees it, 0 to 1023 of 5 V; `lit`: the port feeds the LED."""
+        """Return the output of the AD converter, 0 to 1023 for 0 to 5 V; `lit`: whether the LED is on."""
         ...
 
 
 @dataclass(frozen=True)
 class NothingAnalog:
-    """An empty socket: the pull-up resistor alone."""
+    """An empty port: the pull-up resistor alone."""
 
     def counts(self, *, lit: bool) -> int:
         """Return the full voltage."""
@@ -32,14 +32,14 @@ class NothingAnalog:
 
 @dataclass
 class Light:
-    """The light sensor 9844: the more light, the lower the voltage.
+    """The light sensor 9844: more light gives a lower voltage.
 
     Parameters
     ----------
     seen
-        What the firmware's scale 0 to 100 would show if it had no steps, LED on or off.
+        Unrounded reading on the firmware's scale 0 to 100, with the LED on or off.
     clock
-        The converter takes a new sample every 3 ms of it.
+        Time in seconds; the converter takes a new sample every 3 ms.
     """
 
     seen: Callable[[bool], float]
@@ -47,7 +47,7 @@ class Light:
     _sample: tuple[int, bool, int] = field(default=(-1, False, AD_MAX))
 
     def counts(self, *, lit: bool) -> int:
-        """Return the sample that stands in the converter."""
+        """Return the converter's current sample."""
         number = int(self.clock() / 0.003)
         if self._sample[:2] != (number, lit):
             self._sample = (number, lit, _counts_of(self.seen(lit)))
@@ -55,7 +55,7 @@ class Light:
 
 
 def _counts_of(percent: float) -> int:
-    """Turn the firmware's conversion round: 0 % lies at 896 counts, 100 % at 200, and it runs on to both sides."""
+    """Invert the firmware's conversion: 0 % is 896 counts, 100 % is 200, extrapolated on both sides."""
     return min(max(round(200 + 68 / 100 * (AD_MAX - percent * AD_MAX / 100)), 0), AD_MAX)
 
 
@@ -67,7 +67,7 @@ class Digital:
     registers: dict[int, bytes]
 
     def transfer(self, written: bytes, wanted: int) -> bytes | None:
-        """Answer a write of address, register and data; None where nobody acknowledges."""
+        """Answer a write of address, register and data; None without an acknowledgement."""
         if len(written) < 2 or written[0] & 0xFE != self.address:
             return None
         begin = written[1]
@@ -77,7 +77,7 @@ class Digital:
 
 
 def sonar(distance_cm: int) -> Digital:
-    """Make an ultrasonic sensor that stands before a wall."""
+    """Make an ultrasonic sensor at a distance from a wall."""
     version, maker, kind = b"V1.0".ljust(8, b"\0"), b"LEGO".ljust(8, b"\0"), b"Sonar".ljust(8, b"\0")
     heads = {0x00: version, 0x08: maker, 0x10: kind, 0x14: b"10E-2m\0", 0x41: b"\x02", 0x42: bytes((distance_cm,))}
     return Digital(0x02, heads)

@@ -1,4 +1,4 @@
-"""What a person at the bench changes by hand: what lies on the field, and how the sensor is turned in its mount."""
+"""Manual changes at the bench: the surface on the field, and the sensor's rotation in its mount."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["Table"]
 
 @dataclass
 class Table:
-    """The surface under the sensor, and by how much somebody has turned the sensor from where the geometry has it."""
+    """The surface under the sensor, and the sensor's rotation from the geometry's mounting."""
 
     surface: Surface
     turned_rad: float = 0.0
 
     def obey(self, wish: str) -> None:
-        """Do what a line says: a scene in one of its forms, or `turn DEGREES` for the sensor.
+        """Execute a line: a scene in one of its forms, or `turn DEGREES` for the sensor.
 
         Raises
         ------
         ParameterError
-            If it says neither; nothing changes then.
+            If it is neither; nothing changes then.
         """
         verb, _, angle = wish.strip().partition(" ")
         try:

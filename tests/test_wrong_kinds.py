@@ -251,7 +251,7 @@ MISTAKES = {
         lambda: run(Bell(lambda theta: -abs(theta[2])), rng=RNG, n_live=20),
         r"theta is a batch of shape|a batch theta of shape \(20, 2\)",
     ),
-    "a text as likelihood": (lambda: run(Bell(lambda theta: "high"), rng=RNG), "what are no numbers"),
+    "a text as likelihood": (lambda: run(Bell(lambda theta: "high"), rng=RNG), "something other than numbers"),
     "live points in quotes": (lambda: run(Bell(), rng=RNG, n_live="100"), "n_live is '100'; allowed: a whole number"),
     "no live point": (lambda: run(Bell(), rng=RNG, n_live=0), "n_live is 0; allowed: 10 or more"),
     "a bar of nested sampling": (lambda: run(Bell(), rng=RNG, progress=True), "progress is True; allowed: a function"),

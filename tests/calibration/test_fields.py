@@ -67,7 +67,7 @@ def test_numbering_by_mass_puts_the_heavier_gaussian_first_and_keeps_the_field()
 
 
 def test_weights_that_do_not_match_and_pixels_of_no_size_are_refused() -> None:
-    with pytest.raises(ShapeError, match="one a sample"):
+    with pytest.raises(ShapeError, match="one per sample"):
         mean_field(ONE, 1, weight=np.ones(3))
     with pytest.raises(ParameterError, match="pixel_mm"):
         mean_field(ONE, 1, pixel_mm=0.0)

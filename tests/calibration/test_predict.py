@@ -150,7 +150,7 @@ def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_senso
 
 
 def test_readings_that_do_not_match_the_plan_are_refused(sensor: FittedSensor) -> None:
-    with pytest.raises(ShapeError, match="one a row"):
+    with pytest.raises(ShapeError, match="one per row"):
         predict(sensor, _disc_plan(), np.zeros(3))
 
 

@@ -152,7 +152,7 @@ def test_a_sensor_must_hold_together(sensor: FittedSensor) -> None:
         replace(sensor, samples=sensor.samples[:100], noise_sd=sensor.noise_sd[:100])
     with pytest.raises(ShapeError, match="samples have shape"):
         replace(sensor, samples=sensor.samples[:, :7])
-    with pytest.raises(ShapeError, match="one a sample"):
+    with pytest.raises(ShapeError, match="one per sample"):
         replace(sensor, noise_sd=sensor.noise_sd[:9])
     with pytest.raises(ParameterError, match="greater than 0"):
         replace(sensor, noise_sd=-sensor.noise_sd)

@@ -137,7 +137,7 @@ def test_arrays_of_other_lengths_are_refused(result: NestedResult) -> None:
     for name in ("label", "birth_label", "n_at_death", "log_weight"):
         with pytest.raises(ShapeError, match=rf"{name} has shape \(1,\).*one per row of theta"):
             dataclasses.replace(result, **{name: np.ones(1, dtype=int)})
-    with pytest.raises(ShapeError, match=r"insertion_n_ranked.*one an inserted point"):
+    with pytest.raises(ShapeError, match=r"insertion_n_ranked.*one per inserted point"):
         dataclasses.replace(result, insertion_n_ranked=np.ones(1, dtype=int))
 
 

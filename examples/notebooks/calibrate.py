@@ -25,7 +25,7 @@ calibration.sensor
 calibration.chosen.result
 
 # %%
-# Predictions: chi-square a reading should be near one.
+# Predictions: chi-square per reading should be near one.
 prediction = predict(calibration.sensor, recording.plan, recording.readings)
 z = (recording.readings - prediction.mean) / prediction.sd
-print(f"chi-square a reading {np.mean(z**2):.2f}")
+print(f"chi-square per reading {np.mean(z**2):.2f}")

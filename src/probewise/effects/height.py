@@ -49,7 +49,7 @@ class HeightGradient(NamedEffect[Footprint]):
         return Product({"mm_per_mm": HeavyTailed(self.typical)})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Widen and dim the footprint along X."""
+        """Scale and dim the footprint by the height at each X."""
         return raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
 
     def bank(self) -> FloatArray:

@@ -92,7 +92,7 @@ class Journal:
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """The readings in the order of taking."""
+        """The readings in the order they were taken."""
         return tuple(entry.reading for entry in self.entries)
 
     def recording(
@@ -114,7 +114,7 @@ def recording_of(
     Parameters
     ----------
     readings
-        In the order of taking.
+        In the order they were taken.
     patterns
         What lay on the field, {"field": ...}, where it is known; a hypothesis takes its place otherwise.
     instrumentation

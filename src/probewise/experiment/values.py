@@ -156,7 +156,7 @@ class Exploration(ShowsItself):
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """The readings in the order of taking."""
+        """The readings in the order they were taken."""
         return tuple(step.reading for step in self.steps)
 
     @property

@@ -106,7 +106,7 @@ def sections(
                 ),
                 figure(
                     drawn["residuals.png"],
-                    "Standardised residuals in the order of taking; 95 % should lie between the dashed lines.",
+                    "Standardised residuals in the order they were taken; 95 % should lie between the dashed lines.",
                 ),
             ),
         ),

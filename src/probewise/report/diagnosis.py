@@ -103,7 +103,7 @@ def _first_caption(diagnosis: Diagnosis) -> str:
     shown = shown_first(diagnosis)
     bars = "Below: the possible explanations with their probabilities."
     if shown == "readings":
-        return "The readings in the order of taking. Below: prior probabilities; these readings do not change them."
+        return "The readings in the order taken. Below: prior probabilities; these readings do not change them."
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = ", blue squares the repaired model" if diagnosis.repair.changes_predictions else ""

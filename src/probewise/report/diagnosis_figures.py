@@ -127,7 +127,7 @@ def _along(diagnosis: Diagnosis, chance: Chance, witness: Witness, *, after: boo
 
 
 def _side_by_side(at: FloatArray) -> FloatArray:
-    """Spread the rows of each value evenly over its place, in the order of taking, (n_points,)."""
+    """Spread the rows of each value evenly over its place, in the order they were taken, (n_points,)."""
     out = np.full(at.shape, np.nan)
     for k, value in enumerate(np.unique(at[np.isfinite(at)])):
         rows = np.flatnonzero(at == value)

@@ -15,7 +15,7 @@ __all__ = ["Rows"]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """One row a reading, in the order of taking.
+    """One row per reading, in the order they were taken.
 
     Parameters
     ----------

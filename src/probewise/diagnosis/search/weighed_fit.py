@@ -105,5 +105,5 @@ def in_vocabulary(noise: Names) -> Names:
 
 
 def out_of_vocabulary(mean: Names) -> Names:
-    """Keep those of a combination on the mean that have a formula and no name in the vocabulary."""
+    """Select the effects on the mean that are outside the vocabulary."""
     return tuple(name for name in mean if is_out_of_vocabulary(name))

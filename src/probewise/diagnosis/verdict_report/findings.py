@@ -200,7 +200,7 @@ def parameters_of(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tu
 
 
 def _scans(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
-    """Give the numbers of the scans that an effect is bound to, from 0 in order of taking; its sentence names them."""
+    """Return the numbers, from 0, of the scans to which an effect is restricted; its sentence names them."""
     numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
     return (_parameter("scans", "scan", numbers),) if numbers.size else ()
 

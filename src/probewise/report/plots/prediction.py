@@ -106,7 +106,7 @@ def _draw_alone(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray
 
 
 def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
-    """Draw standardised residuals in the order of taking; 95 % should lie between the dashed lines.
+    """Draw standardised residuals in the order they were taken; 95 % should lie between the dashed lines.
 
     Parameters
     ----------

@@ -151,7 +151,7 @@ def one_scan(
 
 
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
-    """Draw readings in the order of taking: all that there is to see of a few."""
+    """Draw readings in the order they were taken: all that there is to see of a few."""
     require_recording(recording)
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)

@@ -36,7 +36,7 @@ def residuals_by_scan(
     before, after
         Predicted readings by the calibrated and by the repaired model, (n_points,).
     most
-        How many scans are drawn: those that the repair changes most, in the order of taking.
+        How many scans are drawn: those that the repair changes most, in the order they were taken.
     columns
         How many stand side by side.
 

@@ -54,7 +54,7 @@ class Setting:
         )
 
     def mounting_of(self, scan: str) -> tuple[str, ...]:
-        """Return the names of all scans that share this one's orientation, in order of taking."""
+        """Return the names of all scans that share this one's orientation, in the order they were taken."""
         first = {name: rows[0] for name, rows in zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)}
         turn = self.plan.orientation_rad
         return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])

@@ -249,10 +249,10 @@ def _fit_order(
     if n_usable < 6 * n_gaussians + 2:
         notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the result depends on the prior",)
         warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
-    belief = prior(recording, n_gaussians)
-    problem = problem_for(recording, belief, data_sets=data_sets)
-    told = None if progress is None else _told(progress, n_gaussians)
-    result = run(problem, rng=rng, n_live=n_live, progress=told, max_cost=1.0, return_interrupted=False)
+    order_prior = prior(recording, n_gaussians)
+    problem = problem_for(recording, order_prior, data_sets=data_sets)
+    report = None if progress is None else _for_order(progress, n_gaussians)
+    result = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
     refined = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
     if apart > _DISAGREE and set(refined.doubts) <= set(refined.inherited):
@@ -271,10 +271,10 @@ def _fit_order(
         notes=notes,
         rng=rng,
     )
-    return OrderFit(n_gaussians, belief, result, refined, sensor)
+    return OrderFit(n_gaussians, order_prior, result, refined, sensor)
 
 
-def _told(progress: Callable[[int, RoundSummary], None], n_gaussians: int) -> Callable[[RoundSummary], None]:
+def _for_order(progress: Callable[[int, RoundSummary], None], n_gaussians: int) -> Callable[[RoundSummary], None]:
     return lambda state: progress(n_gaussians, state)
 
 

@@ -110,7 +110,7 @@ class Inputs:
     def _bus_status(self, number: int) -> bytes:
         port = self._port(number)
         status, ready = self._bus(port)
-        return _told(status, bytes((len(ready),)))
+        return _checked_status(status, bytes((len(ready),)))
 
     def _bus_write(self, number: int, n_written: int, n_wanted: int, written: bytes) -> bytes:
         port = self._port(number)
@@ -130,7 +130,7 @@ class Inputs:
         status, ready = self._bus(port)
         if status == Status.OK:
             port.answer = b""
-        return _told(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
+        return _checked_status(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
 
     def _bus(self, port: _Port) -> tuple[Status, bytes]:
         """Return the status of the bus and the bytes to read."""
@@ -146,7 +146,7 @@ class Inputs:
         return self._ports[number]
 
 
-def _told(status: Status, payload: bytes) -> bytes:
+def _checked_status(status: Status, payload: bytes) -> bytes:
     if status != Status.OK:
         raise Refused(status, payload)
     return payload

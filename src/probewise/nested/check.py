@@ -100,7 +100,7 @@ def checked(
         budget = min(budget, max_calls)
     spent = first.n_calls
 
-    def ask(route: _Route) -> NestedResult | None:
+    def estimated(route: _Route) -> NestedResult | None:
         """Run a second estimate; None where it would exceed the budget."""
         nonlocal spent
         left = int(budget - spent)
@@ -114,23 +114,23 @@ def checked(
         spent += found.n_calls
         return found if found.complete else None
 
-    now, answers = first, list[NestedResult]()
+    now, estimates = first, list[NestedResult]()
     try:
         route = _second_route(now, problem, move, least_live, rng)
-        answers = [] if (found := ask(route)) is None else [found]
-        if not answers:
+        estimates = [] if (found := estimated(route)) is None else [found]
+        if not estimates:
             return replace(first, n_calls=spent)
         sharper = replace(route, n_live=max(route.n_live, now.n_live))
-        if _suspicious(now, answers, _APART) and (found := ask(sharper)) is not None:
-            answers = [found] if _doubtful(answers[0]) else [*answers, found]
-        if _suspicious(now, answers, DISAGREE):
-            again = ask(_Route(problem, now.n_live, _longer(move), "the run again"))
-            if again is not None and not again.warnings and not _suspicious(again, answers, DISAGREE):
+        if _suspicious(now, estimates, _APART) and (found := estimated(sharper)) is not None:
+            estimates = [found] if _doubtful(estimates[0]) else [*estimates, found]
+        if _suspicious(now, estimates, DISAGREE):
+            again = estimated(_Route(problem, now.n_live, _longer(move), "the run again"))
+            if again is not None and not again.warnings and not _suspicious(again, estimates, DISAGREE):
                 now = again
     except _FailedError as error:
         note = f"the second pass, which checks the evidence, failed: {error}"
         return replace(now, n_calls=spent, warnings=(*now.warnings, note))
-    return _told(now, route.name, answers, spent)
+    return _with_check(now, route.name, estimates, spent)
 
 
 class _FailedError(Exception):
@@ -173,8 +173,8 @@ def _longer(move: Move) -> Move:
     return move.longer() if isinstance(move, SliceMove) else SliceMove().longer()
 
 
-def _doubtful(answer: NestedResult) -> bool:
-    return bool(answer.warnings) or answer.memory > _MOST_MEMORY
+def _doubtful(estimate: NestedResult) -> bool:
+    return bool(estimate.warnings) or estimate.memory > _MOST_MEMORY
 
 
 def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
@@ -183,25 +183,25 @@ def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _together(answers: list[NestedResult]) -> tuple[float, float]:
-    return weighted_mean([a.log_z for a in answers], [a.log_z_error for a in answers])
+def _combined(estimates: list[NestedResult]) -> tuple[float, float]:
+    return weighted_mean([a.log_z for a in estimates], [a.log_z_error for a in estimates])
 
 
-def _distance(run: NestedResult, answers: list[NestedResult]) -> float:
+def _distance(run: NestedResult, estimates: list[NestedResult]) -> float:
     """Difference of the two estimates in combined standard errors."""
-    log_z, error = _together(answers)
+    log_z, error = _combined(estimates)
     return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
 
-def _suspicious(run: NestedResult, answers: list[NestedResult], most: float) -> bool:
-    return abs(_distance(run, answers)) > most or _doubtful(answers[-1])
+def _suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -> bool:
+    return abs(_distance(run, estimates)) > most or _doubtful(estimates[-1])
 
 
-def _told(now: NestedResult, name: str, answers: list[NestedResult], spent: int) -> NestedResult:
+def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], spent: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
-    log_z, error = _together(answers)
-    distance = _distance(now, answers)
-    check = Check(name, log_z, error, distance, sum(answer.n_calls for answer in answers))
+    log_z, error = _combined(estimates)
+    distance = _distance(now, estimates)
+    check = Check(name, log_z, error, distance, sum(estimate.n_calls for estimate in estimates))
     warnings = now.warnings
     if abs(distance) > DISAGREE:
         warnings = (
@@ -210,8 +210,8 @@ def _told(now: NestedResult, name: str, answers: list[NestedResult], spent: int)
             f"{abs(distance):.1f} errors apart; chains are too short or a part of the posterior was lost; "
             "use a greater steps_per_param, more n_live, or a greater max_cost",
         )
-    elif _doubtful(answers[-1]):
-        why = answers[-1].warnings[0] if answers[-1].warnings else f"its memory is {answers[-1].memory:.1f}"
+    elif _doubtful(estimates[-1]):
+        why = estimates[-1].warnings[0] if estimates[-1].warnings else f"its memory is {estimates[-1].memory:.1f}"
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
         # A poorly known share of possible hypotheses no longer matters once a second estimate agrees.

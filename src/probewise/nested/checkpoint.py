@@ -121,13 +121,13 @@ def settings_of(
         "names": list(names),
         "n_live": n_live,
         "n_replaced": n_replaced,
-        "move": _told(move),
-        "stop": _told(stop),
+        "move": _description(move),
+        "stop": _description(stop),
         "seed_state": seed_state,
     }
 
 
-def _told(value: object) -> str:
+def _description(value: object) -> str:
     if not is_dataclass(value):
         return str(getattr(value, "__qualname__", type(value).__qualname__))
     # A function's memory address differs between processes.

@@ -36,7 +36,7 @@ _MOST_FITTED = 2000
 _SURPRISED = 0.01
 _FIRST = 0.75
 _MOST_LOST = 0.2
-_HELD_BACK = 1 / 3
+_HELD_OUT = 1 / 3
 _MOST_HELD = 1000
 _BRIDGE_STEPS = 20
 # Draws whose log Z is this many errors from that of the refined run disagree with it.
@@ -102,7 +102,7 @@ class Weighted(ShowsItself):
         """Reasons not to trust the error, in words; empty if there are none."""
         if self.run is not None:
             return ()
-        told = (
+        reasons = (
             (not self.pareto_k < _MOST_K, f"Pareto k of the weights is {self.pareto_k:.2f}, not below {_MOST_K}"),
             (not self.n_eff >= _FEW_EFFECTIVE, f"only {self.n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
             (not self.missed < _MOST_LOST, f"the draws miss {100 * self.missed:.0f} % of the posterior"),
@@ -111,7 +111,7 @@ class Weighted(ShowsItself):
                 f"{100 * self.lost:.0f} % of the posterior may be lost: too few live points for its parts",
             ),
         )
-        return (*(words for so, words in told if so), *self.inherited)
+        return (*(words for so, words in reasons if so), *self.inherited)
 
     @property
     def weight(self) -> FloatArray:
@@ -213,22 +213,23 @@ def refine(
     if n_pilots < 1:
         raise ParameterError("n_pilots", n_pilots, "1 or more")
     space = unbounded(problem.prior)
-    lines = _lines(result)
-    fitted, held = _parted(result, lines, space, rng)
+    n_lineages = _n_lineages(result)
+    fitted, held = _split(result, n_lineages, space, rng)
     known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_proposals(np.concatenate(known), rng=rng)
         pilots = [
-            _weigh(p, 0.0, _Held.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals
+            _sample(p, 0.0, _HeldOut.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
+            for p in proposals
         ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
-        told = pilots[first]
+        better = pilots[first]
         # The other form keeps a share: it may cover what the better one does not.
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
-        if told.n_eff > 2 * len(evaluate.names):
-            known.append(_to_fit(told.theta, told.log_weight, space, rng))
-    found = _with_lost(_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), lines, space, rng)
+        if better.n_eff > 2 * len(evaluate.names):
+            known.append(_resampled_for_fit(better.theta, told.log_weight, space, rng))
+    found = _with_lost(_sample(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng)
     return replace(found, inherited=_inherited(found, result))
 
 
@@ -300,9 +301,11 @@ def update(
     log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
     n_eff, k = n_effective(log_weight), math.inf
     if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
-        proposal = fit_proposals(_to_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng)[-1]
-        found = _weigh(proposal, prior_share, _Held.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
-        found = _with_lost(found, _lines(previous) * n_eff / len(rows), space, rng)
+        proposal = fit_proposals(
+            _resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
+        )[-1]
+        found = _sample(proposal, prior_share, _HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
+        found = _with_lost(found, _n_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
         k = found.pareto_k
@@ -322,7 +325,7 @@ def update(
 
 
 @dataclass(frozen=True, eq=False)
-class _Held:
+class _HeldOut:
     """Posterior samples held out from the fit, and their effective number.
 
     `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,).
@@ -334,34 +337,34 @@ class _Held:
     n_independent: float
 
     @classmethod
-    def nothing(cls) -> _Held:
+    def nothing(cls) -> _HeldOut:
         """Hold out nothing."""
         return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
 
 
-def _lines(found: Posterior) -> float:
+def _n_lineages(found: Posterior) -> float:
     """Effective number of independent samples for the shares of a posterior's parts.
 
     Many samples of a run descend from one live point: ln Z of a part followed by n live points has the error
     sqrt(H memory / n), where a share estimated from n independent samples has the relative error 1 / sqrt(n).
     """
     if isinstance(found, Weighted):
-        return found.n_eff if found.run is None else _lines(found.run)
+        return found.n_eff if found.run is None else _n_lineages(found.run)
     return found.n_live / max(found.information * found.memory, 1.0)
 
 
-def _parted(found: Posterior, lines: float, space: Space, rng: np.random.Generator) -> tuple[FloatArray, _Held]:
+def _split(found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator) -> tuple[FloatArray, _HeldOut]:
     """Split samples at random into those for fitting a density, (n, n_params), and held-out ones."""
-    lot = rng.random(len(found.theta)) < _HELD_BACK
+    lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
     rows = chosen[resampled(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
-    held = _Held(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_BACK * lines)
-    return _to_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
+    held = _HeldOut(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
+    return _resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 
-def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
+def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
     """Resample for fitting a density: about the effective sample size, so that few samples are repeated.
 
     A third more is drawn with the square root of the weights: a proposal must have wider tails than
@@ -373,21 +376,21 @@ def _to_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.ran
     return space.enter(theta[np.unique(np.concatenate(rows))])
 
 
-def _with_lost(found: Weighted, lines: float, space: Space, rng: np.random.Generator) -> Weighted:
-    """Add to the error the share of the posterior that a run of `lines` effective samples may have lost."""
+def _with_lost(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
+    """Add to the error the share of the posterior that a run of `n_lineages` effective samples may have lost."""
     if not found.n_eff > 1:
         return found
     n = int(min(found.n_eff, 1000))
     parts = find_parts(space.enter(found.theta[np.unique(found.rows(n, rng=rng))]))
     share = parts.size / parts.size.sum()
-    lost = float(share @ np.exp(-lines * share))
+    lost = float(share @ np.exp(-n_lineages * share))
     return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
 
 
-def _weigh(
+def _sample(
     proposal: Proposal,
     prior_share: float,
-    held: _Held,
+    held: _HeldOut,
     space: Space,
     evaluate: Evaluator,
     *,

@@ -162,10 +162,10 @@ class SliceMove:
         n_chains, n_params = start.u.shape
         space = evaluate.space
         walls = _walls(space)
-        around = _Circles.cut_where_empty(space.periodic, live)
-        if around is not None:
-            live = around.wrapped(live)
-            start = replace(start, u=around.wrapped(start.u))
+        periodic = _PeriodicAxes.cut_where_empty(space.periodic, live)
+        if periodic is not None:
+            live = periodic.wrapped(live)
+            start = replace(start, u=periodic.wrapped(start.u))
         clusters = find_clusters(live)
         n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
@@ -175,7 +175,7 @@ class SliceMove:
         axis = _axes(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
-        view = _View.of(clusters, start.u, home, live)
+        metrics = _Metrics.of(clusters, start.u, home, live)
         line = np.empty((n_chains, n_params))
         low, high, level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
@@ -185,22 +185,22 @@ class SliceMove:
         def begin(rows: IntArray) -> None:
             """Set up the next step's line, bracket and level."""
             at = step[rows]
-            kinds, measure = kind[rows, at], view.measure(rows, home[rows])
+            kinds, measure = kind[rows, at], metrics.measure(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
             turned, along, follow = ((kinds == one).nonzero()[0] for one in (_FRAME, _AXIS, _DIFFERENCE))
             if turned.size:
                 frame = frames[rows[turned], at[turned]]
-                toward[turned] = self.width * np.matmul(view.root[measure[turned]], frame[:, :, None])[:, :, 0]
+                toward[turned] = self.width * np.matmul(metrics.root[measure[turned]], frame[:, :, None])[:, :, 0]
             if along.size:
                 which = axis[rows[along], at[along]]
-                least, widening = view.conditional[measure[along], which], view.widening[measure[along], which]
+                least, widening = metrics.conditional[measure[along], which], metrics.widening[measure[along], which]
                 toward[along, which] = self.width * least * widening ** rng.random(along.size)
             if follow.size:
                 n = len(live)
                 first = rng.integers(n - 1, size=follow.size)
                 second = (first + rng.integers(1, n - 1, size=follow.size)) % (n - 1)
                 # Counted cyclically from the row after the chain's own start, so that neither is the start.
-                behind = view.own_row[rows[follow]] + 1
+                behind = metrics.own_row[rows[follow]] + 1
                 toward[follow] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
             line[rows] = toward
             low[rows], high[rows] = _bracket(now.u, rows, toward, walls, rng)
@@ -215,8 +215,8 @@ class SliceMove:
             chain = rows.repeat(n_ahead)
             ahead = now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * line.take(rows, axis=0)[:, None, :]
             candidate = ahead.reshape(-1, n_params)
-            if around is not None:
-                candidate = around.wrapped(candidate)
+            if periodic is not None:
+                candidate = periodic.wrapped(candidate)
             if walls is not None:
                 np.clip(candidate, *walls, out=candidate)
             least = level[chain]
@@ -234,32 +234,32 @@ class SliceMove:
                     first = (hopping & ok).nonzero()[0]
                     who = chain[first]
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
-                    candidate[first], log_growth = view.hop(who, now.u[who], home[who], goal[first])
-                    if around is not None:
+                    candidate[first], log_growth = metrics.hop(who, now.u[who], home[who], goal[first])
+                    if periodic is not None:
                         # Across the cut of a circle the reverse hop would differ.
-                        ok[first] &= (around.wrapped(candidate[first]) == candidate[first]).all(axis=1)
+                        ok[first] &= (periodic.wrapped(candidate[first]) == candidate[first]).all(axis=1)
                     least[first] -= log_growth
                     if walls is not None:
                         ok[first] &= ((candidate[first] >= walls[0]) & (candidate[first] <= walls[1])).all(axis=1)
                 place = clusters.assign(candidate)
                 ok &= (kinds == _DIFFERENCE) | (place == goal)
-            asked = ok.nonzero()[0]
-            if asked.size:
-                theta, log_density = space.leave(candidate.take(asked, axis=0))
-                above_level = (log_density >= least[asked]).nonzero()[0]
+            pending = ok.nonzero()[0]
+            if pending.size:
+                theta, log_density = space.leave(candidate.take(pending, axis=0))
+                above_level = (log_density >= least[pending]).nonzero()[0]
                 theta, log_density = theta.take(above_level, axis=0), log_density[above_level]
-                asked = asked[above_level]
+                pending = pending[above_level]
                 ok[:] = False
-            if asked.size:
-                tried = evaluate.weigh(candidate.take(asked, axis=0), theta, log_density, rng)
-                ok[asked] = bound.admits(tried.log_likelihood, tried.label)
-                n_evaluated += asked.size
+            if pending.size:
+                tried = evaluate.weigh(candidate.take(pending, axis=0), theta, log_density, rng)
+                ok[pending] = bound.admits(tried.log_likelihood, tried.label)
+                n_evaluated += pending.size
             n_needed, delivered = _needed(ok.reshape(-1, n_ahead))
             won = delivered.nonzero()[0]
             if won.size:
                 # A chain takes the first of its candidates above the bound.
                 taken, which = rows[won], won * n_ahead + n_needed[won] - 1
-                now.put(taken, tried, np.searchsorted(asked, which))
+                now.put(taken, tried, np.searchsorted(pending, which))
                 home[taken] = place[which]
                 moved[taken] = True
             n_tried += int(n_needed[~hop].sum())
@@ -272,8 +272,8 @@ class SliceMove:
                 active = active[step[active] < n_steps]
             if more.size:
                 begin(more)
-        if around is not None:
-            now = replace(now, u=around.home(now.u))
+        if periodic is not None:
+            now = replace(now, u=periodic.home(now.u))
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def _kinds(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
@@ -336,7 +336,7 @@ def _axes(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) 
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _Metrics:
     """The clusters' metrics for each chain: its own cluster is computed without the chain's starting point.
 
     A metric that includes the start stretches the lines through it and shrinks the others; with
@@ -357,7 +357,7 @@ class _View:
     own_row: IntArray  # row of the start among the live points
 
     @classmethod
-    def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _View:
+    def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _Metrics:
         same = np.logical_and.reduce(
             [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
         )
@@ -394,7 +394,7 @@ class _View:
 
 
 @dataclass(frozen=True, eq=False)
-class _Circles:
+class _PeriodicAxes:
     """Periodic coordinates, each cut where no live points are, so that no peak is split at the ends.
 
     A candidate is wrapped before it is evaluated, so that a step and its reverse use the same metric and clusters.
@@ -404,7 +404,7 @@ class _Circles:
     cut: FloatArray
 
     @classmethod
-    def cut_where_empty(cls, periodic: tuple[int, ...], live: FloatArray) -> _Circles | None:
+    def cut_where_empty(cls, periodic: tuple[int, ...], live: FloatArray) -> _PeriodicAxes | None:
         """Cut each circle in the middle of the widest gap between live points, (n_live, n_params)."""
         if not periodic:
             return None

@@ -51,10 +51,10 @@ class _Transform:
     def __post_init__(self) -> None:
         shape = self.from_unit_cube(np.full((2, len(self.names)), 0.5)).shape
         if shape != (2, len(self.names)):
-            asked = "two points (2, n_params)" if self.vectorized else "one point (n_params,)"
+            points = "two points (2, n_params)" if self.vectorized else "one point (n_params,)"
             got = shape if self.vectorized else shape[1:]
             wanted = f"the {len(self.names)} parameters of names, {', '.join(self.names)}"
-            raise ParameterError("prior", f"a function that makes {asked} into shape {got}", wanted)
+            raise ParameterError("prior", f"a function that makes {points} into shape {got}", wanted)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         if self.vectorized:

@@ -50,7 +50,7 @@ class Space(Protocol):
 
 
 @dataclass(frozen=True)
-class _Cube:
+class _UnitCube:
     """The unit cube, in which the prior is uniform; `periodic` columns are wrapped."""
 
     prior: Prior
@@ -78,7 +78,7 @@ class _Cube:
 
 
 @dataclass(frozen=True)
-class _Normal:
+class _NormalScores:
     """Normal scores of the unit cube: unbounded coordinates with a standard normal prior."""
 
     prior: Prior
@@ -107,7 +107,7 @@ class _Normal:
 
 
 @dataclass(frozen=True)
-class _Own:
+class _PriorCoordinates:
     """The prior's own coordinates."""
 
     prior: Prior
@@ -132,7 +132,7 @@ class _Own:
         return self.coordinates.leave(u)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        if isinstance(self.coordinates, _Draws):
+        if isinstance(self.coordinates, _DrawsItself):
             return self.coordinates.draw(n, rng=rng)
         return self.enter(self.prior.from_unit_cube(rng.random((n, len(self.prior.names)))))
 
@@ -144,7 +144,7 @@ class _HasCoordinates(Protocol):
 
 
 @runtime_checkable
-class _Draws(Protocol):
+class _DrawsItself(Protocol):
     """Coordinates that draw from the prior themselves, because some of them match no parameters."""
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
@@ -163,8 +163,8 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
         allowed = "none: the prior has coordinates of its own" if own else f"names among {prior.names}"
         raise ParameterError("periodic", tuple(periodic), allowed)
     if isinstance(prior, _HasCoordinates):
-        return _Own(prior, prior.coordinates)
-    return _Cube(prior, tuple(prior.names.index(name) for name in periodic))
+        return _PriorCoordinates(prior, prior.coordinates)
+    return _UnitCube(prior, tuple(prior.names.index(name) for name in periodic))
 
 
 def unbounded(prior: Prior) -> Space:
@@ -176,6 +176,6 @@ def unbounded(prior: Prior) -> Space:
         If the prior has neither coordinates of its own nor `to_unit_cube`.
     """
     if isinstance(prior, _HasCoordinates):
-        return _Own(prior, prior.coordinates)
+        return _PriorCoordinates(prior, prior.coordinates)
     require_prior("problem.prior", prior, "to_unit_cube")
-    return _Normal(prior)
+    return _NormalScores(prior)

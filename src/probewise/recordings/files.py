@@ -19,7 +19,7 @@ from probewise.recordings.atomic import write_bytes_atomically, write_text_atomi
 from probewise.recordings.description import Description, degrees_of, description_text, read_description
 from probewise.recordings.images import image_bytes
 from probewise.recordings.patterns import Image
-from probewise.recordings.plan import Plan, Recording, range_in_words, require_plan, require_recording
+from probewise.recordings.plan import Plan, Recording, range_text, require_plan, require_recording
 from probewise.recordings.table import LARGEST, MISSING, Table, count_numbers, csv_text, number_text, read_table
 
 __all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recording", "write_plan", "write_recording"]
@@ -51,8 +51,8 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
         inst = plan.instrumentation
         nothing = np.isnan(readings).all()
         found = "there is no reading at all" if nothing else "no reading is within the declared range"
-        raise FileError(path, found, f"at least one number in {range_in_words(inst.min, inst.max)}", column="reading")
-    return replace(recording, notes=(*notes, *recording.notes_on_what_is_left_out()))
+        raise FileError(path, found, f"at least one number in {range_text(inst.min, inst.max)}", column="reading")
+    return replace(recording, notes=(*notes, *recording.notes_on_unusable_readings()))
 
 
 def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:

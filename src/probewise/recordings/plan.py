@@ -35,7 +35,7 @@ __all__ = [
     "Instrumentation",
     "Plan",
     "Recording",
-    "range_in_words",
+    "range_text",
     "require_described",
     "require_plan",
     "require_recording",
@@ -373,7 +373,7 @@ class Recording(ShowsItself):
         recording = cls(plan, values, source)
         if not recording.usable.any():
             raise ParameterError("readings", values.tolist(), "at least one number within the declared range")
-        return replace(recording, notes=recording.notes_on_what_is_left_out())
+        return replace(recording, notes=recording.notes_on_unusable_readings())
 
     @classmethod
     def from_table(
@@ -461,12 +461,12 @@ class Recording(ShowsItself):
                 ok &= self.readings <= inst.max
         return ok
 
-    def notes_on_what_is_left_out(self) -> tuple[str, ...]:
+    def notes_on_unusable_readings(self) -> tuple[str, ...]:
         """Say how many readings are unusable: missing, or outside the declared range."""
         inst = self.plan.instrumentation
         n_missing = int(np.isnan(self.readings).sum())
         n_outside = len(self) - n_missing - int(self.usable.sum())
-        why = {"missing": n_missing, f"outside {range_in_words(inst.min, inst.max)}": n_outside}
+        why = {"missing": n_missing, f"outside {range_text(inst.min, inst.max)}": n_outside}
         return tuple(f"{n} reading{'s' if n > 1 else ''} {reason}, left out" for reason, n in why.items() if n)
 
     def summary(self) -> str:
@@ -514,7 +514,7 @@ def require_described(plan: Plan) -> None:
             raise ParameterError("pattern", name, undescribed(name, list(plan.patterns)))
 
 
-def range_in_words(low: float | None, high: float | None) -> str:
+def range_text(low: float | None, high: float | None) -> str:
     """Describe a declared range."""
     if low is None and high is None:
         return "any range"

@@ -16,7 +16,7 @@ from probewise.recordings.files import plan_columns
 from probewise.recordings.plan import Plan
 from probewise.recordings.table import csv_text, number_text, read_table
 
-__all__ = ["Prediction", "read_prediction", "said_of_prediction", "write_prediction"]
+__all__ = ["Prediction", "prediction_summary", "read_prediction", "write_prediction"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +58,10 @@ class Prediction(ShowsItself):
 
     def summary(self) -> str:
         """Summarise: number of predictions, and for recorded readings chi-square and log density per reading."""
-        return said_of_prediction(self.readings, self.mean, self.sd, self.log_density)
+        return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
 
 
-def said_of_prediction(readings: FloatArray, mean: FloatArray, sd: FloatArray, log_density: FloatArray) -> str:
+def prediction_summary(readings: FloatArray, mean: FloatArray, sd: FloatArray, log_density: FloatArray) -> str:
     """Summarise predictions, and for recorded readings chi-square and log density per reading; all (n_points,)."""
     lines = [f"{len(mean)} readings predicted"]
     scored = np.isfinite(log_density) & np.isfinite(readings)

@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
 
-__all__ = ["CENTRE", "PER_SD", "normal_cdf", "replace_by_cumulative"]
+__all__ = ["CENTRE", "PER_SD", "normal_cdf", "normal_cdf_in_place"]
 
 _LIMIT = 8.5  # standard deviations: beyond, the cumulative is 0 or 1 within 1e-17
 _CELLS = 2**13
@@ -30,7 +30,7 @@ def _values_and_slopes() -> tuple[FloatArray, FloatArray]:
 _VALUE, _SLOPE = _values_and_slopes()
 
 
-def replace_by_cumulative(cells: FloatArray) -> None:
+def normal_cdf_in_place(cells: FloatArray) -> None:
     """Replace z PER_SD + CENTRE by the cumulative of z, in place; `cells` is contiguous float64.
 
     For callers that compute z as a product and can fold the table's scale into it. About the nearest entry z0
@@ -65,5 +65,5 @@ def normal_cdf(z: FloatArray) -> FloatArray:
     out += CENTRE
     flat = out.reshape(-1)
     for start in range(0, flat.size, _BLOCK):
-        replace_by_cumulative(flat[start : start + _BLOCK])
+        normal_cdf_in_place(flat[start : start + _BLOCK])
     return out

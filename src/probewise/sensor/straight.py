@@ -13,7 +13,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
-from probewise.sensor._normal import CENTRE, PER_SD, replace_by_cumulative
+from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_in_place
 from probewise.sensor.gaussian import LabGaussian, beyond_corner, mass_in_quadrant, turned
 from probewise.sensor.stages import Footprint, Poses
 
@@ -105,7 +105,7 @@ class StraightEdges:
                 cells = own_shift + distance
                 cells = cells * (own_per_sd * PER_SD)
                 cells += CENTRE
-                replace_by_cumulative(cells)
+                normal_cdf_in_place(cells)
                 share[block] += cells * _rows_of(weight, block)[:, :, g]
 
     def _own(self, array: FloatArray) -> FloatArray:
@@ -171,7 +171,7 @@ class _EdgeViews:
             else:
                 cells = here[..., self.which] * self.distance_mm
                 cells += here[..., n_angles + self.which]
-            replace_by_cumulative(cells)
+            normal_cdf_in_place(cells)
             cells *= weight[:, start : start + step]
             seen = cells.sum(axis=0).take(self.view, axis=1, mode="clip")  # "clip" spares the check of bounds
             seen *= self.gain

@@ -18,7 +18,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.recordings.plan import Plan
-from probewise.recordings.prediction import said_of_prediction
+from probewise.recordings.prediction import prediction_summary
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import AnyEffect, NoiseLevel, Stage
 from probewise.systems.fitted import FittedSystem, require_fitted_system
@@ -52,7 +52,7 @@ class SystemPrediction(ShowsItself):
 
     def summary(self) -> str:
         """Say how many readings were predicted and, of those that were recorded, how well they were expected."""
-        return said_of_prediction(self.readings, self.mean, self.sd, self.log_density)
+        return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
 
 
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:

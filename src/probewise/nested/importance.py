@@ -228,7 +228,7 @@ def refine(
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
-            known.append(_resampled_for_fit(better.theta, told.log_weight, space, rng))
+            known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
     found = _with_lost(_sample(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng)
     return replace(found, inherited=_inherited(found, result))
 

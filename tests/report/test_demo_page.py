@@ -45,7 +45,7 @@ def found():
 def test_a_run_takes_its_first_reading_where_it_is_told_to(found):
     assert found.readings[0].pose == FIRST
     assert len(found.steps) == 2
-    assert "max_readings" in found.stop_reason
+    assert "all 2 readings that it may take are taken" in found.stop_reason
     with pytest.raises(ParameterError, match="max_readings"):
         searched(0)
 

@@ -238,7 +238,7 @@ def test_a_run_killed_while_it_infers_keeps_the_reading_just_taken(small, found,
     journal = tmp_path / "journal.jsonl"
     steps = explore(small.arm(), small.experiment(), rng=rng(), journal=journal)
     next(steps)
-    monkeypatch.setattr("probewise.experiment.loop.updated", lambda *_, **__: os._exit(9))
+    monkeypatch.setattr("probewise.experiment.method.updated", lambda *_, **__: os._exit(9))
     pid = os.fork()
     if pid == 0:
         next(steps)  # measures, writes the reading, dies in the inference

@@ -41,18 +41,20 @@ class Field:
 
 
 def inquire(
-    experiment: Experiment, posterior: Weighted, field: Field, *, at: Reading | None, rng: np.random.Generator
+    experiment: Experiment, posterior: Weighted, drawn: FloatArray, field: Field, *, at: Reading | None
 ) -> tuple[Prospect, UtilityMap]:
     """Value every reading that the arm can take.
 
     Parameters
     ----------
-    experiment, posterior, field
-        What is asked, what is believed, where the arm can go.
+    experiment, posterior
+        What is asked, what is believed.
+    drawn
+        A few equally weighted hypotheses of it, (n_samples, n_params).
+    field
+        Where the arm can go.
     at
         The last reading, where the arm stands now; None before the first, when every place counts as near.
-    rng
-        Draws the samples that are shown.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))
@@ -67,7 +69,7 @@ def inquire(
     plan = dataclasses.replace(
         plan, orientation_rad=plan.orientation_rad + standing, instrumentation=experiment.instrumentation
     )
-    drawn = posterior.samples(experiment.n_samples, rng=rng)
+    drawn = drawn.copy()
     drawn.flags.writeable = False
     prospect = Prospect(
         experiment.forecast,

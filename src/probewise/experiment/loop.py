@@ -29,21 +29,13 @@ from probewise.experiment.journal import (
     require_same_settings,
 )
 from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, information, learnt, moments, stop_reason
-from probewise.experiment.posterior import prior_posterior, updated
+from probewise.experiment.posterior import prior_posterior
 from probewise.experiment.setting import Experiment
 from probewise.experiment.settling import settling
 from probewise.experiment.values import Exploration, State, Step
-from probewise.inference.problem import SensorProblem
 from probewise.inquiry import bits_gained, prior_entropy
-from probewise.nested.kernels import KernelMove
-from probewise.nested.result import NestedResult
-from probewise.nested.run import run as run_nested
-from probewise.nested.sampler import LIVE_PER_PARAM
-from probewise.nested.stop import RemainingEvidence
 
-__all__ = ["begin", "explore", "from_scratch", "run", "step"]
-
-DLOGZ = 0.5  # the last live points are posterior samples too: letting them die one by one would only refine log Z
+__all__ = ["begin", "explore", "run", "step"]
 
 
 def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> State:
@@ -66,7 +58,9 @@ def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> 
         If the prior has no mass, every place promises the same, or the only one nothing.
     """
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
-    prospect, outlook = inquire(experiment, posterior.joined(rng=rng), field, at=None, rng=rng)
+    joined = posterior.joined(rng=rng)
+    drawn = joined.samples(experiment.n_samples, rng=rng)
+    prospect, outlook = inquire(experiment, joined, drawn, field, at=None)
     if outlook.flat:
         raise ParameterError(
             "utility",
@@ -118,13 +112,7 @@ def step(
     with warnings.catch_warnings():
         # Each step keeps its own doubts; a warning a reading would bury them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        carried = updated(
-            state.posterior,
-            problem.recording,
-            experiment.n_particles,
-            rng=rng,
-            from_scratch=lambda kind: from_scratch(kind, experiment, rng),
-        )
+        carried = experiment.learning.updated(state.posterior, problem.recording, rng=rng)
     posterior = carried.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
     off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
@@ -135,7 +123,8 @@ def step(
     notes = () if posterior.run is None else posterior.run.warnings
     if p_value < experiment.doubt_p:
         notes = (*notes, doubt(p_value, worst, readings))
-    prospect, outlook = inquire(experiment, posterior, field, at=reading, rng=rng)
+    drawn = experiment.learning.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
+    prospect, outlook = inquire(experiment, posterior, drawn, field, at=reading)
     if experiment.trust < 1:
         outlook = settling(experiment, carried, prospect, outlook, readings, rng=rng)
     known = experiment.is_known(sd, shapes, off)
@@ -162,19 +151,6 @@ def step(
         notes=notes,
     )
     return State(readings, carried, pose, tuple(planned)), info
-
-
-def from_scratch(problem: SensorProblem, experiment: Experiment, rng: np.random.Generator) -> NestedResult:
-    """Infer from all readings at once by nested sampling: where the samples so far cannot be carried on."""
-    return run_nested(
-        problem,
-        rng=rng,
-        n_live=max(experiment.n_live, LIVE_PER_PARAM * len(problem.prior.names)),
-        move=KernelMove(),
-        stop=RemainingEvidence(DLOGZ),
-        max_cost=1.0,  # the robot waits
-        return_interrupted=False,
-    )
 
 
 def explore(

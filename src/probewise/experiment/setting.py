@@ -18,6 +18,7 @@ from probewise.errors import ParameterError
 from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import Kind, kinds_of
+from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.rivals import Rival, rivals_of
 from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
 from probewise.inference.student_t import StudentT
@@ -120,6 +121,8 @@ class Experiment:
         Hypotheses that are shown, and asked by the paper's utility; the paper has 50.
     n_live
         Live points of nested sampling, which takes over where a reading surprises.
+    method
+        How a reading changes what is believed; None: `SequentialMonteCarlo` with `n_particles` and `n_live`.
     """
 
     shape: Shape
@@ -143,6 +146,7 @@ class Experiment:
     n_particles: int = 3000
     n_samples: int = 50
     n_live: int = 200
+    method: Method | None = None
 
     def __post_init__(self) -> None:
         require_shape(self.shape)
@@ -186,6 +190,11 @@ class Experiment:
         if self.trust < 1:
             rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
         _ = self.readout, self.designs  # check what they are made of
+
+    @cached_property
+    def learning(self) -> Method:
+        """How a reading changes what is believed."""
+        return SequentialMonteCarlo(self.n_particles, self.n_live) if self.method is None else self.method
 
     @cached_property
     def prior(self) -> Prior:
@@ -267,6 +276,7 @@ class Experiment:
 
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
         """Say what decides a run: a journal's first line."""
+        method = {} if self.method is None else {"method": repr(self.method)}
         return {
             "version": __version__,
             "field": {
@@ -282,6 +292,7 @@ class Experiment:
             "likelihood": repr(self.likelihood),
             "likelihood_sha256": value_digest(self.likelihood),
             "utility": repr(self.utility),
+            **method,
             "seed": seed_text(seed),
             "spawn_key": list(seed.spawn_key),
             "options": {

@@ -1,0 +1,91 @@
+"""How a reading changes what a run believes: one Protocol, and sequential Monte Carlo, the default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.experiment.posterior import Posterior, updated
+from probewise.inference.problem import SensorProblem
+from probewise.nested.importance import Weighted
+from probewise.nested.kernels import KernelMove
+from probewise.nested.result import NestedResult
+from probewise.nested.run import run
+from probewise.nested.sampler import LIVE_PER_PARAM
+from probewise.nested.stop import RemainingEvidence
+from probewise.recordings.plan import Recording
+
+__all__ = ["Method", "SequentialMonteCarlo", "from_scratch"]
+
+DLOGZ = 0.5  # the last live points are posterior samples too: letting them die one by one would only refine log Z
+
+
+class Method(Protocol):
+    """Infer after every reading. A frozen dataclass, so that a journal can name it."""
+
+    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """Take in the last reading of a recording.
+
+        Raises
+        ------
+        NotConvergedError
+            If no hypothesis of any kind could have given the readings.
+        """
+        ...
+
+    def drawn(
+        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw the few hypotheses that are shown, and asked by the paper's utility, (n, n_params).
+
+        `joined` is the posterior over all kinds of hypotheses, given the recording.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class SequentialMonteCarlo:
+    """Carry weighted samples from reading to reading; nested sampling takes over where a reading surprises.
+
+    Parameters
+    ----------
+    n_particles
+        Samples of a kind of hypotheses that counts.
+    n_live
+        Live points of nested sampling.
+    """
+
+    n_particles: int
+    n_live: int
+
+    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """See `Method.updated`."""
+        return updated(
+            previous,
+            recording,
+            self.n_particles,
+            rng=rng,
+            from_scratch=lambda problem: from_scratch(problem, self.n_live, rng),
+        )
+
+    def drawn(
+        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+    ) -> FloatArray:
+        """See `Method.drawn`."""
+        return joined.samples(n, rng=rng)
+
+
+def from_scratch(problem: SensorProblem, n_live: int, rng: np.random.Generator) -> NestedResult:
+    """Infer from all readings at once by nested sampling: where the samples so far cannot be carried on."""
+    return run(
+        problem,
+        rng=rng,
+        n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
+        move=KernelMove(),
+        stop=RemainingEvidence(DLOGZ),
+        max_cost=1.0,  # the robot waits
+        return_interrupted=False,
+    )

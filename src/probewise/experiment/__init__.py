@@ -19,6 +19,17 @@ from probewise.experiment.learning import AdjustedMixture, Change, sensor_prior
 from probewise.experiment.left_out import CLEAN, LeftOut, left_out_of, repaired
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
+from probewise.experiment.method import Method, SequentialMonteCarlo
+from probewise.experiment.paper import (
+    NESTED_STOP,
+    NestedSampling,
+    NestedStop,
+    levels_from,
+    levels_in,
+    paper_experiment,
+    student_t_bounds,
+)
+from probewise.experiment.posed import MethodName, pose_experiment
 from probewise.experiment.setting import Experiment, OneScan
 from probewise.experiment.simulation import (
     TRUST,
@@ -39,6 +50,7 @@ from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 
 __all__ = [
     "CLEAN",
+    "NESTED_STOP",
     "OFF_MM",
     "PAPER_BITS",
     "TRUST",
@@ -55,8 +67,13 @@ __all__ = [
     "Journal",
     "JournalWriter",
     "LeftOut",
+    "Method",
+    "MethodName",
     "Model",
+    "NestedSampling",
+    "NestedStop",
     "OneScan",
+    "SequentialMonteCarlo",
     "State",
     "Step",
     "Streams",
@@ -70,7 +87,11 @@ __all__ = [
     "found_shape",
     "least_readings",
     "left_out_of",
+    "levels_from",
+    "levels_in",
     "members_of",
+    "paper_experiment",
+    "pose_experiment",
     "read_journal",
     "recording_of",
     "repaired",
@@ -85,6 +106,7 @@ __all__ = [
     "shape_named",
     "shape_of",
     "step",
+    "student_t_bounds",
     "surface_of",
     "usual_trust",
     "value_digest",

@@ -7,6 +7,7 @@ import itertools
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
@@ -42,7 +43,10 @@ __all__ = [
     "Model",
     "Streams",
     "arm_over",
+    "calibrated_height",
+    "chain_of",
     "experiment_for",
+    "levels_of",
     "scale_of",
     "sensor_named",
     "shape_named",
@@ -63,19 +67,21 @@ _PAINTED_VERTICES = 512  # of a curved outline that is no ellipse: within 0.01 m
 class Streams(NamedTuple):
     """The independent randomness of one simulated run: of the robot, of what is hidden, of a shadow run, of the noise.
 
-    `noise` is a number, from which each reading's generator is made; see `arm_over`.
+    `noise` is a number, from which each reading's generator is made; see `arm_over`. `levels` is that of readings over
+    black and white before the run, see `levels_in`.
     """
 
     run: np.random.Generator
     truth: np.random.Generator
     shadow: np.random.Generator
     noise: int
+    levels: np.random.Generator
 
     @classmethod
     def of(cls, rng: np.random.Generator) -> Streams:
         """Spawn them from one generator, so that one seed gives the whole run."""
-        run, truth, shadow, noise = rng.spawn(4)
-        return cls(run, truth, shadow, int(noise.integers(2**63)))
+        run, truth, shadow, noise, levels = rng.spawn(5)
+        return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
 
 
 def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
@@ -167,8 +173,7 @@ def experiment_for(
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
     sensor = sensor.leading()  # a mean over rivals is true of none of them
-    means = sensor.mean()
-    levels = FixedLevels(means["I_min"], means["I_max"])
+    levels = levels_of(sensor)
     scene = HypothesisScene(shape)
     noise_sd = float(sensor.noise_sd.mean())
     scale = scale_of(sensor.instrumentation)
@@ -183,7 +188,7 @@ def experiment_for(
         orientations_rad=orientations_rad,
         repeats=repeats,
         heights_mm=heights_mm,
-        calibrated_height_mm=_calibrated_height(sensor, model, heights_mm) if heights_mm else None,
+        calibrated_height_mm=calibrated_height(sensor, model, heights_mm) if heights_mm else None,
         batch=batch,
         n_live=n_live,
         trust=trust,
@@ -194,18 +199,30 @@ def experiment_for(
         sd = math.hypot(noise_sd, (scale.step or 0.0) / math.sqrt(12))
         # A reading on the edge never fits two levels, and the naive model knows no edge.
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
-    mixture = sensor.mixture()
+    chain = chain_of(sensor, scene)
+    # Without steps cells are taken as fine as the noise asks for: at the ends a reading stands for all beyond.
+    likelihood = Rounded(noise_sd, scale.step or noise_sd / _CELLS_PER_SD, scale.low, scale.high)
+    if learn_sensor:
+        free = replace(chain, ssf=AdjustedMixture(sensor.mixture()), levels=FreeLevels())
+        return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
+    return pose(chain, likelihood)
+
+
+def levels_of(sensor: FittedSensor) -> FixedLevels:
+    """Take the mean levels of a fitted sensor."""
+    means = sensor.mean()
+    return FixedLevels(means["I_min"], means["I_max"])
+
+
+def chain_of(sensor: FittedSensor, scene: HypothesisScene) -> Chain:
+    """Put a fitted sensor over a scene: its mean field's mixture, its mean levels, its effects at their means."""
+    means = sensor.mean()
     effects = tuple(
         Known(effect, tuple(means[f"{effect.name}.{name}"] for name in effect.prior.names))
         for effect in sensor.carried_effects
         if effect.stage is not Stage.NOISE  # readings far apart in place and time share no noise
     )
-    # Without steps cells are taken as fine as the noise asks for: at the ends a reading stands for all beyond.
-    likelihood = Rounded(noise_sd, scale.step or noise_sd / _CELLS_PER_SD, scale.low, scale.high)
-    if learn_sensor:
-        free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, effects, n_nodes=FAST_NODES)
-        return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
-    return pose(Chain(mixture, levels, scene, effects, n_nodes=FAST_NODES), likelihood)
+    return Chain(sensor.mixture(), levels_of(sensor), scene, effects, n_nodes=FAST_NODES)
 
 
 TRUST = 0.9
@@ -221,7 +238,7 @@ def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Util
     return 1.0 if plain else TRUST
 
 
-def _calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
+def calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
     """Take the height of the calibration: what the sensor sees at another follows from it."""
     height_mm = sensor.instrumentation.height_mm
     if model == "naive":

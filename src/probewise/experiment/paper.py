@@ -1,0 +1,263 @@
+"""The paper's own experiment: nested sampling anew after every reading, fifty samples, the entropy of their answers.
+
+Paper, "The Machine Learning System" and "Models Describing a Light Sensor". What its printing leaves open or cannot
+mean is settled as the rest of the package does (docs/explanation/errata.md): the Student-t's sigma has proper bounds,
+the SSF is the mean field's mixture in closed form rather than a sum over pixels of 1 mm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm import LegoScale
+from probewise.calibration import FittedSensor
+from probewise.calibration.sensor_file import require_sensor
+from probewise.errors import NotConvergedError, ParameterError
+from probewise.experiment.kinds import Kind
+from probewise.experiment.particles import Particles
+from probewise.experiment.posterior import Posterior
+from probewise.experiment.setting import Experiment, OneScan
+from probewise.experiment.simulation import Model, calibrated_height, chain_of, levels_of, scale_of
+from probewise.inference import Naive
+from probewise.inquiry import Grid, ReadingEntropy
+from probewise.nested import (
+    EvidenceChange,
+    Move,
+    NestedResult,
+    RemainingEvidence,
+    SliceMove,
+    StopRule,
+    Weighted,
+    diversify,
+)
+from probewise.nested.run import run
+from probewise.nested.weights import resampled
+from probewise.recordings import Recording
+from probewise.recordings import Uniform as UniformPattern
+from probewise.recordings.plan import require_described, require_recording
+from probewise.scene import Field, HypothesisScene, KnownScene, Shape
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, NaiveSensor
+from probewise.world import World
+
+__all__ = [
+    "NESTED_STOP",
+    "N_LIVE",
+    "NestedSampling",
+    "NestedStop",
+    "levels_from",
+    "levels_in",
+    "paper_experiment",
+    "student_t_bounds",
+]
+
+N_LIVE = 300
+"""Live points of nested sampling in the paper."""
+
+NestedStop: TypeAlias = Literal["change", "remaining"]
+
+NESTED_STOP: dict[str, StopRule] = {"change": EvidenceChange(1e-8), "remaining": RemainingEvidence(0.05)}
+"""When nested sampling ends: the paper's rule, a change of ln Z below 1e-8, or when ln Z can rise by 0.05 at most."""
+
+_N_SAMPLES = 50
+_N_STEPS = 1000
+_N_EACH = 20  # readings over black and over white
+_LEAST_SHARE = 1e-3  # of the difference of the levels: the least sd of the noise, and what counts as wholly black
+
+
+@dataclass(frozen=True)
+class NestedSampling:
+    """Infer from all readings anew after each; diversify the samples that are drawn (paper, machine learning system).
+
+    Parameters
+    ----------
+    n_live
+        Live points; the paper has 300.
+    stop
+        When nested sampling ends; the paper's rule is a change of ln Z below 1e-8.
+    n_steps
+        Metropolis-Hastings steps of each drawn sample; the paper takes about 1000.
+    move
+        How nested sampling draws new points.
+    """
+
+    n_live: int = N_LIVE
+    stop: StopRule = field(default_factory=EvidenceChange)
+    n_steps: int = _N_STEPS
+    move: Move = field(default_factory=SliceMove)
+
+    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """See `Method.updated`; every kind of hypotheses has a run of its own."""
+        found = tuple(
+            self._anew(had, kind, recording, rng) for kind, had in zip(previous.kinds, previous.particles, strict=True)
+        )
+        now = replace(previous, particles=found)
+        if not np.isfinite(now.log_odds).any():
+            raise NotConvergedError("no hypothesis of any kind could have given these readings")
+        return now
+
+    def drawn(
+        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+    ) -> FloatArray:
+        """See `Method.drawn`; samples of a nested run may be replications, so each takes its own steps."""
+        which = resampled(posterior.probability, n, rng)
+        drawn = []
+        for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
+            if n_own := int((which == k).sum()):
+                start = particles.weighted.samples(n_own, rng=rng)
+                moved, _ = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
+                drawn.append(kind.placed(moved, rng))
+        return np.concatenate(drawn)
+
+    def _anew(self, had: Particles, kind: Kind, recording: Recording, rng: np.random.Generator) -> Particles:
+        try:
+            result = run(
+                kind.problem(recording),
+                rng=rng,
+                n_live=self.n_live,
+                stop=self.stop,
+                move=self.move,
+                max_cost=1.0,  # the robot waits
+                return_interrupted=False,
+            )
+        except NotConvergedError:  # nothing of this kind could have given the readings
+            return replace(had, weighted=replace(had.weighted, log_z=-math.inf, log_z_error=math.inf))
+        found = _weighted(result, had.weighted.n_calls + result.n_calls)
+        return Particles(found, np.arange(len(found.theta)))
+
+
+def _weighted(result: NestedResult, n_calls: int) -> Weighted:
+    return Weighted(
+        result.names,
+        result.theta,
+        result.log_likelihood,
+        result.log_weight,
+        result.log_z,
+        result.log_z_error,
+        result.n_eff,
+        n_calls,
+        -math.inf,
+        result,
+    )
+
+
+def paper_experiment(
+    sensor: FittedSensor,
+    shape: Shape,
+    field: Field,
+    *,
+    model: Model = "ssf",
+    nested_stop: NestedStop = "change",
+    naive: Naive | None = None,
+    orientations_rad: tuple[float, ...] = (0.0,),
+    repeats: tuple[int, ...] = (1,),
+    heights_mm: tuple[float, ...] = (),
+) -> Experiment:
+    """Pose the paper's experiment: how it infers, what a reading is worth to it, and with which likelihood.
+
+    Parameters
+    ----------
+    sensor, shape, field
+        As for `experiment_for`.
+    model
+        "ssf": the Student-t likelihood, whose sd is not known. "naive": two levels, each with its own sd.
+    nested_stop
+        "change": nested sampling ends at a change of ln Z below 1e-8, as in the paper; "remaining": where ln Z can rise
+        by 0.05 at most.
+    naive
+        Levels and sds of the naive model, from repeated readings over black and over white; see `levels_from` and
+        `levels_in`.
+    orientations_rad, repeats, heights_mm
+        As for `experiment_for`.
+
+    Raises
+    ------
+    ParameterError
+        If the naive model has no levels, or is to choose heights.
+    """
+    require_sensor(sensor, "in the order paper_experiment(sensor, shape, field)")
+    for name, value, allowed in (("model", model, get_args(Model)), ("nested_stop", nested_stop, tuple(NESTED_STOP))):
+        if value not in allowed:
+            raise ParameterError(name, value, " or ".join(map(repr, allowed)))
+    sensor = sensor.leading()
+    scale, scene = scale_of(sensor.instrumentation), HypothesisScene(shape)
+    levels, noise_sd = levels_of(sensor), float(sensor.noise_sd.mean())
+    likelihood: Naive | OneScan
+    if model == "naive":
+        if naive is None:
+            raise ParameterError(
+                "naive", None, 'levels and sds with the model "naive", from repeated readings over black and white'
+            )
+        # The naive model knows no edge, where a reading never fits two levels: its fit is not doubted.
+        seen, likelihood, doubt_p = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), scene), naive, 0.0
+    else:
+        seen, likelihood, doubt_p = chain_of(sensor, scene), student_t_bounds(levels, scale.step), None
+    posed = Experiment(
+        shape,
+        seen,
+        likelihood,
+        noise_sd=noise_sd,
+        grid=Grid(field.width_mm, field.height_mm),
+        utility=ReadingEntropy(scale.step or noise_sd),
+        step=scale.step,
+        reading_range=(scale.low, scale.high),
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+        heights_mm=heights_mm,
+        calibrated_height_mm=calibrated_height(sensor, model, heights_mm) if heights_mm else None,
+        n_samples=_N_SAMPLES,
+        n_live=N_LIVE,
+        method=NestedSampling(stop=NESTED_STOP[nested_stop]),
+    )
+    return posed if doubt_p is None else replace(posed, doubt_p=doubt_p)
+
+
+def student_t_bounds(levels: FixedLevels, step: float | None) -> OneScan:
+    """Bound the Student-t's sd: from rounding, or a thousandth of the levels' difference, up to that difference."""
+    span = abs(levels.i_max - levels.i_min)
+    floor = max((step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span)
+    return OneScan(floor, max(span, 10.0 * floor))
+
+
+def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
+    """Take the naive model's levels and sds from the readings of a recording over black and over white.
+
+    Those count over which the sensor sees no more than a thousandth of anything else: over sheets of one colour, and
+    of a scan across an edge the far ends.
+
+    Raises
+    ------
+    ParameterError
+        If there are fewer than two of either.
+    """
+    require_recording(recording)
+    require_described(recording.plan)
+    mixture, patterns = sensor.leading().mixture(), KnownScene(recording.plan.patterns)
+    share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)
+    seen = share.predict(np.empty((1, 0)), recording.plan)[0]
+    black, white = (
+        recording.readings[recording.usable & (np.abs(seen - albedo) <= _LEAST_SHARE)] for albedo in (0.0, 1.0)
+    )
+    if min(black.size, white.size) < 2:
+        raise ParameterError(
+            recording.source or "recording",
+            f"{black.size} readings over black and {white.size} over white",
+            "two or more of each, far from any edge: repeated readings over a black and over a white sheet",
+        )
+    step = scale_of(sensor.instrumentation).step or 0.0
+    floor = max(step / math.sqrt(12.0), _LEAST_SHARE * abs(float(white.mean() - black.mean())))
+    return Naive.estimated(black, white, sd_floor=floor)
+
+
+def levels_in(world: World, scale: LegoScale, *, rng: np.random.Generator, n_each: int = _N_EACH) -> Naive:
+    """Let a simulated sensor read a black and a white sheet `n_each` times, for the naive model's levels and sds."""
+    black, white = (
+        [scale.convert(world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng)) for k in range(n_each)]
+        for albedo in (0.0, 1.0)
+    )
+    span = abs(float(np.mean(white) - np.mean(black)))
+    return Naive.estimated(black, white, sd_floor=max((scale.step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span))

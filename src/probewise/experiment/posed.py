@@ -1,0 +1,89 @@
+"""Pose an experiment by the names that a command line gives: of the method, the sensor model, the utility."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias, get_args
+
+from probewise.calibration import FittedSensor
+from probewise.errors import ParameterError
+from probewise.experiment.paper import NestedStop, paper_experiment
+from probewise.experiment.setting import Experiment
+from probewise.experiment.simulation import Model, experiment_for, usual_trust
+from probewise.inference import Naive
+from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
+from probewise.scene import Field, Shape
+
+__all__ = ["MethodName", "pose_experiment"]
+
+MethodName: TypeAlias = Literal["particles", "paper"]
+
+
+def pose_experiment(
+    sensor: FittedSensor,
+    shape: Shape,
+    field: Field,
+    *,
+    method: MethodName = "particles",
+    model: Model = "ssf",
+    utility: str | Utility | None = None,
+    learn_sensor: bool = False,
+    batch: int = 1,
+    trust: float | None = None,
+    nested_stop: NestedStop | None = None,
+    naive: Naive | None = None,
+    orientations_rad: tuple[float, ...] = (0.0,),
+    repeats: tuple[int, ...] = (1,),
+    heights_mm: tuple[float, ...] = (),
+) -> Experiment:
+    """Pose an experiment; what is None is as usual with the method.
+
+    Parameters
+    ----------
+    method
+        "particles": `experiment_for`, sequential Monte Carlo; "paper": `paper_experiment`, which has its own utility,
+        takes its sensor for complete, and chooses one reading at a time.
+    utility
+        What a reading is worth: a name (see `inquiry.utility_named`) or a utility.
+    nested_stop, naive
+        For the method "paper" alone; see `paper_experiment`.
+    sensor, shape, field, model, learn_sensor, batch, trust, orientations_rad, repeats, heights_mm
+        See `experiment_for`.
+
+    Raises
+    ------
+    ParameterError
+        If an option does not go with the method.
+    """
+    worth = utility_named(utility) if isinstance(utility, str) else utility
+    choices = {"orientations_rad": orientations_rad, "repeats": repeats, "heights_mm": heights_mm}
+    if method == "paper":
+        refused = (
+            ("utility", utility, worth is None or isinstance(worth, ReadingEntropy), "entropy"),
+            ("learn_sensor", learn_sensor, not learn_sensor, "False"),
+            ("batch", batch, batch == 1, "1"),
+            ("trust", trust, trust in (None, 1), "1, for it takes its sensor for complete,"),
+        )
+        for name, value, fits, allowed in refused:
+            if not fits:
+                raise ParameterError(name, value, f'{allowed} with the method "paper"')
+        return paper_experiment(
+            sensor, shape, field, model=model, nested_stop=nested_stop or "change", naive=naive, **choices
+        )
+    if method != "particles":
+        raise ParameterError("method", method, " or ".join(map(repr, get_args(MethodName))))
+    for name, value in (("nested_stop", nested_stop), ("naive", naive)):
+        if value is not None:
+            raise ParameterError(name, value, 'None, but with the method "paper"')
+    worth = Finishing() if worth is None else worth
+    usual = usual_trust(shape, model=model, learn_sensor=learn_sensor, utility=worth)
+    return experiment_for(
+        sensor,
+        shape,
+        field,
+        model=model,
+        utility=worth,
+        learn_sensor=learn_sensor,
+        batch=batch,
+        trust=usual if trust is None else trust,
+        **choices,
+    )

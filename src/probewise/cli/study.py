@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["VERB"]
 
-_FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor")
+_FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="conceal an effect from the robot in every row, three sizes each, and look for the same circles with and "
         "without doubt about the sensor (writes concealed.csv; no other row)",
     )
+    parser.add_argument(
+        "--beside-paper",
+        action="store_true",
+        help="for each sensor model, our method and the paper's (explore --method paper) on the same circles; of the "
+        "factors below --population and --nested-stop may be given",
+    )
     one = parser.add_argument_group("one row instead of the table's", "what is not given is as in the reference row")
     one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, wholly in the field) or anywhere")
     one.add_argument("--model", metavar="NAME", help="what the robot takes its sensor for: ssf or naive")
@@ -48,6 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     one.add_argument("--width", type=float, metavar="F", help="believed width of the SSF over the true one")
     one.add_argument("--batch", type=positive_int, metavar="N", help="readings that are chosen together")
     one.add_argument("--learn-sensor", action="store_true", default=None, help="learn the sensor along with the shape")
+    one.add_argument("--method", metavar="NAME", help="how the robot infers and chooses: particles or paper")
+    one.add_argument(
+        "--nested-stop", metavar="NAME", help="when the paper's nested sampling ends: change (of ln Z) or remaining"
+    )
     parser.add_argument(
         "--max-readings", type=positive_int, default=100, metavar="N", help="a run ends here as a miss (default 100)"
     )
@@ -122,11 +132,18 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
 
 
 def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
-    from probewise.study import Row, standard_rows
+    from probewise.study import Row, paper_rows, standard_rows
 
     given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
+    if arguments.beside_paper:
+        others = [f"--{name.replace('_', '-')}" for name in given if name not in ("population", "nested_stop")]
+        if others:
+            raise ParameterError(others[0], "given", "none with --beside-paper, whose rows are its own")
+        return paper_rows(**given)
     if not given:
         return standard_rows()
+    if given.get("method") == "paper":
+        given.setdefault("utility", "entropy")
     if "noise" in given:
         given["noise_sd"] = given.pop("noise")
     return (Row(**given),)
@@ -135,6 +152,7 @@ def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
 def _command(arguments: argparse.Namespace) -> str:
     words = ["probewise", "study", "--circles", str(arguments.circles)]
     words += [] if arguments.quoted is None else ["--quoted", str(arguments.quoted)]
+    words += ["--beside-paper"] if arguments.beside_paper else []
     for name in _FACTORS:
         value = getattr(arguments, name)
         if value is not None:

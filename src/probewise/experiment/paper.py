@@ -27,10 +27,10 @@ from probewise.inference import Naive
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.nested import (
     EvidenceChange,
+    KernelMove,
     Move,
     NestedResult,
     RemainingEvidence,
-    SliceMove,
     StopRule,
     Weighted,
     diversify,
@@ -88,7 +88,7 @@ class NestedSampling:
     n_live: int = N_LIVE
     stop: StopRule = field(default_factory=EvidenceChange)
     n_steps: int = _N_STEPS
-    move: Move = field(default_factory=SliceMove)
+    move: Move = field(default_factory=KernelMove)
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`; every kind of hypotheses has a run of its own."""

@@ -256,6 +256,7 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
         last_change=log_z - before,
         log_volume=fresh.log_volume,
         best_log_likelihood=best,
+        level=bool(fresh.points.log_likelihood.min() == best),
     )
     after = replace(
         now,

@@ -19,7 +19,7 @@ class RoundSummary:
     `log_z` counts the dead points only. `log_z_remaining` is the log of an upper bound on the live
     points' evidence, the best likelihood times the remaining volume; `log_ratio_remaining` is the log of
     its ratio to the evidence so far. `last_change` is the increase of `log_z` by the last dead point;
-    `log_volume` the log of the remaining share of the prior.
+    `log_volume` the log of the remaining share of the prior; `level` whether all live points have the same likelihood.
     """
 
     n_dead: int
@@ -30,6 +30,7 @@ class RoundSummary:
     last_change: float
     log_volume: float
     best_log_likelihood: float
+    level: bool = False
 
 
 State = RoundSummary
@@ -55,9 +56,16 @@ class RemainingEvidence:
         return f"live points can raise log Z by less than {self.dlogz:g}" if gain < self.dlogz else None
 
 
+_ON_PLATEAU = RemainingEvidence(0.05)
+
+
 @dataclass(frozen=True)
 class EvidenceChange:
-    """Stop when consecutive values of log Z differ by less than `tolerance`: the paper's rule, 1e-8."""
+    """Stop when consecutive values of log Z differ by less than `tolerance`: the paper's rule, 1e-8.
+
+    On a plateau there is nothing to climb to: once all live points have the same likelihood and can raise log Z by less
+    than 0.05, the rule ends the run too. Further deaths would leave copies of a few points.
+    """
 
     tolerance: float = 1e-8
 
@@ -69,4 +77,5 @@ class EvidenceChange:
         """Return the reason to stop, or None."""
         if state.last_change < self.tolerance:
             return f"consecutive values of log Z differ by less than {self.tolerance:g}"
-        return None
+        held = _ON_PLATEAU(state) if state.level else None
+        return held and f"all live points have the same likelihood, and {held}"

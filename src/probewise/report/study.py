@@ -112,7 +112,10 @@ def write_page(study: Study, *, command: str) -> str:
     curves = {
         row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]
         for row in summaries
-        if row.utility == REFERENCE.utility and row.noise_sd == 1.0 and row.width == 1.0 and row.batch == 1
+        if (row.utility == REFERENCE.utility or row.method == "paper")
+        and row.noise_sd == 1.0
+        and row.width == 1.0
+        and row.batch == 1
     }
     needed = figure(
         png(readings_needed({row.name: found for row, found in summaries.items()})),

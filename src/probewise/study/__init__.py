@@ -6,7 +6,7 @@ the same noise, and differs from a reference row in one thing.
 
 from probewise.study.circles import POPULATIONS, Population, noise_of
 from probewise.study.concealed import CONCEALED, ConcealedTrial, concealed_table, run_concealed, run_concealed_trial
-from probewise.study.rows import REFERENCE, Row, standard_rows
+from probewise.study.rows import REFERENCE, Row, paper_rows, standard_rows
 from probewise.study.run import Study, read_study, run_study
 from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_within, summarise
 from probewise.study.trial import Trial, arm_of, experiment_of, run_trial
@@ -27,6 +27,7 @@ __all__ = [
     "concealed_table",
     "experiment_of",
     "noise_of",
+    "paper_rows",
     "read_study",
     "run_concealed",
     "run_concealed_trial",

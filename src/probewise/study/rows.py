@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 from probewise.errors import ParameterError
+from probewise.experiment import NESTED_STOP, MethodName
 from probewise.inquiry import utility_named
 from probewise.study.circles import POPULATIONS
 
-__all__ = ["REFERENCE", "Row", "standard_rows"]
+__all__ = ["REFERENCE", "Row", "paper_rows", "standard_rows"]
 
 _IN_BATCHES = ("finishing", "information")
 
@@ -36,6 +37,11 @@ class Row:
         Whether it learns the sensor along with the shape.
     batch
         Readings that are chosen together.
+    method
+        How it infers and chooses: "particles", or "paper", with the utility "entropy" (see
+        `experiment.paper_experiment`).
+    nested_stop
+        When nested sampling ends with the method "paper": "change" or "remaining".
     """
 
     population: str = "inside"
@@ -45,6 +51,8 @@ class Row:
     width: float = 1.0
     learn_sensor: bool = False
     batch: int = 1
+    method: str = "particles"
+    nested_stop: str = "change"
 
     def __post_init__(self) -> None:
         if self.population not in POPULATIONS:
@@ -61,12 +69,26 @@ class Row:
                     raise ParameterError(name, getattr(self, name), f'{plain} with the model "naive", which has no SSF')
         if self.batch > 1 and self.utility not in _IN_BATCHES:
             raise ParameterError("batch", self.batch, f"1, or more with the utility {' or '.join(_IN_BATCHES)}")
+        if self.method not in get_args(MethodName):
+            raise ParameterError("method", self.method, " or ".join(get_args(MethodName)))
+        if self.nested_stop not in NESTED_STOP:
+            raise ParameterError("nested_stop", self.nested_stop, " or ".join(NESTED_STOP))
+        if self.method == "paper" and (self.utility, self.learn_sensor, self.batch) != ("entropy", False, 1):
+            raise ParameterError(
+                "utility, learn_sensor, batch",
+                (self.utility, self.learn_sensor, self.batch),
+                '("entropy", False, 1) with the method "paper"',
+            )
+        if self.method != "paper" and self.nested_stop != "change":
+            raise ParameterError("nested_stop", self.nested_stop, '"change", but with the method "paper"')
 
     @property
     def name(self) -> str:
         """Say in a few words in what it differs from the reference."""
         words = [self.population, "SSF" if self.model == "ssf" else "naive"]
-        if self.utility != REFERENCE.utility:
+        if self.method == "paper":
+            words.append("the paper's method" + (" to remaining evidence" if self.nested_stop == "remaining" else ""))
+        elif self.utility != REFERENCE.utility:
             words.append(self.utility)
         if self.noise_sd != REFERENCE.noise_sd:
             words.append(f"noise {self.noise_sd:g}")
@@ -84,6 +106,15 @@ class Row:
 
 
 REFERENCE = Row()
+
+
+def paper_rows(*, population: str = REFERENCE.population, nested_stop: str = "change") -> tuple[Row, ...]:
+    """List, for each sensor model, the reference's method and the paper's."""
+    paper = {"method": "paper", "utility": "entropy", "nested_stop": nested_stop}
+    ways: tuple[dict[str, Any], ...] = ({}, paper)
+    return tuple(
+        replace(REFERENCE, population=population, model=model, **way) for model in ("ssf", "naive") for way in ways
+    )
 
 
 def standard_rows() -> tuple[Row, ...]:

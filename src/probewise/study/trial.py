@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm import Pose, Reach, SimulatedArm
-from probewise.experiment import AdjustedMixture, Change, Experiment, Step, chance_off, explore
+from probewise.arm import LegoScale, Pose, Reach, SimulatedArm
+from probewise.experiment import (
+    NESTED_STOP,
+    AdjustedMixture,
+    Change,
+    Experiment,
+    NestedSampling,
+    Step,
+    chance_off,
+    explore,
+    levels_in,
+    student_t_bounds,
+)
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.priors import Normal, Product
@@ -25,7 +37,7 @@ from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
 
-__all__ = ["Trial", "arm_of", "experiment_of", "judged", "reached", "run_trial", "timed_steps"]
+__all__ = ["Trial", "arm_of", "experiment_for_trial", "experiment_of", "judged", "reached", "run_trial", "timed_steps"]
 
 SEED = 2013
 # The study's sensor: one Gaussian, mm and LEGO units; the same numbers for the robot and, by pixels, for the world.
@@ -33,6 +45,7 @@ DARK, BRIGHT = 10.0, 60.0
 _CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
 _ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
 _PIXEL_MM = 0.5
+_UNROUNDED = LegoScale(-math.inf, math.inf, None)
 
 
 @dataclass(frozen=True)
@@ -63,6 +76,7 @@ def experiment_of(row: Row) -> Experiment:
         "grid": Grid(FIELD.width_mm, FIELD.height_mm),
         "utility": utility_named(row.utility),
         "batch": row.batch,
+        "method": NestedSampling(stop=NESTED_STOP[row.nested_stop]) if row.method == "paper" else None,
     }
     shape = POPULATIONS[row.population].shape
     if row.model == "naive":
@@ -74,10 +88,24 @@ def experiment_of(row: Row) -> Experiment:
     covariance = np.array([[sd_u**2, _CORRELATION * sd_u * sd_v], [_CORRELATION * sd_u * sd_v, sd_v**2]])
     mixture = FixedMixture(np.ones(1), np.array([_CENTRE]), covariance[None])
     if not row.learn_sensor:
-        chain = Chain(mixture, FixedLevels(DARK, BRIGHT), scene, n_nodes=FAST_NODES)
+        levels = FixedLevels(DARK, BRIGHT)
+        chain = Chain(mixture, levels, scene, n_nodes=FAST_NODES)
+        if row.method == "paper":
+            return Experiment(shape, chain, student_t_bounds(levels, None), **common)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
     return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_changed())
+
+
+def experiment_for_trial(trial: Trial) -> Experiment:
+    """Pose the experiment of a row over one circle: the paper's naive robot reads black and white sheets before."""
+    posed = experiment_of(trial.row)
+    if (trial.row.method, trial.row.model) != ("paper", "naive"):
+        return posed
+    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
+    naive = levels_in(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
+    model = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), HypothesisScene(posed.shape))
+    return replace(posed, model=model, likelihood=naive)
 
 
 def run_trial(trial: Trial) -> dict[str, Any]:
@@ -92,7 +120,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     (`held`), seconds of arm time (`arm_s`), median processor time a decision (`cpu_s`), the widest posterior sd
     after each reading (`widest_mm`), and the fit (`p_value`).
     """
-    experiment = experiment_of(trial.row)
+    experiment = experiment_for_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
     for step, cpu_s in timed_steps(arm_of(trial), experiment, trial):
         last = step

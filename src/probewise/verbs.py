@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from probewise.arm import Instrument, Measures
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis, PlanAudit
-    from probewise.experiment import Exploration, Model, Step, Truth
+    from probewise.experiment import Exploration, MethodName, Model, NestedStop, Step, Truth
     from probewise.inquiry import Utility
     from probewise.progress import Progress
     from probewise.recordings import Plan, Prediction, Recording
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAX_READINGS",
+    "METHOD",
     "MODEL",
     "N_LIVE",
     "ORDERS",
@@ -43,6 +44,7 @@ ORDERS = (1, 2, 3, 4)
 N_LIVE = 300
 SHAPE = "circle"
 MODEL: Model = "ssf"
+METHOD: MethodName = "particles"
 UTILITY = "finishing"
 MAX_READINGS = 100
 
@@ -144,7 +146,10 @@ def explore(
     arm: Instrument | Measures | None = None,
     field: scene.Field | None = None,
     model: Model = MODEL,
-    utility: str | Utility = UTILITY,
+    method: MethodName = METHOD,
+    nested_stop: NestedStop | None = None,
+    levels: Recording | None = None,
+    utility: str | Utility | None = None,
     learn_sensor: bool = False,
     batch: int = 1,
     orientations_rad: float | Sequence[float] = (0.0,),
@@ -179,8 +184,18 @@ def explore(
         Width and height of the field; by default those of the paper.
     model
         The robot's sensor model: "ssf" or "naive".
+    method
+        "particles": samples carried from reading to reading. "paper": nested sampling anew after each reading, 50
+        diversified samples, the entropy of their predictions, a Student-t or naive likelihood, a complete sensor model.
+    nested_stop
+        Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or
+        "remaining" (ln Z can rise by 0.05 at most).
+    levels
+        Recording with readings over black and over white, for the levels and sds of the paper's naive model; the
+        simulated arm reads both before it starts.
     utility
-        The acquisition function: one of `inquiry.UTILITY_NAMES`, or your own utility.
+        The acquisition function: one of `inquiry.UTILITY_NAMES`, or your own utility; by default "finishing", with the
+        method "paper" its own, "entropy".
     learn_sensor
         Infer the size and position of the footprint and both levels along with the shape.
     batch
@@ -190,7 +205,7 @@ def explore(
         `probewise.experiment.experiment_for`.
     trust
         Prior probability that the sensor model is complete; below 1 the run also infers which effect it leaves out.
-        By default 0.9; 1 with the naive model, `learn_sensor`, another utility, or several shapes.
+        By default 0.9; 1 with the naive model, `learn_sensor`, another utility, several shapes, or the method "paper".
     max_readings
         Stop after so many readings at the latest.
     journal
@@ -244,7 +259,6 @@ def explore(
     from probewise.arm import instrument_of
     from probewise.calibration.sensor_file import require_sensor
     from probewise.errors import ParameterError
-    from probewise.inquiry import utility_named
     from probewise.scene import Field
 
     require_rng(rng)
@@ -253,22 +267,32 @@ def explore(
     require_sensor(sensor, "in the order explore(sensor, ...)")
     require_flag("learn_sensor", learn_sensor)
     lies = posing.shape_of(shape, field)
-    worth = utility_named(utility) if isinstance(utility, str) else utility
-    usual = posing.usual_trust(lies, model=model, learn_sensor=learn_sensor, utility=worth)
-    asked = posing.experiment_for(
+    streams, hidden = posing.Streams.of(rng), None
+    naive, wanted = None, method == "paper" and model == "naive"
+    if levels is not None or (wanted and arm is not None):
+        if levels is None or not wanted:
+            allowed = "a recording with readings over black and over white" if wanted else "None"
+            raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
+        naive = posing.levels_from(levels, sensor)
+    elif wanted:
+        world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
+        naive = posing.levels_in(world, scale, rng=streams.levels)
+    asked = posing.pose_experiment(
         sensor,
         lies,
         field,
+        method=method,
         model=model,
-        utility=worth,
+        nested_stop=nested_stop,
+        naive=naive,
+        utility=utility,
         learn_sensor=learn_sensor,
         batch=require_whole("batch", batch),
         orientations_rad=require_one_or_several("orientations_rad", orientations_rad),
         heights_mm=require_one_or_several("heights_mm", heights_mm),
         repeats=tuple(require_whole("repeats", n) for n in require_one_or_several("repeats", repeats)),
-        trust=usual if trust is None else require_number("trust", trust, "a number greater than 0, up to 1"),
+        trust=None if trust is None else require_number("trust", trust, "a number greater than 0, up to 1"),
     )
-    streams, hidden = posing.Streams.of(rng), None
     path = None if journal is None else require_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
     about = {**posing.sensor_named(sensor), "arm": "simulated" if arm is None else type(arm).__name__}

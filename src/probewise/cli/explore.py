@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from probewise.cli._arm import (
     ARMS,
+    ArmName,
     Telling,
     add_geometry,
     geometry_of,
@@ -24,11 +25,15 @@ from probewise.cli._common import Verb, a_path, add_common, add_out_directory, k
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import require_going_on, saying_what_is_kept
 from probewise.errors import FileError, ParameterError
-from probewise.verbs import MAX_READINGS, MODEL, SHAPE, UTILITY
+from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from probewise.arm import Geometry, Instrument
+    from probewise.calibration import FittedSensor
     from probewise.experiment import Journal, Model, Step
+    from probewise.inference import Naive
     from probewise.scene import Field
 
 __all__ = ["VERB"]
@@ -41,6 +46,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sensor", type=a_path, required=True, metavar="S.json", help="sensor model")
     add_out_directory(parser)
     parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="what the robot takes its sensor for")
+    parser.add_argument(
+        "--method",
+        choices=("particles", "paper"),
+        default=METHOD,
+        help="how the robot infers and chooses: with samples that it carries from reading to reading (particles, "
+        "default), or as in the paper: nested sampling anew after each reading, 50 samples diversified, the entropy of "
+        "what they predict, a Student-t or naive likelihood",
+    )
+    parser.add_argument(
+        "--nested-stop",
+        choices=("change", "remaining"),
+        help="when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
+        "where the log evidence can rise by 0.05 at most",
+    )
+    parser.add_argument(
+        "--levels",
+        type=a_path,
+        metavar="REC.csv",
+        help="recording with readings over black and over white, which the naive model of --method paper takes its "
+        "levels and sds from (a simulated arm reads both before it starts)",
+    )
     parser.add_argument(
         "--shape",
         nargs="+",
@@ -81,9 +107,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--utility",
-        default=UTILITY,
         metavar="NAME",
-        help="what a reading is worth: information and, finishing (default), near the end whether it ends the run; "
+        help=f"what a reading is worth: information and, {UTILITY} (default), near the end whether it ends the run; "
         "information alone; the paper's entropy; information per-second of arm time, "
         "information about:PARAMETER such as about:radius_mm, or on which-shape of several lies there",
     )
@@ -127,7 +152,6 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.calibration import read_sensor
     from probewise.cli._geometry import parse_truth
     from probewise.experiment import Exploration, beside, explore, read_journal
-    from probewise.inquiry import utility_named
     from probewise.recordings import write_bytes_atomically, write_text_atomically
     from probewise.report import exploration as report
     from probewise.report.animation import gif
@@ -144,27 +168,32 @@ def run(arguments: argparse.Namespace) -> int:
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
     streams = posing.Streams.of(np.random.default_rng(arguments.seed))
-    shape, utility = posing.shape_named(arguments.shape, field), utility_named(arguments.utility)
+    shape = posing.shape_named(arguments.shape, field)
     orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
+    levels_read = _levels(arguments, chosen, sensor, rng=streams.levels)
     pose_it = partial(
-        posing.experiment_for,
+        posing.pose_experiment,
         sensor,
         shape,
         field,
-        utility=utility,
+        method=arguments.method,
+        utility=arguments.utility,
+        nested_stop=arguments.nested_stop,
         orientations_rad=orientations_rad,
         repeats=repeats,
     )
-    usual = posing.usual_trust(shape, model=arguments.model, learn_sensor=arguments.learn_sensor, utility=utility)
     experiment = pose_it(
         model=arguments.model,
+        naive=levels_read if arguments.model == "naive" else None,
         learn_sensor=arguments.learn_sensor,
         batch=arguments.batch,
         heights_mm=heights_mm,
-        trust=usual if arguments.trust is None else arguments.trust,
+        trust=arguments.trust,
     )
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
-    other = pose_it(model=other_model) if arguments.both_models else None
+    other = None
+    if arguments.both_models:
+        other = pose_it(model=other_model, naive=levels_read if other_model == "naive" else None, trust=1.0)
     journal = out / "journal.jsonl"
     before = _before(journal, resume=arguments.resume)
     taken = () if before is None else before.readings
@@ -337,6 +366,31 @@ def _field(text: str | None, geometry: Geometry | None) -> Field:
     if text is not None and parse_field(text) != own:
         raise ParameterError("--field", text, f"{own.width_mm:g},{own.height_mm:g}, the geometry's; or none")
     return own
+
+
+def _levels(
+    arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
+) -> Naive | None:
+    """Take the paper's naive levels from the recording that is given; a simulated sensor reads them now."""
+    from probewise import experiment as posing
+    from probewise.recordings import read_recording
+
+    if arguments.nested_stop is not None and arguments.method != "paper":
+        raise ParameterError("--nested-stop", arguments.nested_stop, "none but with --method paper")
+    wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
+    if arguments.levels is not None:
+        if not wanted:
+            raise ParameterError("--levels", str(arguments.levels), "none but with --method paper and a naive model")
+        return posing.levels_from(read_recording(arguments.levels), sensor)
+    if not wanted:
+        return None
+    if chosen.kind in ("nxt", "file"):
+        raise ParameterError(
+            "--levels",
+            "none",
+            "a recording of readings over a black and a white sheet, for the naive model of the paper",
+        )
+    return posing.levels_in(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
 
 
 def _before(journal: Path, *, resume: bool) -> Journal | None:

@@ -26,6 +26,11 @@ DLOGZ = 0.5  # the last live points are posterior samples too: letting them die 
 class Method(Protocol):
     """Infer after every reading. A frozen dataclass, so that a journal can name it."""
 
+    @property
+    def label(self) -> str:
+        """Name it in a few words, for a report."""
+        ...
+
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """Take in the last reading of a recording.
 
@@ -60,6 +65,11 @@ class SequentialMonteCarlo:
 
     n_particles: int
     n_live: int
+
+    @property
+    def label(self) -> str:
+        """See `Method.label`."""
+        return f"sequential Monte Carlo, {self.n_particles} samples carried from reading to reading"
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`."""

@@ -90,6 +90,11 @@ class NestedSampling:
     n_steps: int = _N_STEPS
     move: Move = field(default_factory=KernelMove)
 
+    @property
+    def label(self) -> str:
+        """See `Method.label`."""
+        return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
+
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`; every kind of hypotheses has a run of its own."""
         found = tuple(
@@ -185,7 +190,10 @@ def paper_experiment(
             raise ParameterError(name, value, " or ".join(map(repr, allowed)))
     sensor = sensor.leading()
     scale, scene = scale_of(sensor.instrumentation), HypothesisScene(shape)
+    if naive is not None and model != "naive":
+        raise ParameterError("naive", naive, 'None, but with the model "naive"')
     levels, noise_sd = levels_of(sensor), float(sensor.noise_sd.mean())
+    seen: Chain | NaiveSensor
     likelihood: Naive | OneScan
     if model == "naive":
         if naive is None:
@@ -235,6 +243,7 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
         If there are fewer than two of either.
     """
     require_recording(recording)
+    require_sensor(sensor)
     require_described(recording.plan)
     mixture, patterns = sensor.leading().mixture(), KnownScene(recording.plan.patterns)
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)

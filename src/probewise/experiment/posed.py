@@ -55,25 +55,32 @@ def pose_experiment(
         If an option does not go with the method.
     """
     worth = utility_named(utility) if isinstance(utility, str) else utility
-    choices = {"orientations_rad": orientations_rad, "repeats": repeats, "heights_mm": heights_mm}
     if method == "paper":
         refused = (
-            ("utility", utility, worth is None or isinstance(worth, ReadingEntropy), "entropy"),
-            ("learn_sensor", learn_sensor, not learn_sensor, "False"),
-            ("batch", batch, batch == 1, "1"),
-            ("trust", trust, trust in (None, 1), "1, for it takes its sensor for complete,"),
+            ("utility", utility, worth is None or isinstance(worth, ReadingEntropy), "entropy, which is the paper's,"),
+            ("learn_sensor", learn_sensor, not learn_sensor, "False, since the sensor is known,"),
+            ("batch", batch, batch == 1, "1, since each reading is chosen by all before it,"),
+            ("trust", trust, trust in (None, 1), "1, since the sensor model is taken for complete,"),
         )
         for name, value, fits, allowed in refused:
             if not fits:
-                raise ParameterError(name, value, f'{allowed} with the method "paper"')
+                raise ParameterError(name, value, f"{allowed} with the paper's method")
         return paper_experiment(
-            sensor, shape, field, model=model, nested_stop=nested_stop or "change", naive=naive, **choices
+            sensor,
+            shape,
+            field,
+            model=model,
+            nested_stop=nested_stop or "change",
+            naive=naive,
+            orientations_rad=orientations_rad,
+            repeats=repeats,
+            heights_mm=heights_mm,
         )
     if method != "particles":
         raise ParameterError("method", method, " or ".join(map(repr, get_args(MethodName))))
-    for name, value in (("nested_stop", nested_stop), ("naive", naive)):
-        if value is not None:
-            raise ParameterError(name, value, 'None, but with the method "paper"')
+    for name, given in (("nested_stop", nested_stop), ("naive", naive)):
+        if given is not None:
+            raise ParameterError(name, given, "None, but with the paper's method")
     worth = Finishing() if worth is None else worth
     usual = usual_trust(shape, model=model, learn_sensor=learn_sensor, utility=worth)
     return experiment_for(
@@ -85,5 +92,7 @@ def pose_experiment(
         learn_sensor=learn_sensor,
         batch=batch,
         trust=usual if trust is None else trust,
-        **choices,
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+        heights_mm=heights_mm,
     )

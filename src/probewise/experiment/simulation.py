@@ -259,6 +259,7 @@ def scale_of(instrumentation: Instrumentation) -> LegoScale:
 
 def world_like(sensor: FittedSensor) -> World:
     """Build the world that a sensor.json describes: its mean field as the spot, its levels, noise and height."""
+    require_sensor(sensor)
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
     # A fitted field of free form may dip below zero; what light there is never does.

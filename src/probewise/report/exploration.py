@@ -216,6 +216,7 @@ def write_page(
     off = probability(chance_off(run.experiment, run.posterior, OFF_MM))
     facts = [
         ("sensor model", MODEL_NAMES.get(model, model)),
+        ("inference", run.experiment.learning.label),
         ("stopped because", run.stop_reason),
         ("cost", spent),
         ("information", gained),

@@ -7,7 +7,7 @@ The packages below offer the same with every option. Heavy imports happen inside
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,13 +18,15 @@ if TYPE_CHECKING:
     from probewise.arm import Instrument, Measures
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis, PlanAudit
-    from probewise.experiment import Exploration, MethodName, Model, NestedStop, Step, Truth
+    from probewise.experiment import Exploration, MethodName, Model, Step, Truth
     from probewise.inquiry import Utility
+    from probewise.nested import NestedStop
     from probewise.progress import Progress
     from probewise.recordings import Plan, Prediction, Recording
     from probewise.scene import Shape
 
 __all__ = [
+    "CALIBRATION",
     "MAX_READINGS",
     "METHOD",
     "MODEL",
@@ -42,6 +44,7 @@ __all__ = [
 # Defaults of the command line and of the functions below.
 ORDERS = (1, 2, 3, 4)
 N_LIVE = 300
+CALIBRATION: Literal["refined", "paper"] = "refined"
 SHAPE = "circle"
 MODEL: Model = "ssf"
 METHOD: MethodName = "particles"
@@ -54,6 +57,8 @@ def calibrate(
     *,
     orders: Sequence[int] = ORDERS,
     n_live: int = N_LIVE,
+    method: Literal["refined", "paper"] = CALIBRATION,
+    nested_stop: NestedStop | None = None,
     rng: np.random.Generator,
     progress: bool | Progress = True,
 ) -> Calibration:
@@ -67,6 +72,12 @@ def calibrate(
         Numbers of Gaussians to compare.
     n_live
         Live points of nested sampling: fewer are faster but make the evidences less precise.
+    method
+        "refined": widths evenly probable over orders of magnitude, each evidence refined by importance sampling.
+        "paper": uniform priors, and the evidence of nested sampling alone. Both have the Student-t likelihood.
+    nested_stop
+        Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or "remaining"
+        (where ln Z can rise by 0.05 at most).
     rng
         Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise calibrate --seed`.
     progress
@@ -98,9 +109,26 @@ def calibrate(
     """
     from probewise import calibration
     from probewise._progress import of_nested, progress_or_bar
+    from probewise.errors import ParameterError
+    from probewise.nested import NESTED_STOP
 
+    if method not in ("refined", "paper"):
+        raise ParameterError("method", method, "'refined' or 'paper'")
+    paper = method == "paper"
+    if nested_stop is not None and not (paper and nested_stop in NESTED_STOP):
+        allowed = " or ".join(map(repr, NESTED_STOP)) if paper else "None"
+        raise ParameterError("nested_stop", nested_stop, f'{allowed} with the method "{method}"')
     with progress_or_bar(progress) as told:
-        return calibration.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=of_nested(told))
+        return calibration.calibrate(
+            recording,
+            orders=orders,
+            n_live=n_live,
+            prior=calibration.paper_prior if paper else calibration.default_prior,
+            stop=NESTED_STOP[nested_stop or "change"] if paper else None,
+            refined=not paper,
+            rng=rng,
+            progress=of_nested(told),
+        )
 
 
 def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:

@@ -8,7 +8,15 @@ from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_mo
 from probewise.calibration.fit import Calibration, OrderFit, calibrate, problem_for
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
 from probewise.calibration.prediction import predict
-from probewise.calibration.priors import PriorRow, ScanGeometry, SSFPrior, blind_axis_rad, default_prior, scan_geometry
+from probewise.calibration.priors import (
+    PriorRow,
+    ScanGeometry,
+    SSFPrior,
+    blind_axis_rad,
+    default_prior,
+    paper_prior,
+    scan_geometry,
+)
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
 from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 
@@ -30,6 +38,7 @@ __all__ = [
     "mean_field",
     "mixture_moments",
     "noise_by_scan",
+    "paper_prior",
     "pooled_sd",
     "predict",
     "problem_for",

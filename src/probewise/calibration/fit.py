@@ -23,7 +23,7 @@ from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, def
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor, student_t
-from probewise.nested import NestedResult, RoundSummary, Weighted, refine, run
+from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_described, require_recording
 from probewise.scene import KnownScene
@@ -43,24 +43,29 @@ _UNINFORMED = 0.7
 class OrderFit:
     """The fit of an SSF of `n_gaussians` Gaussians: prior, nested sampling run, fitted sensor.
 
-    `refined` holds the evidence by importance sampling, an independent estimate, more precise where it is sound.
+    `refined` holds the evidence by importance sampling, an independent estimate, more precise where it is sound; None
+    where nested sampling alone was asked for.
     """
 
     n_gaussians: int
     prior: SSFPrior
     result: NestedResult
-    refined: Weighted
+    refined: Weighted | None
     sensor: FittedSensor
 
     @property
     def log_z(self) -> float:
         """Natural log of the evidence: the refined estimate where it is sound."""
-        return self.refined.log_z if self.refined.sound else self.result.log_z
+        return self._best.log_z
 
     @property
     def log_z_error(self) -> float:
         """Standard error of log Z."""
-        return self.refined.log_z_error if self.refined.sound else self.result.log_z_error
+        return self._best.log_z_error
+
+    @property
+    def _best(self) -> Weighted | NestedResult:
+        return self.result if self.refined is None or not self.refined.sound else self.refined
 
     @property
     def field(self) -> SSFField:
@@ -140,6 +145,8 @@ def calibrate(
     rng: np.random.Generator,
     progress: Callable[[int, RoundSummary], None] | None = None,
     prior: Callable[[Recording, int], SSFPrior] = default_prior,
+    stop: StopRule | None = None,
+    refined: bool = True,
     data_sets: IntArray | None = None,
     pixel_mm: float | None = None,
     n_samples: int = _N_SAMPLES,
@@ -160,7 +167,11 @@ def calibrate(
     progress
         Called with the order and a `RoundSummary` after every round; not with a process pool.
     prior
-        Function that makes the prior from the recording and an order.
+        Function that makes the prior from the recording and an order; `paper_prior` is the paper's.
+    stop
+        When nested sampling ends; default `RemainingEvidence()`. The paper's rule is `EvidenceChange(1e-8)`.
+    refined
+        Whether to refine each evidence by importance sampling; the paper's is of nested sampling alone.
     data_sets
         Data set of each row, each with its own noise sd, (n_points,) from 0; default: its scan.
     pixel_mm
@@ -198,6 +209,8 @@ def calibrate(
         n_live=n_live,
         progress=progress,
         prior=prior,
+        stop=stop,
+        refined=refined,
         data_sets=data_sets,
         pixel_mm=pixel_mm,
         n_samples=n_samples,
@@ -238,6 +251,8 @@ def _fit_order(
     n_live: int,
     progress: Callable[[int, RoundSummary], None] | None,
     prior: Callable[[Recording, int], SSFPrior],
+    stop: StopRule | None,
+    refined: bool,
     data_sets: IntArray | None,
     pixel_mm: float | None,
     n_samples: int,
@@ -252,15 +267,13 @@ def _fit_order(
     order_prior = prior(recording, n_gaussians)
     problem = problem_for(recording, order_prior, data_sets=data_sets)
     report = None if progress is None else _for_order(progress, n_gaussians)
-    result = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
-    refined = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
-    apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
-    if apart > _DISAGREE and set(refined.doubts) <= set(refined.inherited):
-        notes = (
-            *notes,
-            f"two estimates of the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
-            f"{result.log_z_error:.2f} and {refined.log_z:.2f} ± {refined.log_z_error:.2f}; use more live points",
-        )
+    result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
+    more_precise = None
+    if refined:
+        more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
+        notes = (*notes, *_disagreement(n_gaussians, result, more_precise))
+    else:
+        notes = (*notes, f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}")
     sensor = _fitted(
         recording,
         problem,
@@ -271,7 +284,18 @@ def _fit_order(
         notes=notes,
         rng=rng,
     )
-    return OrderFit(n_gaussians, order_prior, result, refined, sensor)
+    return OrderFit(n_gaussians, order_prior, result, more_precise, sensor)
+
+
+def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
+    """Say so where the two estimates of an evidence do not agree within their errors."""
+    apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
+    if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
+        return ()
+    return (
+        f"two estimates of the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
+        f"{result.log_z_error:.2f} and {refined.log_z:.2f} ± {refined.log_z_error:.2f}; use more live points",
+    )
 
 
 def _for_order(progress: Callable[[int, RoundSummary], None], n_gaussians: int) -> Callable[[RoundSummary], None]:

@@ -6,13 +6,13 @@ mass on footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a un
 of a width is unknown, so A and B are log-uniform, with bounds from what the scans can resolve and
 contain. Likewise, with a uniform amplitude a, a narrow Gaussian has almost no mass, so a superfluous
 Gaussian is hidden there at little cost in evidence; here the mass of a Gaussian,
-a pi / sqrt(A B - C^2), is uniform. `SSFPrior(precision=Uniform(...), unit_mass_mm2=None)` is the paper's.
+a pi / sqrt(A B - C^2), is uniform. `paper_prior` is uniform in A, B and a.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,7 +25,7 @@ from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
 from probewise.recordings import Uniform as UniformPattern
 from probewise.scene import KnownScene
 
-__all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "blind_axis_rad", "default_prior", "scan_geometry"]
+__all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "blind_axis_rad", "default_prior", "paper_prior", "scan_geometry"]
 
 _MAX_CORRELATION = 0.98
 _SAME_AXIS = 0.01  # chord of the doubled angle; it equals 0.3 degrees
@@ -294,6 +294,26 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
             ),
             ("levels", level),
         ),
+    )
+
+
+def paper_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
+    """Believe as the paper does: uniformly in each a, u, v, A, B, C and level, within the bounds of `default_prior`.
+
+    The paper prints no bounds. C is uniform where A and B leave the Gaussian positive definite.
+
+    Raises
+    ------
+    ParameterError
+        See `default_prior`.
+    """
+    usual = default_prior(recording, n_gaussians)
+    bounds = usual.precision
+    if not isinstance(bounds, LogUniform):
+        raise TypeError("default_prior spreads the precisions evenly over orders of magnitude")
+    reasons = {**dict(usual.reasons), "precision": "as in the paper, which prints no bounds; these are the usual ones"}
+    return replace(
+        usual, precision=Uniform(bounds.low, bounds.high), unit_mass_mm2=None, reasons=tuple(reasons.items())
     )
 
 

@@ -9,7 +9,7 @@ from probewise.cli._common import Verb, a_path, add_common, add_out_directory, p
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
-from probewise.verbs import N_LIVE, ORDERS
+from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
 __all__ = ["VERB"]
 
@@ -33,6 +33,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"live points of nested sampling (default {N_LIVE})",
     )
+    parser.add_argument(
+        "--method",
+        choices=("refined", "paper"),
+        default=CALIBRATION,
+        help="refined (default): widths evenly probable over orders of magnitude, each evidence refined by importance "
+        "sampling; or as in the paper: uniform priors, the evidence of nested sampling alone",
+    )
+    parser.add_argument(
+        "--nested-stop",
+        choices=("change", "remaining"),
+        help="when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
+        "where the log evidence can rise by 0.05 at most",
+    )
     add_common(parser)
 
 
@@ -46,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.recordings import read_recording, write_bytes_atomically, write_text_atomically
     from probewise.report import calibration as report
 
+    if arguments.nested_stop is not None and arguments.method != "paper":
+        raise ParameterError("--nested-stop", arguments.nested_stop, "none but with --method paper")
     refuse_journal(arguments.recording)
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
@@ -53,7 +68,15 @@ def run(arguments: argparse.Namespace) -> int:
         orders = tuple(sorted(set(arguments.orders)))
         n_live = _enough_live(arguments.live, orders)
         rng = np.random.default_rng(arguments.seed)
-        result = verbs.calibrate(recording, orders=orders, n_live=n_live, rng=rng, progress=progress)
+        result = verbs.calibrate(
+            recording,
+            orders=orders,
+            n_live=n_live,
+            method=arguments.method,
+            nested_stop=arguments.nested_stop,
+            rng=rng,
+            progress=progress,
+        )
         prediction = predict(result.sensor, recording, progress=progress)
         progress("drawing the figures")
         drawn = report.figures(result, recording, prediction)

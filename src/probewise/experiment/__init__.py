@@ -21,9 +21,7 @@ from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.paper import (
-    NESTED_STOP,
     NestedSampling,
-    NestedStop,
     levels_from,
     levels_in,
     paper_experiment,
@@ -50,7 +48,6 @@ from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
 
 __all__ = [
     "CLEAN",
-    "NESTED_STOP",
     "OFF_MM",
     "PAPER_BITS",
     "TRUST",
@@ -71,7 +68,6 @@ __all__ = [
     "MethodName",
     "Model",
     "NestedSampling",
-    "NestedStop",
     "OneScan",
     "SequentialMonteCarlo",
     "State",

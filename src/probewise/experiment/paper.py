@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -26,11 +26,12 @@ from probewise.experiment.simulation import Model, calibrated_height, chain_of, 
 from probewise.inference import Naive
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.nested import (
+    NESTED_STOP,
     EvidenceChange,
     KernelMove,
     Move,
     NestedResult,
-    RemainingEvidence,
+    NestedStop,
     StopRule,
     Weighted,
     diversify,
@@ -45,10 +46,8 @@ from probewise.sensor import FAST_NODES, Chain, FixedLevels, NaiveSensor
 from probewise.world import World
 
 __all__ = [
-    "NESTED_STOP",
     "N_LIVE",
     "NestedSampling",
-    "NestedStop",
     "levels_from",
     "levels_in",
     "paper_experiment",
@@ -57,11 +56,6 @@ __all__ = [
 
 N_LIVE = 300
 """Live points of nested sampling in the paper."""
-
-NestedStop: TypeAlias = Literal["change", "remaining"]
-
-NESTED_STOP: dict[str, StopRule] = {"change": EvidenceChange(1e-8), "remaining": RemainingEvidence(0.05)}
-"""When nested sampling ends: the paper's rule, a change of ln Z below 1e-8, or when ln Z can rise by 0.05 at most."""
 
 _N_SAMPLES = 50
 _N_STEPS = 1000

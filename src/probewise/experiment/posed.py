@@ -6,11 +6,12 @@ from typing import Literal, TypeAlias, get_args
 
 from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
-from probewise.experiment.paper import NestedStop, paper_experiment
+from probewise.experiment.paper import paper_experiment
 from probewise.experiment.setting import Experiment
 from probewise.experiment.simulation import Model, experiment_for, usual_trust
 from probewise.inference import Naive
 from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
+from probewise.nested import NestedStop
 from probewise.scene import Field, Shape
 
 __all__ = ["MethodName", "pose_experiment"]

@@ -17,10 +17,19 @@ from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
 from probewise.nested.sampler import LIVE_PER_PARAM, least_live, step
-from probewise.nested.stop import EvidenceChange, RemainingEvidence, RoundSummary, State, StopRule
+from probewise.nested.stop import (
+    NESTED_STOP,
+    EvidenceChange,
+    NestedStop,
+    RemainingEvidence,
+    RoundSummary,
+    State,
+    StopRule,
+)
 
 __all__ = [
     "LIVE_PER_PARAM",
+    "NESTED_STOP",
     "Agreement",
     "Bound",
     "Check",
@@ -30,6 +39,7 @@ __all__ = [
     "KernelMove",
     "Move",
     "NestedResult",
+    "NestedStop",
     "Points",
     "Posed",
     "PriorRejection",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from probewise.errors import ParameterError
 
-__all__ = ["EvidenceChange", "RemainingEvidence", "RoundSummary", "StopRule"]
+__all__ = ["NESTED_STOP", "EvidenceChange", "NestedStop", "RemainingEvidence", "RoundSummary", "StopRule"]
 
 
 @dataclass(frozen=True)
@@ -79,3 +79,9 @@ class EvidenceChange:
             return f"consecutive values of log Z differ by less than {self.tolerance:g}"
         held = _ON_PLATEAU(state) if state.level else None
         return held and f"all live points have the same likelihood, and {held}"
+
+
+NestedStop: TypeAlias = Literal["change", "remaining"]
+
+NESTED_STOP: dict[NestedStop, StopRule] = {"change": EvidenceChange(), "remaining": RemainingEvidence()}
+"""Rules by name: the paper's, a change of ln Z below 1e-8; and what remains, at most 0.05 of ln Z."""

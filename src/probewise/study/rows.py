@@ -7,8 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
 from probewise.errors import ParameterError
-from probewise.experiment import NESTED_STOP, MethodName
+from probewise.experiment import MethodName
 from probewise.inquiry import utility_named
+from probewise.nested import NESTED_STOP, NestedStop
 from probewise.study.circles import POPULATIONS
 
 __all__ = ["REFERENCE", "Row", "paper_rows", "standard_rows"]
@@ -52,7 +53,7 @@ class Row:
     learn_sensor: bool = False
     batch: int = 1
     method: str = "particles"
-    nested_stop: str = "change"
+    nested_stop: NestedStop = "change"
 
     def __post_init__(self) -> None:
         if self.population not in POPULATIONS:
@@ -108,7 +109,7 @@ class Row:
 REFERENCE = Row()
 
 
-def paper_rows(*, population: str = REFERENCE.population, nested_stop: str = "change") -> tuple[Row, ...]:
+def paper_rows(*, population: str = REFERENCE.population, nested_stop: NestedStop = "change") -> tuple[Row, ...]:
     """List, for each sensor model, the reference's method and the paper's."""
     paper = {"method": "paper", "utility": "entropy", "nested_stop": nested_stop}
     ways: tuple[dict[str, Any], ...] = ({}, paper)

@@ -15,7 +15,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm import LegoScale, Pose, Reach, SimulatedArm
 from probewise.experiment import (
-    NESTED_STOP,
     AdjustedMixture,
     Change,
     Experiment,
@@ -28,6 +27,7 @@ from probewise.experiment import (
 )
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
+from probewise.nested import NESTED_STOP
 from probewise.priors import Normal, Product
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene

@@ -223,6 +223,27 @@ MISTAKES = {
     "no shape": (lambda: probewise.explore(SENSOR, shape=None, rng=RNG), "shape is None; allowed: a shape such as"),
     "a size as field": (lambda: probewise.explore(SENSOR, field=(1048, 520), rng=RNG), r"allowed: a Field: Field\("),
     "an unknown model": (lambda: probewise.explore(SENSOR, model="SSF", rng=RNG), "model is 'SSF'; allowed: 'ssf' or"),
+    "an unknown method": (
+        lambda: probewise.explore(SENSOR, method="p", rng=RNG),
+        "method is 'p'; allowed: 'particles' or",
+    ),
+    "levels for nobody": (lambda: probewise.explore(SENSOR, levels=RECORDING, rng=RNG), "levels is .*; allowed: None"),
+    "no levels": (
+        lambda: probewise.explore(SENSOR, method="paper", model="naive", arm=ARM, rng=RNG),
+        "levels is None; allowed: a recording with readings over black and over white",
+    ),
+    "a path to the paper's robot": (
+        lambda: probewise.explore("s.json", method="paper", model="naive", rng=RNG),
+        A_SENSOR,
+    ),
+    "another calibration": (
+        lambda: probewise.calibrate(RECORDING, method="paper's", rng=RNG),
+        "method is .*; allowed: 'refined' or 'paper'",
+    ),
+    "a stop for nobody": (
+        lambda: probewise.calibrate(RECORDING, nested_stop="change", rng=RNG),
+        "nested_stop is 'change'; allowed: None",
+    ),
     "an unknown utility": (lambda: probewise.explore(SENSOR, utility="bits", rng=RNG), "utility is 'bits'; allowed"),
     "a number as utility": (lambda: probewise.explore(SENSOR, utility=3, rng=RNG), "utility is 3; allowed: a utility"),
     "readings as text": (lambda: probewise.explore(SENSOR, max_readings="9", rng=RNG), "max_readings is '9'; allowed"),

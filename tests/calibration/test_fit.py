@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from probewise._arrays import FloatArray
-from probewise.calibration import Calibration, calibrate, default_prior, predict, problem_for
+from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
 from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth, wilson_interval
 from probewise.calibration.distinct import DistinctRows
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
-from probewise.nested import RoundSummary
+from probewise.nested import EvidenceChange, RoundSummary
 from probewise.recordings import Recording, fingerprint
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
@@ -199,3 +199,30 @@ def test_orders_run_elsewhere_give_the_same_result(recording):
     )
     assert [o.log_z for o in here.orders] == [o.log_z for o in there.orders]
     np.testing.assert_array_equal(here.sensor.samples, there.sensor.samples)
+
+
+def test_the_papers_priors_are_uniform_within_the_usual_bounds(recording: Recording) -> None:
+    """A quarter of each unit interval is a quarter of each range; C fills what A and B leave it."""
+    usual, paper = default_prior(recording, 1), paper_prior(recording, 1)
+    ends = np.array([[0.0] * 8, [1.0] * 8])
+    lower, upper = paper.from_unit_cube(ends)
+    quarter = paper.from_unit_cube(np.full((1, 8), 0.25))[0]
+    flat = [0, 1, 2, 3, 4, 6, 7]
+    np.testing.assert_allclose(quarter[flat], (0.75 * lower + 0.25 * upper)[flat])
+    np.testing.assert_allclose([lower[1:5], upper[1:5]], usual.from_unit_cube(ends)[:, 1:5])
+    assert quarter[5] == pytest.approx(-0.5 * 0.98 * np.sqrt(quarter[3] * quarter[4]))
+    inside = paper.log_prob(np.array([quarter, quarter * [2, 1, 1, 1, 1, 1, 1, 1]]))
+    assert inside[0] == inside[1]
+
+
+@pytest.mark.slow
+def test_the_papers_evidence_is_that_of_importance_sampling_under_the_same_prior(recording: Recording) -> None:
+    """Two routes to one number: nested sampling to a change of 1e-8, and importance sampling from another run."""
+    common = {"orders": [1], "n_live": 100, "prior": paper_prior}
+    paper = calibrate(recording, rng=np.random.default_rng(1), stop=EvidenceChange(1e-8), refined=False, **common)
+    other = calibrate(recording, rng=np.random.default_rng(2), **common)
+    (nested,), (refined,) = paper.fits, other.fits
+    assert nested.refined is None
+    assert refined.refined.sound
+    assert abs(nested.log_z - refined.log_z) < 4 * np.hypot(nested.log_z_error, refined.log_z_error)
+    assert "nested sampling alone" in paper.sensor.notes[-1]

@@ -202,3 +202,54 @@ def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, mo
     moves = [note for note in told if "moving to (" in note]
     assert [note.partition(",")[0] for note in moves] == ["reading 1", "reading 2"]
     assert "; widest sd" in moves[1]
+
+
+PAPER = ("--method", "paper", "--nested-stop", "remaining")
+
+
+def test_the_papers_robot_leaves_what_the_other_leaves_and_its_journal_names_it(explore, tmp_path, capsys):
+    status, lines = explore(*PAPER, "--max-readings", 1)
+    assert status == 0
+    assert lines[0]["method"].startswith("NestedSampling(n_live=300, stop=RemainingEvidence(dlogz=0.05), n_steps=1000")
+    assert lines[0]["utility"] == "ReadingEntropy(bin_width=1.0)"
+    assert lines[0]["options"]["trust"] == 1.0
+    assert lines[0]["likelihood"].startswith("OneScan(")
+    assert {"mean", "sd", "bits", "next"} == set(lines[1]["belief"])
+    found = json.loads((tmp_path / "found" / "result.json").read_text())
+    assert found["readings"] == 1
+    assert "nested sampling anew after each reading" in (tmp_path / "found" / "report.html").read_text()
+    assert "radius_mm" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_papers_robot_goes_on_bit_for_bit_from_its_journal(explore, tmp_path):
+    naive = (*PAPER, "--model", "naive", "--max-readings", 3)
+    _, whole = explore(*naive)
+    journal = tmp_path / "found" / "journal.jsonl"
+    journal.write_text("".join(line + "\n" for line in journal.read_text().splitlines()[:2]))
+    status, resumed = explore(*naive, "--resume")
+    assert status == 0
+    assert resumed == whole
+    assert whole[0]["likelihood"].startswith("Naive(mu_black=")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--method", "paper", "--trust", "0.9"), "trust is 0.9; allowed: 1"),
+        (("--method", "paper", "--utility", "finishing"), "utility is 'finishing'; allowed: entropy"),
+        (("--method", "paper", "--learn-sensor"), "learn_sensor is True; allowed: False"),
+        (("--method", "paper", "--batch", "2"), "batch is 2; allowed: 1"),
+        (("--nested-stop", "change"), "--nested-stop is 'change'; allowed: none but with --method paper"),
+        (("--levels", "x.csv"), "--levels is 'x.csv'; allowed: none but with --method paper and a naive model"),
+        (("--method", "paper", "--levels", "x.csv"), "--levels is 'x.csv'; allowed: none but with"),
+        (("--method", "paper", "--model", "naive", "--arm", "nxt:x"), "--levels is 'none'; allowed: a recording"),
+    ],
+)
+def test_what_does_not_go_with_a_method_is_refused_before_anything_is_written(
+    sensor_file, tmp_path, capsys, options, named
+):
+    out = tmp_path / "found"
+    assert main(["explore", "--sensor", str(sensor_file), "--out", str(out), *options]) == 2
+    assert named in capsys.readouterr().err
+    assert not out.exists()

@@ -318,3 +318,19 @@ def test_clusters_are_found_where_they_are_and_not_where_they_are_not(rng: np.ra
     home = clusters.assign(two)
     assert len(np.unique(home[:220])) == len(np.unique(home[220:])) == 1
     assert home[0] != home[-1]
+
+
+def test_the_papers_rule_ends_a_run_on_a_plateau_before_its_points_are_copies():
+    """Evidence of two steps by hand: 0.9 of the prior at 1, a tenth at e^5."""
+
+    class Steps:
+        prior = problems.box(1, 0.0, 1.0)
+
+        def log_likelihood(self, theta):
+            return 5.0 * (theta[:, 0] > 0.9)
+
+    result = run(Steps(), rng=np.random.default_rng(4), n_live=100, stop=EvidenceChange(1e-8))
+    assert "same likelihood" in result.stop_reason
+    assert result.warnings == ()
+    assert abs(result.log_z - np.log(0.9 + 0.1 * np.exp(5.0))) < 5 * result.log_z_error
+    assert len(np.unique(result.theta, axis=0)) == len(result.theta)

@@ -7,7 +7,8 @@ import pytest
 
 from probewise.campaign import run_campaign
 from probewise.errors import FileError, ParameterError
-from probewise.study import REFERENCE, Row, Trial, read_study, run_study, run_trial
+from probewise.study import REFERENCE, Row, Trial, paper_rows, read_study, run_study, run_trial
+from probewise.study.trial import experiment_for_trial
 
 ROWS = [REFERENCE, Row(model="naive")]
 BRIEF = {"n_circles": 2, "max_readings": 3}
@@ -43,6 +44,37 @@ def test_a_run_that_may_not_go_on_is_a_miss(study):
         assert [t["readings"] for t in study[0].trials[row]] == [3, 3]
         assert table[row].mean.value == 3
         assert table[row].reached.value == 0
+
+
+def test_the_papers_method_stands_beside_ours_on_the_same_circle():
+    """The first place is drawn by the same rule from other samples; levels come from readings before the run."""
+    ours, paper, _, naive = rows = paper_rows(nested_stop="remaining")
+    assert [row.method for row in rows] == ["particles", "paper"] * 2
+    assert paper.name == "inside, SSF, the paper's method to remaining evidence"
+    assert ours == REFERENCE
+    for row in (paper, naive):
+        found = run_trial(Trial(row, 0, max_readings=1))
+        assert (found["readings"], found["reached"]) == (1, False)
+    one, again, other = (experiment_for_trial(Trial(naive, k)).likelihood for k in (0, 0, 1))
+    assert one == again != other
+    assert abs(one.mu_black - 10) < 5 / 20**0.5
+    assert abs(one.mu_white - 60) < 5 / 20**0.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"method": "other"}, "method"),
+        ({"method": "paper"}, "utility, learn_sensor, batch"),
+        ({"method": "paper", "utility": "entropy", "batch": 2}, "utility, learn_sensor, batch"),
+        ({"method": "paper", "utility": "entropy", "nested_stop": "never"}, "nested_stop"),
+        ({"nested_stop": "remaining"}, "nested_stop"),
+    ],
+)
+def test_rows_that_cannot_be_are_refused(changes, named):
+    with pytest.raises(ParameterError) as caught:
+        Row(**changes)
+    assert caught.value.name == named
 
 
 @pytest.mark.slow

@@ -378,7 +378,9 @@ def _search_section(
                 "Both robots start with the same reading on white and go on by the paper's rule, a place of highest "
                 "entropy (paper, figures 2 and 8). With the naive model (left) the circles cut the field into cells "
                 "of even entropy, at most 1 bit. With the SSF model (right) the circles' edges are bright: a reading "
-                "there also says how much of the edge the sensor sees.",
+                "there also says how much of the edge the sensor sees. Their inference is not the paper's: they "
+                "carry samples from reading to reading. The paper's, nested sampling anew after each reading, is "
+                "probewise explore --method paper.",
             ),
             comparison_table(started_alike),
         ),

@@ -76,8 +76,8 @@ def calibrate(
         "refined": widths evenly probable over orders of magnitude, each evidence refined by importance sampling.
         "paper": uniform priors, and the evidence of nested sampling alone. Both have the Student-t likelihood.
     nested_stop
-        Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or "remaining"
-        (where ln Z can rise by 0.05 at most).
+        Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or
+        "remaining" (ln Z can rise by 0.05 at most).
     rng
         Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise calibrate --seed`.
     progress

@@ -66,7 +66,7 @@ def test_the_papers_method_stands_beside_ours_on_the_same_circle():
     [
         ({"method": "other"}, "method"),
         ({"method": "paper"}, "utility, learn_sensor, batch"),
-        ({"method": "paper", "utility": "entropy", "batch": 2}, "utility, learn_sensor, batch"),
+        ({"method": "paper", "utility": "entropy", "learn_sensor": True}, "utility, learn_sensor, batch"),
         ({"method": "paper", "utility": "entropy", "nested_stop": "never"}, "nested_stop"),
         ({"nested_stop": "remaining"}, "nested_stop"),
     ],

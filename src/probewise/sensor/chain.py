@@ -16,7 +16,7 @@ from probewise.recordings.columns import undescribed
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
-from probewise.sensor.commanded import height_ratio, is_commanded, light_of, raised_as_commanded
+from probewise.sensor.commanded import height_ratio, is_commanded, led_state, raised_as_commanded
 from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, seen_by_one, turned
 from probewise.sensor.ssf import FieldSSF, FreeMixture, SSFModel
@@ -195,7 +195,7 @@ class Chain:
         apply = self._applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
         i_min, i_max = self._levels(theta)
-        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * light_of(plan) * view.brightness * seen)
+        reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * led_state(plan) * view.brightness * seen)
         for stage in (Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             reading = apply(stage, reading)
         shape = (len(theta), len(plan))

@@ -14,7 +14,7 @@ from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint
 
-__all__ = ["COMMANDED", "height_ratio", "is_commanded", "light_of", "raised", "raised_as_commanded"]
+__all__ = ["COMMANDED", "height_ratio", "is_commanded", "led_state", "raised", "raised_as_commanded"]
 
 COMMANDED = ("height_mm", "led")
 
@@ -24,7 +24,7 @@ def is_commanded(plan: Plan) -> bool:
     return "led" in plan.covariates or height_ratio(plan) is not None
 
 
-def light_of(plan: Plan) -> FloatArray:
+def led_state(plan: Plan) -> FloatArray:
     """Return the LED's state at each reading, 0 or 1, (n_points,) or (1,)."""
     led = plan.covariates.get("led")
     return np.ones(1) if led is None else np.where(np.isfinite(led), led, 1.0)

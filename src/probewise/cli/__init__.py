@@ -3,7 +3,8 @@
 The paper's road as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
 (sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can tell), `diagnose` (what the
 model leaves out), `predict` (eq. of the sensor model with its uncertainty) and `demo`, which does
-all of them at once; `arm` moves and reads the LEGO arm, `emulate-nxt` stands in for it.
+all of them at once; `sheets` draws what is printed for a bench, `arm` moves and reads the LEGO arm,
+`emulate-nxt` stands in for it.
 
 Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
 2: input that cannot be used, told in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).
@@ -29,6 +30,7 @@ from probewise.cli import (
     fit,
     investigate,
     predict,
+    sheets,
     study,
 )
 from probewise.cli._common import OneLineParser, Verb
@@ -48,6 +50,7 @@ VERBS: tuple[Verb, ...] = (
     investigate.VERB,
     fit.VERB,
     challenge.VERB,
+    sheets.VERB,
     arm.VERB,
     emulate_nxt.VERB,
 )

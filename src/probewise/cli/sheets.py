@@ -1,0 +1,107 @@
+"""`probewise sheets`: the sheets that a bench needs, at true scale, to print."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probewise.cli._arm import add_geometry, geometry_of
+from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._output import check_out_file
+from probewise.errors import ParameterError
+
+if TYPE_CHECKING:
+    from probewise.report.sheets import Sheet
+
+__all__ = ["VERB"]
+
+FIELD, TARGET, MARKS = "field", "target", "marks"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill the verb's parser."""
+    parser.add_argument(
+        "what",
+        metavar="WHAT",
+        help="paper or two_way, the plans that ship; PLAN.csv, its JSON beside it, or such a JSON alone; field, the "
+        "black field; target, a white shape to cut out; marks, the crosses of `arm fit-geometry`",
+    )
+    parser.add_argument("--out", type=a_path, required=True, metavar="SHEETS.pdf", help="where the pages go")
+    parser.add_argument("--paper", type=str.lower, default="a4", metavar="PAPER", help="a4 (default) or letter")
+    parser.add_argument(
+        "--target",
+        metavar="[SHAPE:]V,V,...",
+        help="of field and target: a white shape as --truth of explore takes it, a circle as X,Y,R in mm of the field",
+    )
+    add_geometry(parser)
+    add_quiet(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw the pages."""
+    from probewise.recordings import write_bytes_atomically
+    from probewise.report.plots.sheets import sheets_pdf
+    from probewise.report.sheets import PAPERS_MM, tiles_of
+
+    if arguments.paper not in PAPERS_MM:
+        raise ParameterError("--paper", arguments.paper, " or ".join(PAPERS_MM))
+    named = Path(arguments.what)
+    out = check_out_file(arguments.out, *([named] if named.is_file() else []))
+    sheets = _sheets(arguments)
+    drawn = sheets_pdf(sheets, paper=arguments.paper, title=f"probewise sheets: {named.name}")
+    write_bytes_atomically(out, drawn)
+    for sheet in sheets:
+        n = len(tiles_of(sheet, arguments.paper))
+        width, height = sheet.size_mm
+        pages = f"{n} page{'s' if n > 1 else ''}"
+        say(f"{sheet.name:<12} {width:g} x {height:g} mm, {pages}: {sheet.lines[0]}", quiet=arguments.quiet)
+    say(f"print at 100 % on {arguments.paper}, and measure the ruler: {out}", quiet=arguments.quiet)
+    return 0
+
+
+def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
+    from probewise.cli._plans import plan_named
+    from probewise.recordings.description import read_description
+    from probewise.report.sheets import field_sheet, marks_sheet, plan_sheets, target_sheet
+
+    what = arguments.what
+    if what not in (FIELD, TARGET) and arguments.target is not None:
+        raise ParameterError("--target", arguments.target, f"none with {what}: it is for {FIELD} and {TARGET}")
+    if what == MARKS:
+        return (marks_sheet(geometry_of(arguments)),)
+    if what in (FIELD, TARGET):
+        field_mm = geometry_of(arguments).field_mm
+        if arguments.target is None and what == TARGET:
+            raise ParameterError("--target", None, "a shape, such as circle:524,260,80")
+        outline = None if arguments.target is None else _outline(arguments.target, field_mm)
+        if what == FIELD:
+            return (field_sheet(field_mm, outline),)
+        assert outline is not None
+        return (target_sheet(arguments.target, outline),)
+    if arguments.geometry is not None:
+        raise ParameterError("--geometry", str(arguments.geometry), f"none with a plan: it is for {FIELD} and {MARKS}")
+    path = Path(what)
+    if path.suffix.lower() == ".json":
+        beside = path.with_suffix(".csv")
+        if not beside.exists():
+            return plan_sheets(read_description(path).patterns)
+        what = str(beside)
+    plan = plan_named(what)
+    return plan_sheets(plan.patterns, plan)
+
+
+def _outline(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyped-def]
+    import numpy as np
+
+    from probewise.cli._geometry import parse_truth
+    from probewise.scene import Field, outlines
+
+    try:
+        hidden = parse_truth(text, ("circle",), Field(*field_mm), rng=np.random.default_rng(0))
+    except ParameterError as error:
+        raise ParameterError(error.name.replace("--truth", "--target"), error.value, error.allowed) from error
+    return outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
+
+
+VERB = Verb("sheets", "Draw the sheets that a bench needs, at true scale, to print.", add_arguments, run)

@@ -1,0 +1,298 @@
+"""Sheets as pages of a PDF at true scale: one unit of the drawing is one millimetre of the paper."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon as Outline
+from matplotlib.patches import Rectangle
+
+from probewise._arrays import FloatArray
+from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
+from probewise.report.plots.apparatus import draw_sensor_face
+from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
+from probewise.report.sheets import BOTTOM_MM, LEFT_MM, PAPERS_MM, Sheet, Tile, tiles_of
+from probewise.scene import region_of
+
+__all__ = ["sheets_pdf"]
+
+_MM_PER_IN = 25.4
+_RULER_MM = 100
+_PIXEL_MM = 0.25  # of patterns that no outline draws
+_ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
+_SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
+_THUMB_MM = 38.0
+
+
+def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
+    """Draw a page that explains, then every sheet at true scale, page after page.
+
+    Parameters
+    ----------
+    sheets
+        What to print.
+    paper
+        "a4" or "letter".
+    title
+        What all of them are for.
+
+    Returns
+    -------
+    The PDF, the same bytes for the same sheets.
+
+    Raises
+    ------
+    ParameterError
+        If a sheet needs too many pages.
+    """
+    cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
+    n_covers = len(_batches(cut))
+    buffer = io.BytesIO()
+    about = {"Title": title, "Creator": "probewise", "Producer": None, "CreationDate": None}
+    with mpl.rc_context({"path.simplify": False}), PdfPages(buffer, metadata=about) as pdf:
+        number = 1 + n_covers
+        firsts = []
+        for _, tiles in cut:
+            firsts.append(number)
+            number += len(tiles)
+        n_pages = number - 1
+        for k, batch in enumerate(_batches(list(zip(cut, firsts, strict=True)))):
+            pdf.savefig(_cover(batch, paper, title, f"page {k + 1} of {n_pages}"))
+        for (sheet, tiles), first in zip(cut, firsts, strict=True):
+            for k, tile in enumerate(tiles):
+                pdf.savefig(_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
+    return buffer.getvalue()
+
+
+def _batches(items: Sequence[Any]) -> list[Sequence[Any]]:
+    return [items[k : k + 5] for k in range(0, len(items), 5)]
+
+
+def _paper(page_mm: tuple[float, float]) -> Axes:
+    """Open a page whose drawing has the millimetre for unit, its lower left corner for origin."""
+    figure = Figure(figsize=(page_mm[0] / _MM_PER_IN, page_mm[1] / _MM_PER_IN), facecolor="none")
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    ax.set(xlim=(0.0, page_mm[0]), ylim=(0.0, page_mm[1]))
+    ax.set_axis_off()
+    return ax
+
+
+def _cover(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
+    page = PAPERS_MM[paper]
+    ax = _paper(page)
+    top = page[1] - 18.0
+    ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
+    told = (
+        "Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",
+        "A sheet of several pages: cut each page along the corner marks at its left and lower side, lay it on the",
+        "strip that its neighbour prints beyond the marks, mark on mark, and glue it there.",
+        "Ticks in the margins show x = 0 and y = 0. All is seen from above, x to the right, y up (away from you).",
+        "Lay a sheet so that these ticks are where `arm record` says that the origin is, the sheet's x axis along",
+        "the field's. At orientation 0 the sensor's x' axis is along x, the photodiode on the side of y; it turns",
+        "anticlockwise.",
+    )
+    for k, line in enumerate(told):
+        ax.text(LEFT_MM, top - 8.0 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
+    y = top - 8.0 - 4.6 * len(told) - 4.0
+    for (sheet, tiles), first in batch:
+        _thumbnail(ax, sheet, tiles, (LEFT_MM, y - _THUMB_MM))
+        x = LEFT_MM + 72.0
+        last = first + len(tiles) - 1
+        said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; page {first}"]
+        if len(tiles) > 1:
+            said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; pages {first} to {last}", _grid(tiles)]
+        said += [*sheet.lines, f"origin: {sheet.frame}"]
+        if sheet.orientations_rad:
+            turns = ", ".join(f"{np.degrees(turn):.4g}" for turn in sheet.orientations_rad)
+            said.append(f"the sensor stands at {turns} degrees")
+        ax.text(x, y - 5.0, sheet.name, fontsize=11, fontweight="bold", va="baseline")
+        for k, line in enumerate(said):
+            ax.text(x, y - 10.5 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
+        y -= _THUMB_MM + 6.0
+    _ruler(ax, LEFT_MM, 11.0)
+    ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
+    return ax.figure  # type: ignore[return-value]
+
+
+def _grid(tiles: Sequence[Tile]) -> str:
+    return f"{tiles[-1].column + 1} side by side, {tiles[-1].row + 1} one above the other, from the lower left"
+
+
+def _thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float, float]) -> None:
+    """Draw a sheet small, with its pages, its origin and the sensor at orientation 0."""
+    width, height = sheet.size_mm
+    scale = min(66.0 / width, (_THUMB_MM - 2.0) / height)
+    low = np.array(sheet.low_mm)
+
+    def small(points: FloatArray) -> FloatArray:
+        return np.asarray((np.asarray(points) - low) * scale + np.array(at_mm))
+
+    frame = Rectangle(at_mm, width * scale, height * scale, fc="none", ec=GREY, lw=0.6, zorder=4)
+    clip = ax.add_patch(Rectangle(at_mm, width * scale, height * scale, fc="none", ec="none"))
+    _paint(ax, sheet, sheet.low_mm, sheet.high_mm, small, clip, named=False)
+    ax.add_patch(frame)
+    for tile in tiles:
+        corner = small(np.array(tile.low_mm))
+        size = (np.array(tile.high_mm) - tile.low_mm) * scale
+        ax.add_patch(Rectangle(tuple(corner), *size, fc="none", ec=GREY, lw=0.4, ls=(0, (3, 2)), zorder=4))
+    if (low <= 0).all() and (np.array(sheet.high_mm) >= 0).all():
+        x, y = small(np.zeros(2))
+        if sheet.orientations_rad:
+            draw_sensor_face(ax, center=(x, y), size=8.0, zorder=5)
+        ax.plot(x, y, marker="+", ms=7, mew=1.2, color=VERMILLION, zorder=7, clip_on=False)
+
+
+def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
+    ax = _paper(tile.page_mm)
+    low, high = np.array(tile.low_mm), np.array(tile.high_mm)
+    size, beyond = high - low, np.array(tile.beyond_mm)
+    clip = ax.add_patch(Rectangle((LEFT_MM, BOTTOM_MM), *(size + beyond), fc="none", ec="none"))
+    _paint(ax, sheet, tuple(low), tuple(high + beyond), tile.on_page_mm, clip)
+    (x0, y0), (x1, y1) = (LEFT_MM, BOTTOM_MM), (LEFT_MM + size[0], BOTTOM_MM + size[1])
+    far_x, far_y = x1 + beyond[0], y1 + beyond[1]
+    line: dict[str, Any] = {"color": BLACK, "lw": 0.4, "solid_capstyle": "butt"}
+    for y in (y0, y1):
+        ax.plot([x0 - 8.0, x0 - 1.0], [y, y], **line)
+        ax.plot([far_x + 1.0, far_x + 5.0], [y, y], **line)
+    for x in (x0, x1):
+        ax.plot([x, x], [y0 - 4.0, y0 - 1.0], **line)
+        ax.plot([x, x], [far_y + 1.0, far_y + 4.0], **line)
+    said: dict[str, Any] = {"fontsize": _SMALL, "va": "center", "ha": "center"}
+    for x, value in ((x0, low[0]), (x1, high[0])):
+        if abs(value) > 12 or value == 0:
+            ax.text(x, y0 - 6.0, f"x = {value:.4g} mm", **said)
+    for y, value in ((y0, low[1]), (y1, high[1])):
+        if abs(value) > 12 or value == 0:
+            ax.text(x0 - 10.0, y, f"y = {value:.4g} mm", rotation=90, **said)
+    heavy = line | {"lw": 1.2, "color": VERMILLION}
+    if low[0] < 0 < high[0]:
+        x = x0 - low[0]
+        ax.plot([x, x], [y0 - 4.0, y0 - 0.5], **heavy)
+        ax.plot([x, x], [far_y + 0.5, far_y + 4.0], **heavy)
+        ax.text(x, y0 - 6.0, "x = 0", color=VERMILLION, **said)
+    if low[1] < 0 < high[1]:
+        y = y0 - low[1]
+        ax.plot([x0 - 8.0, x0 - 0.5], [y, y], **heavy)
+        ax.plot([far_x + 0.5, far_x + 5.0], [y, y], **heavy)
+        ax.text(x0 - 10.0, y, "y = 0", color=VERMILLION, rotation=90, **said)
+    _ruler(ax, LEFT_MM, 6.5)
+    place = f", column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
+    ax.text(
+        LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
+    )
+    ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
+    joins = _joins(tiles, tile, first)
+    ax.text(tile.page_mm[0] - 10.0, 10.0, joins, fontsize=_SMALL, ha="right", va="center")
+    return ax.figure  # type: ignore[return-value]
+
+
+def _joins(tiles: Sequence[Tile], tile: Tile, first: int) -> str:
+    """Say which pages lie on this one's strips."""
+    at = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
+    right, above = at.get((tile.column + 1, tile.row)), at.get((tile.column, tile.row + 1))
+    said = [f"right strip: page {right}"] if right else []
+    said += [f"upper strip: page {above}"] if above else []
+    return "; ".join(said)
+
+
+def _ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
+    ax.plot([x_mm, x_mm + _RULER_MM], [y_mm, y_mm], color=BLACK, lw=0.5, solid_capstyle="butt", gid="ruler")
+    for mm in range(0, _RULER_MM + 1, 5):
+        length = 3.0 if mm % 50 == 0 else 2.0 if mm % 10 == 0 else 1.2
+        ax.plot([x_mm + mm] * 2, [y_mm, y_mm + length], color=BLACK, lw=0.4, solid_capstyle="butt")
+    ax.text(x_mm + _RULER_MM + 3.0, y_mm + 1.0, "100 mm?", fontsize=_SMALL, va="center")
+
+
+def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True) -> None:
+    """Print what lies between two corners of the sheet's frame; `place` moves points, (n, 2), onto the page."""
+    for corners, albedo in _areas(sheet.pattern, low_mm, high_mm):
+        ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))
+        patch = ax.add_patch(Outline(place(corners), closed=True, fc=ink, ec="none", lw=0, zorder=1))
+        patch.set_clip_path(clip)
+    if not isinstance(sheet.pattern, Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes):
+        _raster(ax, sheet.pattern, low_mm, high_mm, place)
+    if sheet.outline_mm is not None:
+        line = ax.add_patch(Outline(place(sheet.outline_mm), closed=True, fc="none", ec=BLACK, lw=0.4, zorder=2))
+        line.set_clip_path(clip)
+    for k, mark in enumerate([] if sheet.crosses_mm is None else sheet.crosses_mm):
+        for arm in ([[-8.0, 0.0], [8.0, 0.0]], [[0.0, -8.0], [0.0, 8.0]]):
+            (half,) = ax.plot(*place(mark + np.array(arm)).T, color=BLACK, lw=0.35, solid_capstyle="butt", zorder=2)
+            half.set_clip_path(clip)
+        x, y = place((mark + 3.0)[None])[0].tolist()
+        if (low_mm[0] <= mark[0] < high_mm[0]) and (low_mm[1] <= mark[1] < high_mm[1]):
+            told = ax.text(
+                x, y, f"{k + 1}: ({mark[0]:g}, {mark[1]:g})" if named else f"{k + 1}", fontsize=_SMALL, zorder=2
+            )
+            told.set_clip_path(clip)
+
+
+def _areas(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
+    """Give outlines (n, 2) with the albedo inside, in the order of painting."""
+    (x0, y0), (x1, y1) = low_mm, high_mm
+    whole = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    match pattern:
+        case Uniform(albedo):
+            return [(whole, albedo)]
+        case HalfPlane(normal, offset, inside, outside):
+            return [(whole, outside), (_beyond(whole, normal, offset), inside)]
+        case Quadrant((x, y), (dx, dy), inside, outside):
+            across = _beyond(whole, 0.0 if dx > 0 else np.pi, x * dx)
+            return [(whole, outside), (_beyond(across, dy * np.pi / 2, y * dy), inside)]
+        case Disc(center, radius, inside, outside):
+            circle = np.array(center) + radius * np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=-1)
+            return [(whole, outside), (circle, inside)]
+        case Polygon(vertices, inside, outside):
+            return [(whole, outside), (np.array(vertices), inside)]
+        case Stripes(normal, period, duty, phase, inside, outside):
+            along = whole @ [np.cos(normal), np.sin(normal)] - phase
+            first, last = int(np.floor(along.min() / period)), int(np.ceil(along.max() / period))
+            painted = [(whole, outside)]
+            for k in range(first, last + 1):
+                begin = _beyond(whole, normal, phase + k * period)
+                painted.append((_beyond(begin, normal + np.pi, -(phase + (k + duty) * period)), inside))
+            return [(corners, albedo) for corners, albedo in painted if len(corners)]
+        case _:
+            return []
+
+
+def _beyond(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
+    """Cut a convex outline, (n, 2): what lies beyond a line."""
+    if not len(corners_mm):
+        return corners_mm
+    away = corners_mm @ [np.cos(normal_rad), np.sin(normal_rad)] - offset_mm
+    kept = []
+    for here, there, a, b in zip(corners_mm, np.roll(corners_mm, -1, axis=0), away, np.roll(away, -1), strict=True):
+        if a >= 0:
+            kept.append(here)
+        if (a > 0) != (b > 0) and a != b:
+            kept.append(here + (there - here) * a / (a - b))
+    return np.array(kept).reshape(-1, 2)
+
+
+def _raster(ax: Axes, pattern: Pattern, low_mm: Any, high_mm: Any, place: Any) -> None:
+    n_x, n_y = (max(round((high - low) / _PIXEL_MM), 1) for low, high in zip(low_mm, high_mm, strict=True))
+    x = low_mm[0] + (np.arange(n_x) + 0.5) * (high_mm[0] - low_mm[0]) / n_x
+    y = low_mm[1] + (np.arange(n_y) + 0.5) * (high_mm[1] - low_mm[1]) / n_y
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shades = region_of(pattern).albedo(points)[0].reshape(n_y, n_x)
+    (left, bottom), (right, top) = place(np.array([low_mm, high_mm], dtype=np.float64))
+    ax.imshow(
+        np.clip(shades, 0.0, 1.0),
+        cmap="gray",
+        vmin=0.0,
+        vmax=1.0,
+        origin="lower",
+        extent=(left, right, bottom, top),
+        interpolation="none",
+        aspect="auto",
+        zorder=1,
+    )
+    page = ax.figure.get_size_inches() * _MM_PER_IN  # type: ignore[union-attr]
+    ax.set(xlim=(0.0, page[0]), ylim=(0.0, page[1]))

@@ -1,0 +1,238 @@
+"""Sheets to print and lay under the arm: what lies on each, and how a large one is cut into pages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm import Geometry
+from probewise.arm.marks import marks_of
+from probewise.errors import ParameterError
+from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
+from probewise.recordings.plan import Plan
+from probewise.recordings.where_white import where_white
+
+__all__ = ["PAPERS_MM", "Sheet", "Tile", "field_sheet", "marks_sheet", "plan_sheets", "target_sheet", "tiles_of"]
+
+PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
+"""Width and height of the papers, upright."""
+
+LEFT_MM, RIGHT_MM, TOP_MM, BOTTOM_MM = 16.0, 12.0, 10.5, 20.0
+"""Margins of a page: printers leave some 6 mm blank, and what is said stands in the rest."""
+
+OVERLAP_MM = 6.0
+"""So much of the next page is printed beyond the cut, for the next page to be glued on."""
+
+AROUND_MM = 40.0  # beyond the outermost reading: what the sensor sees there still counts
+_MOST_PAGES = 400
+_ROUND_MM = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A rectangle of the lab frame with what is printed on it.
+
+    Parameters
+    ----------
+    name
+        The pattern's, as prompts call it.
+    pattern
+        What is printed: albedo 0 black, 1 white.
+    low_mm, high_mm
+        Lower left and upper right corner, in the pattern's frame.
+    lines
+        What a person is told of it.
+    outline_mm
+        A line to cut along, (n, 2); None: none.
+    crosses_mm
+        Crosses to bring the sensor to, (n, 2).
+    frame
+        Where x and y are counted from.
+    orientations_rad
+        How the sensor stands over it.
+    """
+
+    name: str
+    pattern: Pattern
+    low_mm: tuple[float, float]
+    high_mm: tuple[float, float]
+    lines: tuple[str, ...] = ()
+    outline_mm: FloatArray | None = None
+    crosses_mm: FloatArray | None = None
+    frame: str = "the pattern's origin"
+    orientations_rad: tuple[float, ...] = ()
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.high_mm[0] - self.low_mm[0], self.high_mm[1] - self.low_mm[1]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """The part of a sheet that one page shows.
+
+    Parameters
+    ----------
+    column, row
+        From 0, from the lower left.
+    low_mm, high_mm
+        Its corners in the sheet's frame: the cut.
+    page_mm
+        Width and height of the page.
+    beyond_mm
+        How much is printed beyond the cut on the right and at the top, for the neighbour to lie on.
+    """
+
+    column: int
+    row: int
+    low_mm: tuple[float, float]
+    high_mm: tuple[float, float]
+    page_mm: tuple[float, float]
+    beyond_mm: tuple[float, float]
+
+    def on_page_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Move points, (n, 2), from the sheet's frame to the page's, whose lower left corner is the origin."""
+        return np.asarray(points_mm - np.array(self.low_mm) + [LEFT_MM, BOTTOM_MM])
+
+
+def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
+    """Cut a sheet into pages, upright or lying, whichever needs fewer.
+
+    Returns
+    -------
+    Row by row from below, each from the left.
+
+    Raises
+    ------
+    ParameterError
+        If it needs hundreds of pages, or there is no such paper.
+    """
+    if paper not in PAPERS_MM:
+        raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
+    width, height = PAPERS_MM[paper]
+    ways = [(_counts(sheet, page), page) for page in ((width, height), (height, width))]
+    (n_columns, n_rows), page = min(ways, key=lambda way: way[0][0] * way[0][1])
+    if n_columns * n_rows > _MOST_PAGES:
+        w, h = sheet.size_mm
+        raise ParameterError(
+            sheet.name, f"{w:g} x {h:g} mm, {n_columns * n_rows} pages", f"a sheet of {_MOST_PAGES} pages at most"
+        )
+    x_mm = np.linspace(sheet.low_mm[0], sheet.high_mm[0], n_columns + 1).tolist()
+    y_mm = np.linspace(sheet.low_mm[1], sheet.high_mm[1], n_rows + 1).tolist()
+    return tuple(
+        Tile(
+            column,
+            row,
+            (x_mm[column], y_mm[row]),
+            (x_mm[column + 1], y_mm[row + 1]),
+            page,
+            (OVERLAP_MM * (column < n_columns - 1), OVERLAP_MM * (row < n_rows - 1)),
+        )
+        for row in range(n_rows)
+        for column in range(n_columns)
+    )
+
+
+def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
+    """Make a sheet of every pattern: as large as the plan's readings over it need.
+
+    Parameters
+    ----------
+    patterns
+        By name.
+    plan
+        Whose readings they are laid for; patterns that it does not use are left out. None: as large as usual.
+    """
+    sheets = []
+    for name, pattern in patterns.items():
+        places, turns = np.zeros((1, 2)), ()
+        if plan is not None:
+            rows = np.flatnonzero(plan.pattern == plan.pattern_names.index(name))
+            if not rows.size:
+                continue
+            places = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
+            turns = tuple(dict.fromkeys(plan.orientation_rad[rows].tolist()))
+        else:
+            places = np.concatenate([places, _features(pattern)])
+        low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM
+        high = np.ceil((places.max(axis=0) + AROUND_MM) / _ROUND_MM) * _ROUND_MM
+        lines = (where_white(pattern),)
+        sheets.append(Sheet(name, pattern, _pair(low), _pair(high), lines, orientations_rad=turns))
+    return tuple(sheets)
+
+
+def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
+    """Make the black field, with a white target of some outline, (n, 2), at its place."""
+    pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_corners(outline_mm))
+    said = "all black" if outline_mm is None else "black, the target white at its place"
+    return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
+
+
+def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
+    """Make a white target of some outline, (n, 2), to cut out and lay on a black field."""
+    low = np.floor((outline_mm.min(axis=0) - _ROUND_MM) / _ROUND_MM) * _ROUND_MM
+    high = np.ceil((outline_mm.max(axis=0) + _ROUND_MM) / _ROUND_MM) * _ROUND_MM
+    lines = ("white: cut it out along the line and lay it on the black field",)
+    return Sheet(
+        name,
+        Uniform(1.0),
+        _pair(low),
+        _pair(high),
+        lines,
+        outline_mm=outline_mm,
+        frame="the field's lower left corner",
+    )
+
+
+def marks_sheet(geometry: Geometry) -> Sheet:
+    """Make the sheet of crosses that `arm fit-geometry` brings the sensor to."""
+    marks = marks_of(geometry)
+    lines = (
+        f"{len(marks)} crosses for `probewise arm fit-geometry`, numbered",
+        "its lower left corner is the field's; its long sides run along the field's x axis",
+    )
+    frame = "the field's lower left corner"
+    return Sheet("marks", Uniform(1.0), (0.0, 0.0), geometry.field_mm, lines, crosses_mm=marks, frame=frame)
+
+
+def _counts(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
+    width, height = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
+    w, h = sheet.size_mm
+    return _count(w, width), _count(h, height)
+
+
+def _count(length_mm: float, room_mm: float) -> int:
+    return 1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
+
+
+def _features(pattern: Pattern) -> FloatArray:
+    """Give the places that a sheet must show where no plan says it, (n, 2)."""
+    match pattern:
+        case Disc((x, y), radius):
+            return np.array([[x - radius, y - radius], [x + radius, y + radius]])
+        case Polygon(vertices):
+            return np.array(vertices)
+        case Quadrant((x, y)):
+            return np.array([[x, y]])
+        case HalfPlane(normal, offset):
+            return offset * np.array([[math.cos(normal), math.sin(normal)]])
+        case Stripes(_, period):
+            return np.array([[-1.5 * period] * 2, [1.5 * period] * 2])
+        case Image(albedo, pixel, (x, y)):
+            return np.array([[x, y], [x + albedo.shape[1] * pixel, y + albedo.shape[0] * pixel]])
+        case Ramp() | Uniform():
+            return np.array([[-AROUND_MM, 0.0], [AROUND_MM, 0.0]])
+
+
+def _corners(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
+    return tuple((x, y) for x, y in outline_mm[:-1].tolist())
+
+
+def _pair(values: FloatArray | Sequence[float]) -> tuple[float, float]:
+    x, y = values
+    return float(x), float(y)

@@ -1,0 +1,195 @@
+"""Sheets at true scale, measured in the PDF's own drawing."""
+
+import re
+import zlib
+
+import numpy as np
+import pytest
+
+from probewise.arm import read_geometry, shipped_geometry
+from probewise.cli import main
+from probewise.errors import ParameterError
+from probewise.recordings import paper_plan, two_way_plan
+from probewise.recordings.patterns import HalfPlane, Image, Quadrant, Stripes, Uniform
+from probewise.recordings.where_white import where_white
+from probewise.report.plots.sheets import sheets_pdf
+from probewise.report.sheets import (
+    BOTTOM_MM,
+    LEFT_MM,
+    OVERLAP_MM,
+    Sheet,
+    field_sheet,
+    marks_sheet,
+    plan_sheets,
+    target_sheet,
+    tiles_of,
+)
+
+POINT_MM = 25.4 / 72  # a point of PDF is 1/72 inch
+CIRCLE = np.array([600.0, 250.0]) + 80 * np.stack(
+    [np.cos(np.linspace(0, 2 * np.pi, 121)), np.sin(np.linspace(0, 2 * np.pi, 121))], axis=-1
+)
+
+
+def pages_of(pdf):
+    """Size (mm) of each page with its paths: vertices (mm) and how each is painted, read without matplotlib."""
+    boxes = [tuple(map(float, box.split())) for box in re.findall(rb"/MediaBox \[ ?([^\]]*?) ?\]", pdf)]
+    streams = [zlib.decompress(s) for s in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", pdf, re.S) if s[:1] == b"x"]
+    drawn = [s for s in streams if b" m\n" in s and b"BT" in s]
+    assert len(boxes) == len(drawn)
+    return [(np.array(box[2:]) * POINT_MM, paths_of(content)) for box, content in zip(boxes, drawn, strict=True)]
+
+
+def paths_of(content):
+    paths, path, stack, to_page, numbers = [], [], [], np.eye(3), []
+    for word in re.sub(rb"\((?:\\.|[^\\)])*\)", b"", content, flags=re.S).decode("latin-1").split():
+        if re.fullmatch(r"-?\d*\.?\d+", word):
+            numbers.append(float(word))
+            continue
+        if word == "cm":
+            a, b, c, d, e, f = numbers
+            to_page = np.array([[a, b, 0], [c, d, 0], [e, f, 1]]) @ to_page
+        elif word == "q":
+            stack.append(to_page)
+        elif word == "Q":
+            to_page = stack.pop()
+        elif word in ("m", "l"):
+            path.append((np.array([*numbers, 1.0]) @ to_page)[:2] * POINT_MM)
+        elif path and word in ("f", "S", "n", "B", "s"):
+            paths.append((word, np.array(path)))
+            path = []
+        numbers = []
+    return paths
+
+
+def filled(page):
+    return [points for how, points in page[1] if how == "f" and (points > 1).all()]  # without the page's own ground
+
+
+@pytest.mark.parametrize(("paper", "size"), [("a4", (210, 297)), ("letter", (215.9, 279.4))])
+def test_the_edge_is_where_it_should_be_and_the_ruler_is_100_mm_long(paper, size):
+    plan = paper_plan()
+    pages = pages_of(sheets_pdf(plan_sheets(plan.patterns, plan), paper=paper, title="t"))
+    assert len(pages) == 6  # one that explains, five sheets
+    page = pages[1]
+    assert sorted(page[0]) == pytest.approx(size, abs=0.01)
+    black, white = filled(page)[:2]
+    assert np.ptp(black, axis=0) == pytest.approx([180, 80], abs=0.01)
+    assert white[:, 0].min() - black[:, 0].min() == pytest.approx(90, abs=0.01)
+    assert white[:, 0].max() == pytest.approx(black[:, 0].max(), abs=0.01)
+    ruler = [points for _, points in page[1] if len(points) == 2 and np.ptp(points[:, 0]) > 95]
+    assert any(np.ptp(points[:, 0]) == pytest.approx(100, abs=0.01) for points in ruler)
+
+
+def test_each_quadrant_has_its_corner_and_its_side():
+    plan = paper_plan()
+    pages = pages_of(sheets_pdf(plan_sheets(plan.patterns, plan), paper="a4", title="t"))
+    for page, (corner, direction) in zip(
+        pages[2:], [((0, 0), (1, 1)), ((0, 0), (-1, 1)), ((4, 4), (1, 1)), ((-4, 4), (-1, 1))], strict=True
+    ):
+        black, white = filled(page)[:2]
+        origin = black.min(axis=0) + 40
+        inner = [white[:, k].min() if direction[k] > 0 else white[:, k].max() for k in (0, 1)]
+        assert inner - origin == pytest.approx(corner, abs=0.01)
+
+
+def test_the_fields_pages_join_without_gap_or_step():
+    sheet = field_sheet((700.0, 340.0), CIRCLE)
+    tiles = tiles_of(sheet, "a4")
+    assert len(tiles) == 6
+    pages = pages_of(sheets_pdf([sheet], paper="a4", title="t"))[1:]
+    inked = 0.0
+    for tile, page in zip(tiles, pages, strict=True):
+        black, white = filled(page)[:2]
+        shift = np.array(tile.low_mm) - [LEFT_MM, BOTTOM_MM]
+        # The same circle on every page, once each page is laid where its cut says.
+        assert white.min(axis=0) + shift == pytest.approx([520, 170], abs=0.02)
+        assert white.max(axis=0) + shift == pytest.approx([680, 330], abs=0.02)
+        # Black reaches over the cut, where a neighbour lies on it, and ends within the page.
+        assert black.min(axis=0) + shift == pytest.approx(tile.low_mm, abs=0.02)
+        assert black.max(axis=0) + shift == pytest.approx(np.add(tile.high_mm, tile.beyond_mm), abs=0.02)
+        assert (black.max(axis=0) < page[0] - 4).all()
+        inked += np.prod(np.subtract(tile.high_mm, tile.low_mm))
+    assert inked == pytest.approx(700 * 340)
+    assert {tile.beyond_mm[0] for tile in tiles} == {0.0, OVERLAP_MM}
+
+
+def test_the_papers_field_takes_twelve_pages():
+    assert len(tiles_of(field_sheet((1048.0, 520.0)), "a4")) == 12
+
+
+def test_every_cut_has_its_marks_in_the_margin():
+    sheet = field_sheet((400.0, 200.0))
+    for tile, page in zip(
+        tiles_of(sheet, "letter"), pages_of(sheets_pdf([sheet], paper="letter", title="t"))[1:], strict=True
+    ):
+        lines = [points for how, points in page[1] if how == "S" and len(points) == 2]
+        size = np.subtract(tile.high_mm, tile.low_mm)
+        for axis, low in ((0, LEFT_MM), (1, BOTTOM_MM)):
+            for at in (low, low + size[axis]):
+                hits = [p for p in lines if np.abs(p[:, axis] - at).max() < 0.01 and np.ptp(p[:, 1 - axis]) > 2]
+                assert len(hits) >= 2, (tile, axis, at)
+
+
+def test_a_sheet_is_as_large_as_its_readings_need():
+    plan = two_way_plan()
+    sheets = {sheet.name: sheet for sheet in plan_sheets(plan.patterns, plan)}
+    assert (sheets["boundary"].low_mm, sheets["boundary"].high_mm) == ((-90.0, -40.0), (90.0, 40.0))
+    assert np.degrees(sheets["boundary"].orientations_rad) == pytest.approx([0, 90, 180, 270])
+    assert set(sheets) == set(plan.pattern_names)
+
+
+def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
+    picture = Image(np.linspace(0, 1, 20).reshape(4, 5), 10.0, (0.0, 0.0), "x.npy")
+    sheets = plan_sheets({"a": Stripes(0.3, 8.0, 0.5, 1.0), "b": picture, "c": Uniform(0.5)})
+    assert b"/Subtype /Image" in sheets_pdf(sheets, paper="a4", title="t")
+
+
+def test_marks_and_targets_are_at_their_places_of_the_field():
+    geometry = read_geometry(shipped_geometry())
+    sheet = marks_sheet(geometry)
+    assert len(sheet.crosses_mm) == 8
+    assert geometry.holds(sheet.crosses_mm).all()
+    tiles = tiles_of(sheet, "a4")
+    pages = pages_of(sheets_pdf([sheet], paper="a4", title="t"))[1:]
+    found = set()
+    for tile, page in zip(tiles, pages, strict=True):
+        shift = np.array(tile.low_mm) - [LEFT_MM, BOTTOM_MM]
+        for how, points in page[1]:
+            if how == "S" and len(points) == 2 and np.ptp(points) > 15 and abs(np.ptp(points[:, 0]) - 16) < 0.02:
+                found.add(tuple(np.round(points.mean(axis=0) + shift, 1).tolist()))
+    assert {tuple(mark) for mark in sheet.crosses_mm.tolist()} <= found
+    cut = pages_of(sheets_pdf([target_sheet("circle", CIRCLE)], paper="a4", title="t"))[1:]
+    assert any(np.ptp(points, axis=0) == pytest.approx([160, 160], abs=0.02) for _, points in cut[0][1])
+
+
+def test_words_say_which_side_is_white():
+    assert where_white(HalfPlane(0.0, 0.0)).startswith("white on the right, x > 0 mm")
+    assert where_white(HalfPlane(np.pi, 5.0)).startswith("white on the left, x < -5 mm")
+    assert where_white(HalfPlane(np.pi / 2, 3.0, 0.0, 1.0)) == "black on top, y > 3 mm, white elsewhere"
+    assert where_white(Quadrant((-4.0, 4.0), (-1, 1))).startswith("white above y = 4 mm and left of x = -4 mm")
+
+
+def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, capsys):
+    out = tmp_path / "s.pdf"
+    assert (
+        main(["sheets", "target", "--target", "hexagon:600,250,120,0.3", "--out", str(out), "--paper", "letter"]) == 0
+    )
+    assert out.read_bytes().startswith(b"%PDF")
+    said = capsys.readouterr().out
+    assert "cut it out" in said
+    for words, told in (
+        (["paper", "--paper", "a3"], "--paper is 'a3'; allowed: a4 or letter"),
+        (["target"], "--target is None; allowed: a shape"),
+        (["target", "--target", "blob:1,2"], "--target is 'blob:1,2'; allowed: a shape of"),
+        (["paper", "--target", "600,250,80"], "none with paper"),
+        (["nothing.csv"], "nothing.csv"),
+    ):
+        assert main(["sheets", *words, "--out", str(tmp_path / "no.pdf")]) == 2
+        assert told in capsys.readouterr().err
+        assert not (tmp_path / "no.pdf").exists()
+
+
+def test_a_sheet_of_thousands_of_pages_is_refused():
+    with pytest.raises(ParameterError, match="a sheet of 400 pages at most"):
+        tiles_of(Sheet("huge", Uniform(0.0), (0.0, 0.0), (1e5, 1e5)), "a4")

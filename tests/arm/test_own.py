@@ -268,9 +268,9 @@ def test_a_plan_is_carried_out_with_a_person_who_lays_patterns_and_turns_the_sen
     asked, own = [], Own(lambda pose: {"value": 2 * pose.x_mm, "lux": pose.y_mm})
     readings = taken(own, asked, plan())
     assert [text.split(",")[0].split(" at (")[0] for text in asked] == [
-        "put pattern 'edge' under the arm",
+        "lay sheet 'edge'",
         "turn the sensor on its mount to 60 degrees",
-        "put pattern 'corner' under the arm",
+        "lay sheet 'corner'",
     ]
     assert own.asked[2] == Pose(110.0, 50.0, math.pi / 3)
     write_recording(recorded(plan(), readings), tmp_path / "r.csv")

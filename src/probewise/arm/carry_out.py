@@ -16,11 +16,13 @@ from probewise.arm.reach import Bounds, require_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.where_white import where_white
 
-__all__ = ["Request", "bounds_of", "carry_out", "readings_of", "recorded"]
+__all__ = ["BY_HAND_S", "Request", "bounds_of", "carry_out", "duration_s", "readings_of", "recorded"]
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
+BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 
 
 class Request(str):
@@ -75,8 +77,8 @@ def carry_out(
 
     Yields
     ------
-    A reading for each row, its place the plan's, as commanded, its orientation the true one. An instrument of one's own
-    may know the true place too: then that, in the plan's frame.
+    A reading for each row, in the plan's frame, at the place that the arm knows to be the true one: a motor stops
+    within a count of its goal, and its counter says where. Where an instrument knows none better it is the plan's.
 
     Raises
     ------
@@ -97,15 +99,44 @@ def carry_out(
             lying = int(plan.pattern[row])
             name = plan.pattern_names[lying]
             where = f"its origin at ({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
-            ask(Request(f"put pattern {name!r} under the arm, {where}", pattern=name))
+            shown = f": {where_white(plan.patterns[name])}" if name in plan.patterns else ""
+            ask(Request(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
             mounted = float(turns[row])
             text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {handed.from_where}"
             ask(Request(text, turned_rad=mounted))
         x_mm, y_mm = places[row].tolist()
         reading = handed.measure(x_mm, y_mm, mounted, plan, row)
-        there = Pose(*handed.place(reading, plan, row, origin_mm), reading.pose.orientation_rad)
-        yield dataclasses.replace(reading, pose=there)
+        there = _in_plan(reading, plan, row, origin_mm)
+        yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
+
+
+def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], first: int = 0) -> float:
+    """Tell how long a plan takes, about: what the arm needs for its readings, and half a minute by hand each time.
+
+    Parameters
+    ----------
+    arm
+        The arm, entered.
+    plan, origin_mm, first
+        As of `carry_out`.
+    """
+    places = (np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm))[first:]
+    turns, lying = plan.orientation_rad[first:], plan.pattern[first:]
+    seconds, here = 0.0, places[:1]
+    for place in places:
+        seconds += float(arm.travel_s(Pose(*here[0].tolist()), place[None, :])[0])
+        here = place[None, :]
+    by_hand = 1 + np.count_nonzero(np.diff(lying)) + np.count_nonzero(np.abs(np.diff(turns)) > _SAME_TURN_RAD)
+    return seconds + BY_HAND_S * float(by_hand)
+
+
+def _in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
+    """Give the place of a reading in the plan's frame, rounded to a micron; the plan's own where that was met."""
+    x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
+    if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
+        return x_mm, y_mm
+    return round(reading.pose.x_mm - origin_mm[0], 3), round(reading.pose.y_mm - origin_mm[1], 3)
 
 
 class _Lego:
@@ -127,10 +158,6 @@ class _Lego:
         self._arm.turned_rad = turned_rad
         standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
         return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
-
-    def place(self, reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
-        """Give the place to be written down: as commanded."""
-        return float(plan.x_mm[row]), float(plan.y_mm[row])
 
 
 class _Own:
@@ -155,13 +182,6 @@ class _Own:
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
-    def place(self, reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
-        """Give the place to be written down: as commanded, where the instrument knows none better."""
-        x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
-        if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
-            return x_mm, y_mm
-        return reading.pose.x_mm - origin_mm[0], reading.pose.y_mm - origin_mm[1]
-
 
 def _skills(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
     """Tell whether an arm turns its sensor itself, and reads at a height that is asked for."""
@@ -169,7 +189,7 @@ def _skills(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
 
 
 def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
-    """Write down what was read: the plan's first rows with true orientation, time, battery and height of each.
+    """Write down what was read: the plan's first rows with true place and orientation, time, battery, height of each.
 
     Parameters
     ----------
@@ -183,6 +203,8 @@ def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
     covariates = {name: np.array([reading.covariates.get(name, math.nan) for reading in readings]) for name in names}
     taken = dataclasses.replace(
         rows,
+        x_mm=np.array([reading.pose.x_mm for reading in readings]),
+        y_mm=np.array([reading.pose.y_mm for reading in readings]),
         orientation_rad=np.array([reading.pose.orientation_rad for reading in readings]),
         time_s=np.array([reading.time_s for reading in readings]),
         covariates={**rows.covariates, **covariates},

@@ -9,6 +9,7 @@ turns about the vertical with the base alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.basics import Side
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["JOINTS", "ROOM_COUNTS", "Geometry", "Joint", "wrapped"]
+__all__ = ["JOINTS", "ROOM_COUNTS", "Accuracy", "Geometry", "Joint", "placed_mm", "wrapped"]
 
 JOINTS = ("base", "shoulder", "elbow")
 """The joints in the order of the columns of all arrays of angles."""
@@ -114,6 +115,41 @@ class Joint:
         return self.home_rad + counts / self.counts_per_rad - side * self.play_rad / 2
 
 
+UNMEASURED_RAD = math.radians(2.0)
+"""So far off may the home angles of links be that were set by eye."""
+
+FIELD_STEPS = 12  # places along each side of the field at which errors are worked out
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How well a geometry is known, from marks that it was fitted to.
+
+    Parameters
+    ----------
+    marks
+        So many.
+    place_sd_mm
+        Sd of the sensor's place along x and y, root mean square over the field.
+    height_sd_mm
+        Sd of its height where that is known least.
+    scale_sd
+        Sd of the ratio of lengths on the field to lengths as the arm measures them.
+    """
+
+    marks: int
+    place_sd_mm: float
+    height_sd_mm: float
+    scale_sd: float
+
+    def __post_init__(self) -> None:
+        if self.marks < 1:
+            raise ParameterError("marks", self.marks, "1 or more")
+        for name in ("place_sd_mm", "height_sd_mm", "scale_sd"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ParameterError(name, getattr(self, name), "0 or more")
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Every number of the arm as built; `read_geometry` takes them from a file.
@@ -142,6 +178,8 @@ class Geometry:
         The joints.
     whole_percent
         Whether readings are cut to whole percent, as the brick shows them.
+    accuracy
+        How well all this is known; None: nobody has fitted it to marks.
     """
 
     field_mm: tuple[float, float]
@@ -159,6 +197,7 @@ class Geometry:
     shoulder: Joint
     elbow: Joint
     whole_percent: bool = True
+    accuracy: Accuracy | None = None
 
     def __post_init__(self) -> None:
         finite = (*self.field_mm, *self.axis_mm, *self.shoulder_mm, *self.links_mm, *self.sensor_mm, self.mounting_rad)
@@ -210,15 +249,34 @@ class Geometry:
         x_mm, y_mm, _ = self.position_mm(home)[0]
         return float(x_mm), float(y_mm)
 
+    @property
+    def height_doubt_mm(self) -> float:
+        """By how much the sensor may hang lower than it is told to, where that is most.
+
+        Two sds of a fitted geometry; else what home angles of both links cost that are two degrees off.
+        """
+        if self.accuracy is not None:
+            return 2 * self.accuracy.height_sd_mm
+        rises = np.abs(self.rise_mm_rad(self.angles_rad(self.spread_mm, self.read_height_mm)))
+        return float(rises.sum(axis=-1).max(initial=0.0) * UNMEASURED_RAD)
+
+    @property
+    def spread_mm(self) -> FloatArray:
+        """Places spread over the field that the sensor can read at, (n, 2)."""
+        sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
+        places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+        return places[self.holds(places)]
+
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Place the sensor's face, lab frame and height: joint angles (n, 3) to (n, 3)."""
-        base, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
-        lower = shoulder + elbow if self.elbow_is_relative else elbow
-        upper_mm, lower_mm = self.links_mm
-        away = self.shoulder_mm[0] + upper_mm * np.cos(shoulder) + lower_mm * np.cos(lower) + self.sensor_mm[0]
-        height = self.shoulder_mm[1] + upper_mm * np.sin(shoulder) + lower_mm * np.sin(lower) - self.sensor_mm[1]
-        x_mm, y_mm = self.axis_mm
-        return np.stack([x_mm + away * np.cos(base), y_mm + away * np.sin(base), height], axis=-1)
+        return placed_mm(
+            angles_rad,
+            self.links_mm,
+            self.axis_mm,
+            self.shoulder_mm,
+            self.sensor_mm,
+            elbow_is_relative=self.elbow_is_relative,
+        )
 
     def rise_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
         """Tell how the sensor rises with each joint's angle: joint angles (n, 3) to (n, 3), mm a radian."""
@@ -304,6 +362,23 @@ class Geometry:
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
         within = away[self._leaves_room(places)]
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
+
+
+def placed_mm(
+    angles_rad: FloatArray,
+    links_mm: Sequence[float] | FloatArray,
+    axis_mm: Sequence[float] | FloatArray,
+    shoulder_mm: Sequence[float] | FloatArray,
+    sensor_mm: Sequence[float] | FloatArray,
+    *,
+    elbow_is_relative: bool,
+) -> FloatArray:
+    """Place the sensor's face of an arm of these lengths, lab frame and height: joint angles (n, 3) to (n, 3)."""
+    base, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
+    lower = shoulder + elbow if elbow_is_relative else elbow
+    away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + sensor_mm[0]
+    height = shoulder_mm[1] + links_mm[0] * np.sin(shoulder) + links_mm[1] * np.sin(lower) - sensor_mm[1]
+    return np.stack([axis_mm[0] + away * np.cos(base), axis_mm[1] + away * np.sin(base), height], axis=-1)
 
 
 def wrapped(angle_rad: FloatArray) -> FloatArray:

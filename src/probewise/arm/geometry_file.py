@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from probewise._kinds import require_path
-from probewise.arm.geometry import JOINTS, Geometry, Joint
+from probewise.arm.geometry import JOINTS, Accuracy, Geometry, Joint
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.text import read_text
 
-__all__ = ["FORMAT", "read_geometry", "shipped_geometry"]
+__all__ = ["FORMAT", "read_geometry", "shipped_geometry", "with_fitted"]
 
 FORMAT = "arm/1"
 ELBOWS = ("absolute", "relative")
+_HEADER = re.compile(r"\s*\[\s*([\w.]+)\s*\]")
+_ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)([-+\w.]+)(.*)")
 LARGEST = 1e6
 
 
@@ -57,6 +60,7 @@ def read_geometry(path: str | Path) -> Geometry:
     if not isinstance(whole, bool):
         raise sensor.fail("whole_percent", "true or false")
     tables = {name: joints.table(name) for name in JOINTS}
+    known = top.table("accuracy") if "accuracy" in content else None
     try:
         geometry = Geometry(
             field_mm=(field.number("width_mm"), field.number("height_mm")),
@@ -74,12 +78,59 @@ def read_geometry(path: str | Path) -> Geometry:
             shoulder=_joint(tables["shoulder"]),
             elbow=_joint(tables["elbow"]),
             whole_percent=whole,
+            accuracy=None if known is None else _accuracy(known),
         )
     except ParameterError as error:
         raise FileError(path, f"{error.name} is {shown(error.value)}", error.allowed) from error
-    for table in (top, field, base, links, sensor, joints, *tables.values()):
+    for table in (top, field, base, links, sensor, joints, *tables.values(), *([] if known is None else [known])):
         table.finish()
     return geometry
+
+
+def with_fitted(text: str, geometry: Geometry) -> str:
+    """Put the numbers that a fit changes, and how well they are known, into the text of a geometry's file.
+
+    Parameters
+    ----------
+    text
+        The file that the fit began with; its comments stay.
+    geometry
+        The fitted one.
+    """
+    numbers: dict[tuple[str, str], float] = {
+        ("base", "x_mm"): geometry.axis_mm[0],
+        ("base", "y_mm"): geometry.axis_mm[1],
+        ("base", "shoulder_forward_mm"): geometry.shoulder_mm[0],
+        ("base", "shoulder_height_mm"): geometry.shoulder_mm[1],
+        ("links", "upper_mm"): geometry.links_mm[0],
+        ("links", "lower_mm"): geometry.links_mm[1],
+    }
+    for name, joint in zip(JOINTS, geometry.joints, strict=True):
+        angles = {"home": joint.home_rad, "low": joint.low_rad, "high": joint.high_rad, "stop": joint.stop_rad}
+        numbers |= {
+            (f"joints.{name}", f"{key}_deg"): math.degrees(angle) for key, angle in angles.items() if angle is not None
+        }
+    lines, table = [], ""
+    for line in text.splitlines():
+        if header := _HEADER.match(line):
+            table = header[1]
+        entry = _ENTRY.match(line)
+        if table == "accuracy":
+            continue
+        if entry and (table, entry[2]) in numbers:
+            line = f"{entry[1]}{numbers[table, entry[2]]:.4f}{entry[4]}"
+        lines.append(line)
+    known = geometry.accuracy
+    if known is not None:
+        lines += [
+            *([""] if lines and lines[-1] else []),
+            "[accuracy]                # written by `probewise arm fit-geometry`, from marks on the field",
+            f"marks = {known.marks}",
+            f"place_sd_mm = {known.place_sd_mm:.4f}",
+            f"height_sd_mm = {known.height_sd_mm:.4f}",
+            f"scale_sd = {known.scale_sd:.6f}",
+        ]
+    return "\n".join(lines) + "\n"
 
 
 class _Table:
@@ -126,5 +177,16 @@ def _joint(table: _Table) -> Joint:
     stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
     try:
         return Joint("ABC".index(port), ratio, home, low, high, play, stop)
+    except ParameterError as error:
+        raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
+
+
+def _accuracy(table: _Table) -> Accuracy:
+    marks = table.take("marks")
+    if not isinstance(marks, int) or isinstance(marks, bool):
+        raise table.fail("marks", "a whole number, 1 or more")
+    place, height, scale = (table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd"))
+    try:
+        return Accuracy(marks, place, height, scale)
     except ParameterError as error:
         raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error

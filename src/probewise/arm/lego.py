@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -27,10 +27,11 @@ BASE, SHOULDER, ELBOW = range(3)
 N_RISES = 3  # rough moves, of which the first one or two may stop short
 NEAR_TRAVEL_MM = 10.0  # a sensor not farther below the height of travel is raised
 CLEAR_MM = 1.0  # a way may lead so much lower than its end
+N_STEPS_DOWN = 5  # of the first lowering
 N_TRIED = 361  # angles looked at for the way up
 SAME_TURN_RAD = math.radians(1.0)
 # A measurement takes about so long, on the emulator: joints move one after another, and each takes time to stop.
-COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.0
+COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.6
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,9 @@ class LegoArm:
     ----------
     turned_rad
         How far the sensor has been turned on its mount, by hand, from where the geometry has it.
+    first_down
+        Asked before each step of the first lowering, with the height that the sensor should have by then, and returns
+        when a person has seen that it does; None: the arm comes down in one go.
     """
 
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
@@ -74,6 +78,7 @@ class LegoArm:
         self._is_down = False
         self._arrived: list[int] = [0, 0, 0]  # from which side each joint came to where it stands
         self.turned_rad = 0.0
+        self.first_down: Callable[[float], None] | None = None
 
     def __enter__(self) -> Self:
         self._machine.__enter__()
@@ -171,15 +176,26 @@ class LegoArm:
         for joint in self._order(goals):
             self._near(joint, goals[joint].counts)
 
-    def go_down(self, x_mm: float, y_mm: float) -> None:
-        """Bring the sensor over a place and down to the height of reading.
+    def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
+        """Bring the sensor over a place and down to a height, by default that of reading.
+
+        Until `first_down` has let it down once, it comes down in steps.
 
         Raises
         ------
         ReachError
-            If the arm cannot take the place.
+            If the arm cannot take the place, or not at that height.
         """
-        goals = self._goals(x_mm, y_mm, self.geometry.read_height_mm)
+        read_mm, travel_mm = self.geometry.read_height_mm, self.geometry.travel_height_mm
+        if self.first_down is not None and height_mm is None:
+            ask, self.first_down = self.first_down, None
+            for step_mm in np.linspace(travel_mm, read_mm, N_STEPS_DOWN + 1)[:-1].tolist():
+                self._down(x_mm, y_mm, step_mm)
+                ask(step_mm)
+        self._down(x_mm, y_mm, read_mm if height_mm is None else height_mm)
+
+    def _down(self, x_mm: float, y_mm: float, height_mm: float) -> None:
+        goals = self._goals(x_mm, y_mm, height_mm)
         self.rise()
         self._arrive(BASE, goals[BASE])
         self._is_down = True

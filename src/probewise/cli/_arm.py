@@ -13,13 +13,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
-from probewise.cli._common import CommandError, a_path
+from probewise.cli._common import CommandError, a_path, caution
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Pose, Reading
+    from probewise.arm import Geometry, Instrument, LegoArm, Machine, OwnInstrument, Pose, Reading
+    from probewise.arm.basics import Clock
     from probewise.arm.nxt import Brick
-    from probewise.emulator import Table
+    from probewise.emulator import Bench as EmulatedBench
     from probewise.world import Surface, World
 
 __all__ = [
@@ -29,19 +30,23 @@ __all__ = [
     "Telling",
     "add_geometry",
     "asker",
+    "emulated_arm",
     "geometry_of",
+    "in_steps",
     "open_brick",
     "open_emulated",
     "open_nxt",
     "open_own",
     "parse_arm",
     "parse_place",
+    "questioner",
     "require_choices",
+    "warn_of_clearance",
 ]
 
 ARMS = (
-    "simulated; emulator, the LEGO arm in software; nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, "
-    "an instrument of your own"
+    "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built otherwise than --geometry says; "
+    "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own"
 )
 """How arms are named, the same in every verb."""
 
@@ -70,7 +75,7 @@ def geometry_of(arguments: argparse.Namespace) -> Geometry:
 
 @dataclass(frozen=True)
 class ArmName:
-    """Which arm: its kind, and the port or the file that it is behind."""
+    """Which arm: its kind, and the port or the file that it is behind; of an emulated one how it is really built."""
 
     kind: Literal["simulated", "emulator", "nxt", "file"]
     where: str = ""
@@ -80,9 +85,18 @@ class ArmName:
         """Whether it is the LEGO arm, whose geometry says how far it reaches."""
         return self.kind in ("nxt", "emulator")
 
+    @property
+    def is_apart(self) -> bool:
+        """Whether it may be built otherwise than its geometry says."""
+        return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
+
+    def built_as(self, geometry_file: Path | None) -> Path | None:
+        """Name the file that an emulated arm is built by; None: the shipped one."""
+        return Path(self.where) if self.where else geometry_file
+
 
 def parse_arm(text: str) -> ArmName:
-    """Read the name of an arm: "simulated", "emulator", "nxt:PORT" or "FILE.py".
+    """Read the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py".
 
     Raises
     ------
@@ -94,6 +108,8 @@ def parse_arm(text: str) -> ArmName:
     if text == "emulator":
         return ArmName("emulator")
     kind, _, port = text.partition(":")
+    if kind == "emulator" and port:
+        return ArmName("emulator", port)
     if kind == "nxt" and port:
         return ArmName("nxt", port)
     if text.endswith(".py"):
@@ -116,12 +132,11 @@ def open_emulated(
     *,
     seed: int,
     start_s: float = 0.0,
-) -> tuple[LegoArm, Table]:
+) -> tuple[LegoArm, EmulatedBench]:
     """Hang the LEGO arm on a brick in software, over a table; its clock runs as fast as it can.
 
-    The emulator reads the geometry by itself: `geometry_file`, or the shipped one.
+    The emulator reads the geometry that it is built by itself: `geometry_file`, or the shipped one.
     """
-    from probewise.arm import LegoArm
     from probewise.arm.nxt import Brick, BrickMachine, Link
     from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
 
@@ -129,7 +144,57 @@ def open_emulated(
     numbers = read_geometry(geometry_file or shipped_geometry())
     bench = set_up(numbers, world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
-    return LegoArm(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench.table
+    machine = BrickMachine(brick, geometry)
+    return emulated_arm(machine, geometry, bench, clock=clock, start_s=start_s), bench
+
+
+def emulated_arm(
+    machine: Machine, geometry: Geometry, bench: EmulatedBench, *, clock: Clock, start_s: float
+) -> LegoArm:
+    """Make the arm on an emulated bench, which tells in the end whether its sensor went through the table."""
+    from probewise.arm import LegoArm
+
+    class Emulated(LegoArm):
+        def __exit__(
+            self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        ) -> None:
+            super().__exit__(kind, error, trace)
+            lowest = bench.arm.lowest
+            if lowest.height_mm < 0:
+                caution(
+                    f"the emulated arm's sensor went {-lowest.height_mm:.1f} mm through the table, at "
+                    f"({lowest.x_mm:.0f}, {lowest.y_mm:.0f}) mm"
+                )
+
+    return Emulated(machine, geometry, clock=clock, start_s=start_s)
+
+
+def warn_of_clearance(geometry: Geometry) -> None:
+    """Warn where the height to read at leaves less room than errors of the geometry may cost."""
+    doubt_mm = geometry.height_doubt_mm
+    if doubt_mm < geometry.read_height_mm:
+        return
+    known = (
+        "home angles of both links that are 2 degrees off cost up to"
+        if geometry.accuracy is None
+        else "by its [accuracy] the arm may hang lower by"
+    )
+    caution(
+        f"the sensor may touch the table: it reads {geometry.read_height_mm:g} mm above it, and {known} "
+        f"{doubt_mm:.0f} mm; fit the geometry (probewise arm fit-geometry), or look how it comes down "
+        "(probewise arm jog X,Y --down --steps)"
+    )
+
+
+def in_steps(arm: LegoArm) -> LegoArm:
+    """Let the first lowering of an arm be confirmed step by step."""
+    ask = asker(arm)
+
+    def confirm(height_mm: float) -> None:
+        ask(f"the sensor should be {height_mm:.0f} mm above the table; if it is, and it may go on down")
+
+    arm.first_down = confirm
+    return arm
 
 
 def parse_place(name: str, text: str) -> tuple[float, float]:
@@ -212,10 +277,20 @@ def require_choices(
 
 def asker(arm: Instrument) -> Callable[[str], None]:
     """Make what asks a person and waits for Enter, while an arm that may fall asleep is kept awake."""
-    keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
+    answer_to = questioner(arm)
 
     def ask(text: str) -> None:
-        sys.stderr.write(f"{text[0].upper()}{text[1:]}, then press Enter: ")
+        answer_to(f"{text[0].upper()}{text[1:]}, then press Enter: ")
+
+    return ask
+
+
+def questioner(arm: Instrument) -> Callable[[str], str]:
+    """Make what asks a person for a line, while an arm that may fall asleep is kept awake."""
+    keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
+
+    def ask(text: str) -> str:
+        sys.stderr.write(text)
         sys.stderr.flush()
         answers: queue.Queue[str] = queue.Queue()
         # Reading a line cannot be cut short, so that it waits in a thread that the program need not wait for.
@@ -229,5 +304,6 @@ def asker(arm: Instrument) -> Callable[[str], None]:
                 break
         if not answer:
             raise CommandError("nobody is there to press Enter: standard input has ended; run it in a terminal")
+        return answer.strip()
 
     return ask

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,10 +21,15 @@ from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadr
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Pose
+    from probewise.cli._marks import Look
+    from probewise.emulator import Stand
     from probewise.recordings import Instrumentation
     from probewise.world import Surface, World
 
 __all__ = ["Bench", "moved", "open_arm", "world_of"]
+
+_SEEN_MM = 0.5  # a person sees the sensor's middle beside a mark from here on
+_TOUCHES_MM = 0.5  # and a gap above the block
 
 
 class Bench:
@@ -47,6 +52,7 @@ class Bench:
     def __init__(self, world: World, scene: str, *, scale: LegoScale, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
         self._table = Table(parse_scene(scene))
+        self._stand: Callable[[], Stand] | None = None
 
     def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Stand the simulated arm over it, which turns its sensor itself."""
@@ -64,8 +70,33 @@ class Bench:
     def emulated(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
         """Stand the LEGO arm over it, on a brick in software."""
         surface, seed = self._table.surface, self._seed + self._n_taken
-        arm, self._table = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
+        arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
+        self._table, self._stand = bench.table, bench.arm.stand
         return arm
+
+    def look(self, look: Look) -> str:
+        """Answer as a person does who watches the emulated arm's sensor over a mark.
+
+        Raises
+        ------
+        ParameterError
+            If the arm has no sensor to be seen.
+        """
+        if self._stand is None:
+            raise ParameterError("--arm", "simulated", "emulator: the simulated arm is where it says")
+        stand = self._stand()
+        across = (look.mark_mm[0] - stand.x_mm, look.mark_mm[1] - stand.y_mm)
+        gap_mm = stand.height_mm - look.block_mm
+        words = [
+            f"{axis} {round(2 * off) / 2:g}" for axis, off in zip("xy", across, strict=True) if abs(off) > _SEEN_MM
+        ]
+        if not words and gap_mm <= _TOUCHES_MM:
+            return "ok"
+        if gap_mm < -_TOUCHES_MM:
+            words.append(f"up {round(-2 * gap_mm) / 2 + _TOUCHES_MM:g}")
+        elif not words:
+            words.append(f"down {max(min(gap_mm - _TOUCHES_MM / 2, gap_mm / 2 if gap_mm > 8 else gap_mm), 0.2):.1f}")
+        return " ".join(words)
 
     def lay(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
         """Do what `carry_out` asks of a person: lay a pattern with its origin there, or turn the sensor."""
@@ -116,7 +147,7 @@ def open_arm(
     scale = LegoScale() if instrumentation is None else scale_of(instrumentation)
     bench = Bench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
     if chosen.is_lego:
-        return bench.emulated(geometry, geometry_file, start_s=start_s), bench
+        return bench.emulated(geometry, chosen.built_as(geometry_file), start_s=start_s), bench
     return bench.simulated(None if geometry_file is None else geometry, start_s=start_s), bench
 
 

@@ -25,6 +25,7 @@ __all__ = [
     "add_common",
     "add_out_directory",
     "add_quiet",
+    "caution",
     "keeps",
     "positive_int",
     "say",
@@ -138,6 +139,12 @@ def say(text: str, *, quiet: bool = False) -> None:
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
+
+
+def caution(text: str) -> None:
+    """Write a line of warning to standard error, also where nothing else is said."""
+    sys.stderr.write(f"warning: {text}\n")
+    sys.stderr.flush()
 
 
 def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:

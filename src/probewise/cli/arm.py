@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,13 @@ from probewise.cli._arm import (
     add_geometry,
     asker,
     geometry_of,
+    in_steps,
     open_brick,
     open_nxt,
     parse_arm,
     parse_place,
+    questioner,
+    warn_of_clearance,
 )
 from probewise.cli._common import (
     DEFAULT_SEED,
@@ -26,6 +30,7 @@ from probewise.cli._common import (
     Verb,
     a_path,
     add_quiet,
+    caution,
     keeps,
     positive_int,
     say,
@@ -37,16 +42,19 @@ from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, SimulatedArm
+    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, Request, SimulatedArm
     from probewise.cli._bench import Bench
     from probewise.recordings import Plan
 
 __all__ = ["TASKS", "VERB"]
 
 PAPER = "paper"
+MARKS = "marks"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
 _MOST_READINGS = 100_000  # of one scan
 _OFF_PLAN_MM = 5.0  # an instrument of one's own may know better where it read
+BLOCK_MM = 32.0
+TOUCH_MM = 1.0
 UNITS = "LEGO units (1 dark to 100 bright)"
 
 
@@ -57,12 +65,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = _task(tasks, "check", "Check a geometry file, and a brick; say and draw how far the arm reaches.")
     _add_arm(check)
     check.add_argument("--out", type=a_path, metavar="REACH.png", help="where the drawing goes (default: none is made)")
+    check.add_argument("--drawing", type=a_path, metavar="ARM.png", help="draw the arm with its lengths there")
 
     jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
     jog.add_argument(
         "where", nargs="+", metavar="WHERE", help="base, shoulder or elbow and degrees; or a place X,Y in mm"
     )
     jog.add_argument("--down", action="store_true", help="at a place: lower the sensor to the height of reading")
+
+    jog.add_argument("--steps", action="store_true", help="with --down: in steps, each confirmed with Enter")
+
+    fit = _task(
+        tasks,
+        "fit-geometry",
+        "Fit home angles, links and base to marks that the sensor is brought to; writes the geometry.",
+        moves=True,
+        own=True,
+    )
+    fit.add_argument("--out", type=a_path, required=True, metavar="ARM.toml", help="where the fitted geometry goes")
+    fit.add_argument(
+        "--marks",
+        type=a_path,
+        metavar="MARKS.csv",
+        help="where marks are kept (default: beside --out); without --arm they are read from there and only fitted",
+    )
+    fit.add_argument(
+        "--block-mm",
+        type=_positive,
+        default=BLOCK_MM,
+        metavar="MM",
+        help=f"height of the block on a mark (default {BLOCK_MM:g}: three LEGO bricks and a smooth tile)",
+    )
+    fit.add_argument(
+        "--touch-mm",
+        type=_positive,
+        default=TOUCH_MM,
+        metavar="MM",
+        help=f"how well a mark is met, sd of place and height (default {TOUCH_MM:g})",
+    )
+    fit.add_argument("--resume", action="store_true", help="go on behind the marks that MARKS.csv holds")
 
     home = _task(tasks, "home", "Bring all joints to where their counters are 0.", moves=True)
     home.add_argument(
@@ -133,6 +174,17 @@ def _add_arm(parser: argparse.ArgumentParser, *, own: bool = False) -> None:
         parser.add_argument("--arm", metavar="nxt:PORT", help=brick)
 
 
+def _positive(text: str) -> float:
+    """Read a number above zero, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of mm above 0")
+    return value
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Do one task."""
     TASKS[arguments.task](arguments, geometry_of(arguments))
@@ -145,8 +197,10 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.geometry import JOINTS
     from probewise.recordings import write_bytes_atomically
     from probewise.report.plots import png, reach_map
+    from probewise.report.plots.apparatus import arm_lengths
 
     out = None if arguments.out is None else check_out_file(arguments.out)
+    drawing = None if arguments.drawing is None else check_out_file(arguments.drawing)
     port = None if arguments.arm is None else _port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
@@ -162,12 +216,23 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
             f"its play {joint.play_rad * geometry.farthest_mm:.1f} mm",
             quiet=arguments.quiet,
         )
+    if geometry.accuracy is None:
+        known = "nobody has fitted it: where home is 2 degrees off on both links the sensor hangs up to"
+    else:
+        known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
+    say(
+        f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.height_doubt_mm:.1f} mm lower",
+        quiet=arguments.quiet,
+    )
     if not held.any():
         raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
     if out is not None:
         standing = np.where(held, geometry.orientation_rad(places), np.nan).reshape(y_mm.size, x_mm.size)
         write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))
         say(f"drawn        {out}", quiet=arguments.quiet)
+    if drawing is not None:
+        write_bytes_atomically(drawing, png(arm_lengths(geometry)))
+        say(f"drawn        {drawing}", quiet=arguments.quiet)
     if port is not None:
         _check_brick(port, geometry)
 
@@ -194,7 +259,13 @@ def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
     match arguments.where:
         case [place]:
             x_mm, y_mm = parse_place("WHERE", place)
+            if arguments.steps and not arguments.down:
+                raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
+            if arguments.down and not arguments.dry_run and not arguments.steps:
+                warn_of_clearance(geometry)
             with _arm(arguments, geometry) as arm:
+                if arguments.steps and not arguments.dry_run:
+                    in_steps(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _say_position(arm, quiet=arguments.quiet)
                 if arguments.down:
@@ -225,6 +296,78 @@ def _home(arguments: argparse.Namespace, geometry: Geometry) -> None:
         _say_position(arm, quiet=arguments.quiet)
 
 
+def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    from probewise.arm import shipped_geometry
+    from probewise.arm.fitting import fit_geometry
+    from probewise.arm.geometry_file import read_geometry, with_fitted
+    from probewise.arm.touched import read_touched
+    from probewise.recordings import write_text_atomically
+
+    source = arguments.geometry or shipped_geometry()
+    out = check_out_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
+    if arguments.dry_run:
+        raise ParameterError("--dry-run", True, "none with fit-geometry: its moves are what a person says")
+    if arguments.arm is None and arguments.marks is None:
+        raise CommandError(
+            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit marks that are there, "
+            "--marks MARKS.csv"
+        )
+    kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
+    if arguments.arm is not None:
+        _touch_marks(arguments, geometry, check_out_file(kept))
+    turned, marks = read_touched(kept)
+    fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
+    say(fitted.summary(), quiet=arguments.quiet)
+    text = with_fitted(source.read_text(encoding="utf-8-sig"), fitted.geometry)
+    write_text_atomically(out, text)
+    read_geometry(out)  # what a person has written above the numbers must not have hidden one
+    say(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
+
+
+def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
+    """Bring the sensor to one mark after another, and keep each at once."""
+    from probewise.arm import LegoArm
+    from probewise.arm.marks import marks_of
+    from probewise.arm.touched import Touched, read_touched, write_touched
+    from probewise.cli._marks import bring
+
+    chosen = parse_arm(arguments.arm)
+    if not chosen.is_lego:
+        raise ParameterError("--arm", arguments.arm, "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted")
+    if kept.exists() and not arguments.resume:
+        raise FileError(kept, "a file stands there", "--resume to go on with it, or another --marks")
+    taken: list[Touched] = []
+    if kept.exists():
+        rows = zip(*(array.tolist() for array in read_touched(kept)), strict=True)
+        taken = [Touched(tuple(turned), tuple(place)) for turned, place in rows]
+    done = {mark.place_mm[:2] for mark in taken}
+    marks = [(x, y) for x, y in marks_of(geometry).tolist()]
+    arguments.scene = arguments.sensor = arguments.seed = None
+    instrument, bench = _instrument(arguments, geometry)
+    assert isinstance(instrument, LegoArm)
+
+    def said() -> str:
+        return keeps(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
+
+    with saying_what_is_kept(said), instrument as arm:
+        answer = questioner(arm)
+        eyes = answer if bench is None else bench.look
+        tell = partial(say, quiet=bench is not None)
+        if bench is None:
+            asker(arm)(
+                f"lay the sheet of marks (probewise sheets {MARKS}) on the field, and on each cross in its turn a "
+                f"block {arguments.block_mm:g} mm high"
+            )
+        for number, mark in enumerate(marks, 1):
+            if mark in done:
+                continue
+            met = bring(arm, mark, arguments.block_mm, eyes, tell, named=f"mark {number} of {len(marks)}")
+            if met is not None:
+                taken.append(met)
+                write_touched(taken, kept)
+                say(f"mark {number} kept: {kept}", quiet=arguments.quiet)
+
+
 def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with _arm(arguments, geometry) as arm:
         value, battery_mv = arm.read_here(), arm.battery_mv()
@@ -246,6 +389,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         require_reach(geometry, places, "reading of the scan")
     names: list[str] = ["battery_mv"]
     instrument, _ = _instrument(arguments, geometry)
+    _take_care(arguments, instrument, geometry)
     with instrument as arm:
         require_reach(bounds_of(arm), places, "reading of the scan")
         if isinstance(arm, LegoArm):
@@ -261,10 +405,11 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 
 def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    from functools import partial
-
     from probewise._progress import progress_shown
     from probewise.arm import carry_out, recorded
+    from probewise.arm.carry_out import BY_HAND_S, duration_s
+    from probewise.cli._hands import Hands, is_pty
+    from probewise.cli._sheet_watch import SheetWatch
     from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
 
     named = arguments.plan == PAPER
@@ -289,12 +434,28 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
         return keeps(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
     instrument, bench = _instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
+    _take_care(arguments, instrument, geometry)
     with saying_what_is_kept(kept), instrument as arm:
-        ask = _asker(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
+        watch = SheetWatch(plan, white_is_bright=not own)
+        by_person = bench is None and not arguments.dry_run
+        ask: Callable[[Request], None] = (
+            _asker(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
+        )
+        if by_person:
+            ask = Hands(arm, plan, origin, watch, typed=not own and is_pty(_port(arguments.arm)))
+            seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
+            say(
+                f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; {BY_HAND_S:g} s of it each time "
+                "that you are asked for something",
+                quiet=arguments.quiet,
+            )
         readings = carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
         with progress_shown(quiet=arguments.quiet, beat=False) as progress:
             progress("readings", len(taken), len(plan))
             for reading in readings:
+                wrong = watch.heard(len(taken), reading.value)
+                if wrong is not None and not arguments.dry_run:
+                    caution(f"{wrong}; is the right sheet there, the right way round?")
                 taken.append(reading)
                 progress("readings", len(taken), len(plan))
                 if not arguments.dry_run:
@@ -376,6 +537,22 @@ def _instrument(
     return opened
 
 
+def _take_care(
+    arguments: argparse.Namespace, instrument: LegoArm | OwnInstrument | SimulatedArm, geometry: Geometry
+) -> None:
+    """Warn of a geometry that may lead the sensor into the table; lower it step by step where somebody looks on."""
+    import sys
+
+    from probewise.arm import LegoArm
+
+    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    if chosen is None or not chosen.is_apart or arguments.dry_run or not isinstance(instrument, LegoArm):
+        return
+    warn_of_clearance(geometry)
+    if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
+        in_steps(instrument)
+
+
 def _refuse(arguments: argparse.Namespace, what: str, *names: str) -> None:
     for name in names:
         value = getattr(arguments, name, None)
@@ -413,6 +590,7 @@ def _say_position(arm: LegoArm, *, quiet: bool) -> None:
 TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
     "check": _check,
     "jog": _jog,
+    "fit-geometry": _fit_geometry,
     "home": _home,
     "read": _read,
     "scan": _scan,

@@ -19,7 +19,7 @@ from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.emulator import Table, Trace
+    from probewise.emulator import Bench, Stand, Trace
 
 __all__ = ["VERB"]
 
@@ -98,23 +98,28 @@ def run(arguments: argparse.Namespace) -> int:
         )
         say(terminal.path)
         say(
-            f"seed {arguments.seed}, scene {arguments.scene}; type another, or `turn DEGREES`; end with Ctrl-C",
+            f"seed {arguments.seed}, scene {arguments.scene}; type another, `turn DEGREES` or `where`; end with Ctrl-C",
             quiet=arguments.quiet,
         )
         with saying_what_is_kept(lambda: "the device is gone"):
-            serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench.table).listen)
+            serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench).listen)
     say(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
     return 0
 
 
 class _Listener:
-    """Do what a person types: another scene, or `turn DEGREES`."""
+    """Do what a person types: another scene, `turn DEGREES`, `where`; tell when the sensor is in the table."""
 
-    def __init__(self, table: Table) -> None:
-        self._table, self._typed, self._is_heard = table, b"", sys.stdin is not None
+    def __init__(self, bench: Bench) -> None:
+        self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
+        self._is_in_table = False
 
     def listen(self) -> None:
         """Take what has been typed, without waiting; from a terminal only in its foreground, as shells want it."""
+        stand = self._bench.arm.stand()
+        if (stand.height_mm < 0) is not self._is_in_table:
+            self._is_in_table = stand.height_mm < 0
+            say(f"{'the sensor went through' if self._is_in_table else 'it came out of'} the table: {_where(stand)}")
         while self._is_heard and select.select([0], [], [], 0)[0] and _is_foreground():
             typed = os.read(0, 4096)
             self._is_heard = bool(typed)
@@ -123,11 +128,19 @@ class _Listener:
                 self._obey(line.decode(errors="replace"))
 
     def _obey(self, line: str) -> None:
+        if line.strip() == "where":
+            say(_where(self._bench.arm.stand()))
+            return
         try:
-            self._table.obey(line)
+            self._bench.table.obey(line)
             say(f"done: {line}")
         except ParameterError as error:
             say(str(error))
+
+
+def _where(stand: Stand) -> str:
+    """Say where the sensor is, as somebody sees who looks at it."""
+    return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
 
 def _is_foreground() -> bool:

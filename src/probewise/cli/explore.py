@@ -20,6 +20,7 @@ from probewise.cli._arm import (
     open_own,
     parse_arm,
     require_choices,
+    warn_of_clearance,
 )
 from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
 from probewise.cli._output import check_out_directory, staged
@@ -212,7 +213,8 @@ def run(arguments: argparse.Namespace) -> int:
         hidden = parse_truth(arguments.truth, arguments.shape, field, rng=streams.truth)
         world, surface = posing.world_like(sensor), hidden.surface
         if chosen.is_lego and geometry is not None:
-            arm, _ = open_emulated(geometry, arguments.geometry, world, surface, seed=streams.noise, start_s=start_s)
+            built = chosen.built_as(arguments.geometry)
+            arm, _ = open_emulated(geometry, built, world, surface, seed=streams.noise, start_s=start_s)
         else:
             scale = posing.scale_of(sensor.instrumentation)
             arm = posing.arm_over(
@@ -223,6 +225,8 @@ def run(arguments: argparse.Namespace) -> int:
     means = sensor.mean()
     levels = (means["I_min"], means["I_max"])
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
+    if geometry is not None and chosen.is_apart:
+        warn_of_clearance(geometry)
     folder = out / "frames"
     steps: list[Step] = []
     others: list[Step] = []

@@ -66,16 +66,25 @@ class EmulatedArm:
     ----------
     joints
         Base, shoulder, elbow.
+    lowest
+        Where the sensor was lowest so far; below 0 it would have gone through the table.
     """
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
         self.joints = tuple(Joint.at_home(numbers) for numbers in geometry.joints)
+        self.lowest = self.stand()
 
     def motors(self) -> tuple[Motor, ...]:
         """Return the motors at ports A, B, C."""
         by_port = {joint.numbers.port: joint.motor for joint in self.joints}
         return tuple(by_port[port] for port in "ABC")
+
+    def watch(self) -> None:
+        """Take note of where the sensor is lowest."""
+        here = self.stand()
+        if here.height_mm < self.lowest.height_mm:
+            self.lowest = here
 
     def stand(self) -> Stand:
         """Return the sensor's pose (the paper's arm: two links on a turning base)."""

@@ -85,6 +85,7 @@ def set_up(
         name=name,
         battery=Battery(sag_mv_min=faults.sag),
         sleep_min=sleep_min,
+        watch=arm.watch,
     )
     rng = np.random.default_rng([seed, 1])
     return Bench(table, arm, Radio(brick, clock, rng=rng, faults=faults, trace=trace))

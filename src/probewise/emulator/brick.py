@@ -59,6 +59,8 @@ class Brick:
         Minutes without KEEPALIVE after which it switches itself off.
     files
         Files in flash. Each of them runs as a program that echoes messages.
+    watch
+        Called again and again while a motor turns.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class Brick:
         battery: Battery | None = None,
         sleep_min: int = 10,
         files: Mapping[str, bytes] | None = None,
+        watch: Callable[[], None] = lambda: None,
     ) -> None:
         if not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable() or any(ord(c) > 255 for c in name):
             raise ParameterError("name", name, f"1 to {_LONGEST_NAME} printable characters of Latin-1")
@@ -85,7 +88,8 @@ class Brick:
         self._began_s = self._awake_s = clock()
         self._battery = Battery() if battery is None else battery
         self._name = name.encode("latin-1")
-        self.outputs = Outputs([Motor() for _ in range(3)] if motors is None else motors, now_s=self._began_s)
+        plugged = [Motor() for _ in range(3)] if motors is None else motors
+        self.outputs = Outputs(plugged, now_s=self._began_s, watch=watch)
         self.inputs = Inputs([NothingAnalog()] * 4 if sensors is None else sensors, clock)
         self._files = Files({"echo.rxe": b""} if files is None else files, capacity=_FLASH_BYTES)
         self._programs = Programs(self._files.exists, self._release)

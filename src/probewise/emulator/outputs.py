@@ -14,6 +14,7 @@ __all__ = ["Outputs"]
 
 _ALL = 0xFF
 _TICK_S = 1e-3
+_WATCHED_TICKS = 10
 
 
 @dataclass
@@ -45,9 +46,12 @@ class Outputs:
         The motors at ports A, B, C.
     now_s
         The clock's time.
+    watch
+        Called again and again while a motor turns.
     """
 
-    def __init__(self, motors: Sequence[Motor], *, now_s: float) -> None:
+    def __init__(self, motors: Sequence[Motor], *, now_s: float, watch: Callable[[], None] = lambda: None) -> None:
+        self._watch = watch
         self.ports = tuple(Output(motor) for motor in motors)
         self._ticked_s = now_s
         self._step = _Step()
@@ -61,11 +65,13 @@ class Outputs:
         """Simulate all milliseconds up to now."""
         n_ticks = int((now_s - self._ticked_s) / _TICK_S + 1e-6)
         self._ticked_s += n_ticks * _TICK_S
-        for _ in range(n_ticks):
+        for number in range(n_ticks):
             moving = [port for port in self.ports if not port.is_at_rest]
             if not moving:
                 return
             self._tick(moving, battery_mv)
+            if number % _WATCHED_TICKS == 0:
+                self._watch()
 
     def release(self) -> None:
         """Let all motors coast, as the start or end of a program does."""

@@ -9,7 +9,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Uniform
 from probewise.world import Oval, Surface
 
-__all__ = ["FORMS", "parse_scene"]
+__all__ = ["FORMS", "parse_scene", "scene_text"]
 
 FORMS = (
     "[circle:]X,Y,RADIUS",
@@ -35,6 +35,29 @@ def parse_scene(text: str) -> Surface:
         return _MAKERS[name or "circle"](*(_finite(cell) for cell in listed.split(",")))
     except (KeyError, TypeError, ValueError) as error:
         raise ParameterError("--scene", text, f"{'; '.join(FORMS)}; in mm and degrees") from error
+
+
+def scene_text(surface: Surface) -> str:
+    """Write a scene as `parse_scene` reads it.
+
+    Raises
+    ------
+    ParameterError
+        If it has none of the forms, such as stripes or black on white.
+    """
+    if (getattr(surface, "inside", 1.0), getattr(surface, "outside", 0.0)) == (1.0, 0.0):
+        match surface:
+            case Uniform(albedo):
+                return f"uniform:{albedo:g}"
+            case HalfPlane(normal, offset):
+                return f"edge:{math.degrees(normal):.6g},{offset:.6g}"
+            case Quadrant((x, y), (dx, dy)):
+                return f"corner:{x:g},{y:g},{dx},{dy}"
+            case Disc((x, y), radius):
+                return f"circle:{x:g},{y:g},{radius:g}"
+            case Polygon(vertices):
+                return "polygon:" + ",".join(f"{x:g},{y:g}" for x, y in vertices)
+    raise ParameterError("scene", type(surface).__name__, "; ".join(FORMS))
 
 
 def _finite(text: str) -> float:

@@ -12,9 +12,19 @@ from matplotlib.transforms import Affine2D
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.errors import ReachError
-from probewise.report.plots.canvas import BLACK, GREY, ORANGE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, tidy
+from probewise.report.plots.canvas import (
+    BLACK,
+    GREY,
+    ORANGE,
+    SMALL_PT,
+    VERMILLION,
+    AxesGrid,
+    axes_or_new,
+    grid_of_axes,
+    tidy,
+)
 
-__all__ = ["arm_and_sensor", "draw_sensor_face"]
+__all__ = ["arm_and_sensor", "arm_lengths", "draw_sensor_face"]
 
 _ROD_MM = 26.0  # between the two rods of each parallelogram, as drawn
 _ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
@@ -62,6 +72,92 @@ def arm_and_sensor(
     return axes
 
 
+def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
+    """Draw the arm from the side with every length of its geometry, to build or to measure it by.
+
+    Parameters
+    ----------
+    geometry
+        Lengths and joints of the arm.
+    away_mm
+        Distance from the base's axis at which the sensor reads; None: in the middle of its reach.
+    ax
+        Axes to draw on; a new figure without.
+
+    Raises
+    ------
+    ReachError
+        If the arm cannot read at that distance.
+    """
+    away = (geometry.nearest_mm + geometry.farthest_mm) / 2 if away_mm is None else away_mm
+    middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
+    place = np.array([geometry.axis_mm]) + away * np.array([[np.cos(middle), np.sin(middle)]])
+    _, shoulder, elbow = geometry.angles_rad(place, geometry.read_height_mm)[0].tolist()
+    if not np.isfinite(shoulder):
+        raise ReachError("away_mm", away, f"{geometry.nearest_mm:.0f} to {geometry.farthest_mm:.0f} mm")
+    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
+    ax = axes_or_new(ax, size_in=(8.2, 5.4))
+    (forward, height), (upper_mm, lower_mm), (out_mm, drop_mm) = (
+        geometry.shoulder_mm,
+        geometry.links_mm,
+        geometry.sensor_mm,
+    )
+    joint = np.array([forward, height])
+    knee = joint + upper_mm * np.array([np.cos(shoulder), np.sin(shoulder)])
+    wrist = knee + lower_mm * np.array([np.cos(lower), np.sin(lower)])
+    _draw_side(ax, geometry, shoulder, lower, named=False)
+    across = 40.0 * np.array([-np.sin(shoulder), np.cos(shoulder)])
+    _measure(ax, joint, knee, across, f"upper_mm {upper_mm:g}")
+    _measure(ax, knee, wrist, 40.0 * np.array([-np.sin(lower), np.cos(lower)]), f"lower_mm {lower_mm:g}")
+    low = np.array([0.0, -45.0])
+    _measure(ax, np.array([0.0, 0.0]), np.array([forward, 0.0]), low, f"shoulder_forward_mm {forward:g}", side="left")
+    up = np.array([-70.0, 0.0])
+    _measure(ax, np.array([0.0, 0.0]), np.array([0.0, height]), up, f"shoulder_height_mm\n{height:g}", side="left")
+    eye = wrist + np.array([out_mm, -drop_mm])
+    _measure(ax, np.array([wrist[0], 0.0]), np.array([eye[0], 0.0]), low, f"forward_mm {out_mm:g}", side="right")
+    _measure(ax, eye, np.array([eye[0], wrist[1]]), np.array([35.0, 0.0]), f"drop_mm {drop_mm:g}", side="right")
+    said = f"read_height_mm {geometry.read_height_mm:g}"
+    _measure(ax, np.array([eye[0], 0.0]), eye, np.array([75.0, 0.0]), said, side="right")
+    x, y = joint.tolist()
+    named = (
+        ("base", geometry.base, (0.0, height + 110.0), (-12, 16), "right"),
+        ("shoulder", geometry.shoulder, (x, y), (40, -22), "left"),
+        ("elbow", geometry.elbow, (float(knee[0]), float(knee[1])), (30, 26), "left"),
+    )
+    for name, mechanics, at, off, ha in named:
+        told = f"{name}: motor {'ABC'[mechanics.port]}, {abs(mechanics.gear_ratio):g} : 1"
+        ax.annotate(told, at, xytext=off, ha=ha, **_LABEL)
+    ax.set(xlim=(-260, away + 290), ylim=(-110, float(knee[1]) + 110), title="")
+    return ax
+
+
+def _measure(ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above") -> None:
+    """Draw a length with its arrow, away from what it measures."""
+    a, b = begin + away, end + away
+    for here, there in ((begin, a), (end, b)):
+        ax.plot([here[0], there[0]], [here[1], there[1]], color=GREY, linewidth=0.6, zorder=1)
+    arrow = {
+        "arrowstyle": "<|-|>",
+        "color": BLACK,
+        "linewidth": 0.8,
+        "shrinkA": 0.0,
+        "shrinkB": 0.0,
+        "mutation_scale": 7,
+    }
+    ax.annotate("", tuple(b), xytext=tuple(a), arrowprops=arrow)
+    middle = (a + b) / 2
+    if side == "above":
+        turn = float(np.degrees(np.arctan2(*(b - a)[::-1])))
+        turn = turn - 180 if turn > 90 else turn
+        off = 12.0 * away / np.hypot(*away)
+        x, y = (middle + off).tolist()
+        ax.text(x, y, text, rotation=turn, ha="center", va="center", fontsize=SMALL_PT)
+    elif side == "left":
+        ax.text(min(a[0], b[0]) - 6, middle[1], text, ha="right", va="center", fontsize=SMALL_PT)
+    else:
+        ax.text(max(a[0], b[0]) + 6, middle[1] + 2, text, ha="left", va="center", fontsize=SMALL_PT)
+
+
 def draw_sensor_face(
     ax: Axes, *, center: tuple[float, float] = (0.0, 0.0), size: float, turned_rad: float = 0.0, zorder: float = 3.0
 ) -> None:
@@ -90,7 +186,7 @@ def draw_sensor_face(
         ax.add_patch(part)
 
 
-def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float) -> None:
+def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, named: bool = True) -> None:
     forward, height = geometry.shoulder_mm
     joint = np.array([forward, height])
     knee = joint + geometry.links_mm[0] * np.array([np.cos(shoulder), np.sin(shoulder)])
@@ -108,6 +204,10 @@ def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float) -> N
         ax.plot(*end, marker="o", markersize=6, color="white", markeredgecolor=BLACK, zorder=5)
     ax.plot([wrist[0], eye[0]], [wrist[1], wrist[1]], color=BLACK, linewidth=2.2, zorder=4)
     ax.add_patch(Rectangle((eye[0] - 8, eye[1]), 16, geometry.sensor_mm[1] + 6, fc="#9a9a9a", ec=BLACK, zorder=4))
+    if not named:
+        tidy(ax, x="distance from the arm's axis (mm)", y="height (mm)")
+        ax.set_aspect("equal")
+        return
     ax.annotate("base turns about this axis", (0, knee[1] + 40), xytext=(10, 12), **_LABEL)
     ax.annotate("shoulder", (float(joint[0]), float(joint[1])), xytext=(-30, 44), ha="right", **_LABEL)
     ax.annotate("elbow", (float(knee[0]), float(knee[1]) + _ROD_MM), xytext=(30, -2), **_LABEL)

@@ -1,0 +1,241 @@
+"""Fit an arm's geometry to marks that its sensor was brought to: home angles, links, base.
+
+Each mark gives the place and, where it was touched, the height of the sensor beside the angles by which its motors
+have turned the joints from home. What the file says of the arm so far counts as a measurement by ruler and eye
+(`RULER_SDS`); the rest is least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from probewise._arrays import FloatArray, floats
+from probewise.arm.geometry import Accuracy, Geometry, placed_mm
+from probewise.arm.marks import LEAST_MARKS
+from probewise.errors import ParameterError, ProbewiseError, ShapeError
+
+__all__ = ["FITTED", "RULER_SDS", "FittedGeometry", "MarksDisagreeError", "fit_geometry"]
+
+FITTED = (
+    *("base home", "shoulder home", "elbow home", "upper link", "lower link"),
+    *("base x", "base y", "shoulder forward", "shoulder height"),
+)
+"""What is fitted, angles in radians, lengths in mm; the sensor's own lengths go with those of the shoulder."""
+
+RULER_SDS = np.array([*np.radians([5.0, 5.0, 5.0]), 5.0, 5.0, 10.0, 10.0, 10.0, 10.0])
+"""So well is each known before, from a ruler and by eye."""
+
+LEAST_P = 1e-3  # marks that fit by chance no better than this disagree
+MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # of a geometry that the marks determine
+
+
+class MarksDisagreeError(ProbewiseError, ValueError):
+    """Report marks that no geometry explains."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedGeometry:
+    """A geometry and what speaks for it.
+
+    Parameters
+    ----------
+    geometry
+        With its accuracy.
+    before, values, sds
+        What is fitted, before and after, and its sd, (9,) in the order of `FITTED`.
+    residuals_mm
+        Mark minus fitted place and height, (n_marks, 3); NaN where no height was taken.
+    p_value
+        How often marks as good as they are said to be fit worse.
+    """
+
+    geometry: Geometry
+    before: FloatArray
+    values: FloatArray
+    sds: FloatArray
+    residuals_mm: FloatArray
+    p_value: float
+
+    def summary(self) -> str:
+        """Say what changed, by how much, and how well it is known."""
+        lines = []
+        for k, name in enumerate(FITTED):
+            angle = k < 3
+            scale, unit, digits = (180 / np.pi, "degrees", 2) if angle else (1.0, "mm", 1)
+            was, is_, sd = (scale * float(array[k]) for array in (self.before, self.values, self.sds))
+            lines.append(
+                f"{name:<17} {is_:8.{digits}f} ± {sd:.{digits}f} {unit} (was {was:.{digits}f}, {is_ - was:+.{digits}f})"
+            )
+        rms = np.sqrt(np.nanmean(self.residuals_mm**2))
+        known = self.geometry.accuracy
+        lines.append(
+            f"residuals         {rms:.2f} mm root mean square at {len(self.residuals_mm)} marks (p {self.p_value:.2g})"
+        )
+        if known is not None:
+            lines.append(
+                f"the sensor is placed to {known.place_sd_mm:.2f} mm, its height known to {known.height_sd_mm:.2f} mm "
+                "where it is least (sds)"
+            )
+        return "\n".join(lines)
+
+
+def fit_geometry(
+    geometry: Geometry, turned_rad: FloatArray, marks_mm: FloatArray, *, touch_mm: float = 1.0
+) -> FittedGeometry:
+    """Fit home angles, links and base to marks.
+
+    Parameters
+    ----------
+    geometry
+        The arm as it is known so far.
+    turned_rad
+        By how much each joint had turned from home at each mark, (n_marks, 3): base, shoulder, elbow.
+    marks_mm
+        Where the sensor's face then was, (n_marks, 3): lab frame, and height; NaN: no height was taken.
+    touch_mm
+        Sd of a mark's place and height, of hand and eye and of the motors.
+
+    Raises
+    ------
+    ShapeError
+        If there is not one row of three a mark.
+    ParameterError
+        If there are too few marks, or they lie so that they do not determine the geometry.
+    MarksDisagreeError
+        If no geometry explains them.
+    """
+    turned, marks = floats(turned_rad, "turned_rad"), floats(marks_mm, "marks_mm")
+    if turned.ndim != 2 or turned.shape[1] != 3 or marks.shape != turned.shape:
+        raise ShapeError(f"turned_rad and marks_mm have shapes {turned.shape} and {marks.shape}; allowed: (n_marks, 3)")
+    if not touch_mm > 0:
+        raise ParameterError("touch_mm", touch_mm, "greater than 0")
+    if len(marks) < LEAST_MARKS:
+        raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
+    before = _values_of(geometry)
+    values, total, jacobian = _solve(geometry, before, turned, marks, touch_mm)
+    n = int(np.isfinite(marks).sum())
+    p_value = float(chi2.sf(total, n))
+    residuals = marks - _places_mm(geometry, values, turned)
+    if p_value < LEAST_P:
+        raise MarksDisagreeError(_disagreement(geometry, before, turned, marks, touch_mm, residuals))
+    covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
+    fitted = _with_values(geometry, values)
+    accuracy = _accuracy(fitted, values, covariance, len(marks))
+    if accuracy.height_sd_mm > MOST_HEIGHT_SD_MM or accuracy.place_sd_mm > MOST_PLACE_SD_MM:
+        raise ParameterError(
+            "marks",
+            f"{len(marks)} that leave the height open to {accuracy.height_sd_mm:.1f} mm and the place to "
+            f"{accuracy.place_sd_mm:.1f} mm",
+            f"marks that determine them to {MOST_HEIGHT_SD_MM:g} and {MOST_PLACE_SD_MM:g} mm all over the field: "
+            "more of them, touched, near and far from the base and on both sides",
+        )
+    return FittedGeometry(
+        replace(fitted, accuracy=accuracy), before, values, np.sqrt(np.diagonal(covariance)), residuals, p_value
+    )
+
+
+def _solve(
+    geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
+) -> tuple[FloatArray, float, FloatArray]:
+    """Find the most probable numbers, the sum of squares there, and the slopes, (n_residuals, 9)."""
+    known = np.isfinite(marks)
+
+    def misses(scaled: FloatArray) -> FloatArray:
+        off = (_places_mm(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
+        return np.concatenate([off, scaled])
+
+    found = least_squares(misses, np.zeros(len(before)), method="lm", xtol=1e-12, ftol=1e-12)
+    return before + RULER_SDS * found.x, float(2 * found.cost), np.asarray(found.jac / RULER_SDS)
+
+
+def _disagreement(
+    geometry: Geometry,
+    before: FloatArray,
+    turned: FloatArray,
+    marks: FloatArray,
+    touch_mm: float,
+    residuals: FloatArray,
+) -> str:
+    """Say which mark does not fit the others, where leaving it out makes peace."""
+    rms = np.sqrt(np.nanmean(residuals**2))
+    off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
+    for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
+        others = np.arange(len(marks)) != k
+        values, total, _ = _solve(geometry, before, turned[others], marks[others], touch_mm)
+        if chi2.sf(total, int(np.isfinite(marks[others]).sum())) >= LEAST_P:
+            away = float(np.sqrt(np.nansum((marks[k] - _places_mm(geometry, values, turned[[k]])[0]) ** 2)))
+            return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
+    return (
+        f"{off}; allowed: a sheet at true scale, gears that do not slip, gear_ratio as built, no joint that is loose; "
+        "or marks that are known less well"
+    )
+
+
+def _accuracy(geometry: Geometry, values: FloatArray, covariance: FloatArray, n_marks: int) -> Accuracy:
+    places = geometry.spread_mm
+    if not len(places):
+        raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
+    home = np.array([joint.home_rad for joint in geometry.joints])
+    turned = geometry.angles_rad(places, geometry.read_height_mm) - home
+    slopes = np.empty((len(places), 3, len(values)))
+    for k, step in enumerate(RULER_SDS * 1e-4):
+        up, down = values.copy(), values.copy()
+        up[k] += step
+        down[k] -= step
+        slopes[:, :, k] = (_places_mm(geometry, up, turned) - _places_mm(geometry, down, turned)) / (2 * step)
+    variances = np.einsum("nik,kl,nil->ni", slopes, covariance, slopes)
+    # How the whole field is stretched: the mean of what displaces places away from their middle.
+    arms = places - places.mean(axis=0)
+    stretch = np.einsum("nik,ni->k", slopes[:, :2], arms) / float((arms**2).sum())
+    return Accuracy(
+        n_marks,
+        float(np.sqrt(variances[:, :2].mean())),
+        float(np.sqrt(variances[:, 2].max())),
+        float(np.sqrt(stretch @ covariance @ stretch)),
+    )
+
+
+def _values_of(geometry: Geometry) -> FloatArray:
+    homes = [joint.home_rad for joint in geometry.joints]
+    return np.array([*homes, *geometry.links_mm, *geometry.axis_mm, *geometry.shoulder_mm])
+
+
+def _places_mm(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
+    """Place the sensor, (n, 3), of an arm of other numbers."""
+    return placed_mm(
+        values[:3] + turned_rad,
+        values[3:5],
+        values[5:7],
+        values[7:9],
+        geometry.sensor_mm,
+        elbow_is_relative=geometry.elbow_is_relative,
+    )
+
+
+def _with_values(geometry: Geometry, values: Sequence[float] | FloatArray) -> Geometry:
+    """Put fitted numbers in; limits and stops are angles as the motors count them, so that they move with home."""
+    joints = []
+    for joint, home in zip(geometry.joints, values[:3], strict=True):
+        by = float(home) - joint.home_rad
+        stop = None if joint.stop_rad is None else joint.stop_rad + by
+        joints.append(
+            replace(
+                joint, home_rad=float(home), low_rad=joint.low_rad + by, high_rad=joint.high_rad + by, stop_rad=stop
+            )
+        )
+    upper, lower, x, y, forward, height = (float(value) for value in values[3:])
+    base, shoulder, elbow = joints
+    return replace(
+        geometry,
+        axis_mm=(x, y),
+        shoulder_mm=(forward, height),
+        links_mm=(upper, lower),
+        base=base,
+        shoulder=shoulder,
+        elbow=elbow,
+    )

@@ -1,0 +1,51 @@
+"""Marks that a sensor was brought to, on file: a row each, how far the joints had turned from home and where it was."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm.geometry import JOINTS
+from probewise.recordings.atomic import write_text_atomically
+from probewise.recordings.table import csv_text, number_text, read_table
+
+__all__ = ["Touched", "read_touched", "write_touched"]
+
+_TURNED = tuple(f"{joint}_turned_deg" for joint in JOINTS)
+_PLACE = ("x_mm", "y_mm", "height_mm")
+_LARGEST = 1e4
+
+
+@dataclass(frozen=True)
+class Touched:
+    """One mark: how far each joint had turned from home, where the sensor's face was; a height of NaN: not taken."""
+
+    turned_rad: tuple[float, float, float]
+    place_mm: tuple[float, float, float]
+
+
+def read_touched(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Read marks: turns in radians and places in mm, both (n_marks, 3).
+
+    Raises
+    ------
+    FileError
+        If a column is missing or a cell is no number; `height_mm` alone may be empty.
+    """
+    table = read_table(path)
+    table.require(*_TURNED, *_PLACE)
+    turned = [table.numbers(name, largest=_LARGEST) for name in _TURNED]
+    place = [table.numbers(name, missing=name == "height_mm", largest=_LARGEST) for name in _PLACE]
+    return np.radians(np.stack(turned, axis=-1)), np.stack(place, axis=-1)
+
+
+def write_touched(marks: Sequence[Touched], path: Path) -> None:
+    """Write marks, all at once or not at all."""
+    turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
+    place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)
+    columns = dict(zip((*_TURNED, *_PLACE), np.concatenate([turned, place], axis=1).T.tolist(), strict=True))
+    write_text_atomically(path, csv_text({name: [number_text(v) for v in cells] for name, cells in columns.items()}))

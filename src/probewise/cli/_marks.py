@@ -1,0 +1,127 @@
+"""Bring the sensor to marks on the field, told by a person who watches it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probewise.errors import ReachError
+
+if TYPE_CHECKING:
+    from probewise.arm import LegoArm
+    from probewise.arm.touched import Touched
+
+__all__ = ["Look", "bring"]
+
+STEP_MM = 5.0
+_MOST_MM = 60.0  # in one step
+_HELP = (
+    "Enter: 5 mm down; 'down 2', 'up 2', 'x 4', 'y -2.5' or several of them: mm; 'ok': it is over the cross and just "
+    "touches; 'seen': it is over the cross, its height is not known; 'skip'"
+)
+
+
+class Look(str):
+    """What a person who watches the sensor is asked, as a sentence.
+
+    Attributes
+    ----------
+    mark_mm
+        Where the mark is.
+    block_mm
+        How high what stands on it is.
+    """
+
+    __slots__ = ("block_mm", "mark_mm")
+
+    mark_mm: tuple[float, float]
+    block_mm: float
+
+    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> Look:
+        """Make one of a sentence."""
+        look = super().__new__(cls, text)
+        look.mark_mm, look.block_mm = mark_mm, block_mm
+        return look
+
+
+def bring(
+    arm: LegoArm,
+    mark_mm: tuple[float, float],
+    block_mm: float,
+    eyes: Callable[[Look], str],
+    tell: Callable[[str], None],
+    *,
+    named: str,
+) -> Touched | None:
+    """Bring the sensor over a mark and down to the block on it, as a person says; None: the mark is left out.
+
+    Every move goes over the place, turns the base and then comes down, as when the arm reads.
+
+    Parameters
+    ----------
+    arm
+        The arm, entered.
+    mark_mm, block_mm
+        Place of the mark on the field, and height of the block.
+    eyes
+        What answers: "ok", "seen", "skip", or how to move on.
+    tell
+        Where it is said why a move was not made.
+    named
+        What the mark is called.
+    """
+    from probewise.arm.touched import Touched
+
+    at = (*mark_mm, arm.geometry.travel_height_mm)
+    arm.go_down(*at)
+    tell(_HELP)
+    while True:
+        answer = eyes(Look(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
+        if answer == "skip":
+            return None
+        if answer in ("ok", "seen"):
+            homes = np.array([joint.home_rad for joint in arm.geometry.joints])
+            base, shoulder, elbow = (arm.angles_rad - homes).tolist()
+            height_mm = block_mm if answer == "ok" else math.nan
+            return Touched((base, shoulder, elbow), (*mark_mm, height_mm))
+        moved = _moved(at, answer)
+        if moved is None:
+            tell(f"{answer!r} says nothing that can be done. {_HELP}")
+            continue
+        try:
+            arm.go_down(*moved)
+        except ReachError as error:
+            tell(str(error))
+            arm.go_down(*at)
+        else:
+            at = moved
+
+
+def _moved(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
+    """Say where an answer leads; None where it is none."""
+    words = answer.split() or ["down", str(STEP_MM)]
+    x, y, height = at_mm
+    if len(words) % 2:
+        return None
+    for way, text in zip(words[::2], words[1::2], strict=True):
+        try:
+            by = float(text)
+        except ValueError:
+            return None
+        if not abs(by) <= _MOST_MM:
+            return None
+        match way:
+            case "x":
+                x += by
+            case "y":
+                y += by
+            case "up":
+                height += by
+            case "down":
+                height -= by
+            case _:
+                return None
+    return x, y, height

@@ -1,0 +1,145 @@
+"""See at once whether what lies under the sensor is what a plan says: white bright, black dark."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probewise.scene import region_of
+
+if TYPE_CHECKING:
+    from probewise._arrays import BoolArray, FloatArray
+    from probewise.recordings import Pattern, Plan
+
+__all__ = ["SheetWatch"]
+
+_SEES_MM = 14.0  # so far around it the sensor sees
+_LOOK_MM = 25.0  # beside the plan's places a sheet still shows the pattern
+_SHARE = 0.05  # of the range of readings: white and black are at least so far apart
+_OFF = 0.35  # of the way from one level to the other: no noise leads so far
+_FEWEST = 3
+_SPREAD_SHARE = 0.15  # of the range: readings of one shade lie closer together
+
+_AROUND_MM = np.stack(
+    [
+        radius * np.array([math.cos(turn), math.sin(turn)])
+        for radius in (0.0, _SEES_MM / 2, _SEES_MM)
+        for turn in np.arange(8) * math.pi / 4
+    ]
+)
+
+
+class SheetWatch:
+    """Compare readings with the shade that the sensor sees nothing but.
+
+    Parameters
+    ----------
+    plan
+        Its patterns, and the range of its readings.
+    white_is_bright
+        Whether white is known to read higher than black, as with the light sensor of the LEGO arm.
+    """
+
+    def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:
+        self._plan, self._bright = plan, white_is_bright
+        ends = plan.instrumentation.ends
+        self._range = ends[1] - ends[0] if len(ends) == 2 else math.nan
+        self._read: dict[bool, list[float]] = {True: [], False: []}
+        self._told: set[tuple[str, bool]] = set()
+        places = np.stack([plan.x_mm, plan.y_mm], axis=-1)
+        self._shades = np.full(len(plan), math.nan)
+        for name, rows in plan.rows_by_pattern():
+            self._shades[rows] = shades(plan.patterns[name], places[rows])
+
+    def heard(self, row: int, value: float) -> str | None:
+        """Take a reading of the plan's; say what is wrong with it, once a sheet and shade."""
+        shade = self._shades[row]
+        if math.isnan(shade) or math.isnan(value):
+            return None
+        name, is_white = self._plan.pattern_names[int(self._plan.pattern[row])], bool(shade)
+        wrong = self._against_earlier(is_white, value)
+        if wrong is None:
+            self._read[is_white].append(value)
+            return None
+        if (name, is_white) in self._told:
+            return None
+        self._told.add((name, is_white))
+        place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {_shade(is_white)}, and {wrong}"
+
+    def looked(self, name: str, values: dict[bool, float]) -> str | None:
+        """Judge readings taken over the white and the black of a sheet; keep them where they are right."""
+        wrong = None
+        if len(values) == 2:
+            contrast = values[True] - values[False]
+            if self._bright and contrast < self._least(*values.values()):
+                wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
+        for is_white, value in values.items():
+            told = self._against_earlier(is_white, value)
+            wrong = wrong or (None if told is None else f"where it should be {_shade(is_white)} {told}")
+        if wrong is not None:
+            return f"sheet {name!r} contradicts its pattern: {wrong}"
+        for is_white, value in values.items():
+            self._read[is_white].append(value)
+        return None
+
+    def places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
+        """Choose where to look at a sheet that was laid: over nothing but white and nothing but black, by shade.
+
+        Parameters
+        ----------
+        name
+            The pattern.
+        allowed
+            Tells which places, (n, 2) in the plan's frame, the arm can take.
+        """
+        rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
+        there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
+        beside = there.mean(axis=0) + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+        candidates = np.concatenate([there, beside])
+        candidates = candidates[allowed(candidates)]
+        if not len(candidates):
+            return {}
+        found = shades(self._plan.patterns[name], candidates)
+        middle = there.mean(axis=0)
+        out = {}
+        for is_white in (True, False):
+            fitting = candidates[found == float(is_white)]
+            if len(fitting):
+                x, y = fitting[np.argmin(((fitting - middle) ** 2).sum(axis=-1))].tolist()
+                out[is_white] = (x, y)
+        return out
+
+    def _against_earlier(self, is_white: bool, value: float) -> str | None:
+        own, other = self._read[is_white], self._read[not is_white]
+        if own and other:
+            level, opposite = float(np.median(own)), float(np.median(other))
+            if abs(value - level) > max(_OFF * abs(opposite - level), self._least(level, opposite)):
+                return f"reads {value:g}; {_shade(is_white)} read {level:g} so far, {_shade(not is_white)} {opposite:g}"
+        elif len(own) >= _FEWEST:
+            level = float(np.median(own))
+            if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
+                return f"reads {value:g}; {_shade(is_white)} read {level:g} so far"
+        elif other and self._bright:
+            opposite = float(np.median(other))
+            if (value - opposite) * (1 if is_white else -1) < self._least(value, opposite):
+                return f"reads {value:g}, where {_shade(not is_white)} read {opposite:g}"
+        return None
+
+    def _least(self, *levels: float) -> float:
+        return _SHARE * (self._range if math.isfinite(self._range) else max(abs(level) for level in levels))
+
+
+def shades(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
+    """Tell what the sensor sees nothing but at each place, (n, 2): 1 white, 0 black, NaN both or grey; (n,)."""
+    seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
+    albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
+    low, high = albedo.min(axis=1), albedo.max(axis=1)
+    return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)
+
+
+def _shade(is_white: bool) -> str:
+    return "white" if is_white else "black"

@@ -1,0 +1,189 @@
+"""The geometry fitted at the emulated bench, and sheets that are watched while a plan is carried out."""
+
+import dataclasses
+import io
+import math
+import re
+
+import numpy as np
+import pytest
+
+from probewise.arm import LegoArm, Rehearsal, Request, read_geometry, shipped_geometry
+from probewise.cli import main
+from probewise.cli._hands import Hands
+from probewise.cli._marks import _moved, bring
+from probewise.cli._sheet_watch import SheetWatch, shades
+from probewise.emulator import parse_scene
+from probewise.emulator.scenes import scene_text
+from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
+
+OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}
+
+
+@pytest.fixture
+def true_toml(tmp_path):
+    """The shipped arm, its lengths 3 mm and its home angles 2 degrees off."""
+    text = shipped_geometry().read_text(encoding="utf-8")
+    for name, by in OFF.items():
+        text = re.sub(
+            rf"^{name} = (\d+)", lambda found, by=by, name=name: f"{name} = {int(found[1]) + by}", text, flags=re.M
+        )
+    text = re.sub(r"^home_deg = (-?\d+)", lambda found: f"home_deg = {int(found[1]) - 2}", text, flags=re.M)
+    path = tmp_path / "true.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def edge_plan(tmp_path):
+    plan = paper_plan()
+    write_plan(plan.take(np.r_[0:101:10]), tmp_path / "plan.csv")
+    return tmp_path / "plan.csv"
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_built_otherwise_is_fitted_and_records_without_touching_the_table(
+    true_toml, edge_plan, tmp_path, capsys
+):
+    out, arm = tmp_path / "fitted.toml", f"emulator:{true_toml}"
+    told = ["arm", "record", str(edge_plan), "--arm", arm, "--quiet", "--origin-mm", "524,60"]
+    assert main([*told, "--out", str(tmp_path / "wrong.csv")]) == 0
+    said = capsys.readouterr().err
+    assert "the sensor may touch the table: it reads 14 mm above it" in said
+    assert re.search(r"the emulated arm's sensor went \d+\.\d mm through the table", said)
+    assert main(["arm", "fit-geometry", "--arm", arm, "--out", str(out)]) == 0
+    fitted = read_geometry(out)
+    assert fitted.links_mm == pytest.approx((353, 347), abs=6)
+    assert math.degrees(fitted.base.home_rad) == pytest.approx(-92, abs=0.2)
+    capsys.readouterr()
+    assert main([*told, "--geometry", str(out), "--out", str(tmp_path / "right.csv")]) == 0
+    assert capsys.readouterr().err == ""
+    # The same marks fit again without an arm.
+    again = [
+        "arm",
+        "fit-geometry",
+        "--marks",
+        str(tmp_path / "fitted.marks.csv"),
+        "--out",
+        str(tmp_path / "again.toml"),
+    ]
+    assert main(again) == 0
+    assert (tmp_path / "again.toml").read_text() == out.read_text()
+
+
+def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, capsys):
+    out = str(tmp_path / "a.toml")
+    assert main(["arm", "fit-geometry", "--out", out]) == 2
+    assert "--arm is missing" in capsys.readouterr().err
+    assert main(["arm", "fit-geometry", "--out", out, "--arm", "simulated"]) == 2
+    assert "nxt:PORT or emulator:TRUE.toml" in capsys.readouterr().err
+    (tmp_path / "a.marks.csv").write_text("")
+    assert main(["arm", "fit-geometry", "--out", out, "--arm", "emulator"]) == 2
+    assert "--resume to go on with it" in capsys.readouterr().err
+
+
+def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
+    geometry = read_geometry(shipped_geometry())
+    arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
+    said, answers = [], iter(["", "x 4 y -2", "sideways", "down 55", "up 3", "ok"])
+    with arm:
+        met = bring(arm, (520.0, 260.0), 32.0, lambda look: next(answers), said.append, named="mark 1")
+    homes = np.array([joint.home_rad for joint in geometry.joints])
+    x, y, height = geometry.position_mm((np.array(met.turned_rad) + homes)[None, :])[0]
+    assert (x, y, height) == pytest.approx((524, 258, 60 - 5 + 3), abs=1.0)
+    assert met.place_mm == (520.0, 260.0, 32.0)
+    assert any("'sideways' says nothing" in text for text in said)
+    assert any("8 mm or more" in text for text in said)  # the guard refused 55 mm down
+
+
+@pytest.mark.parametrize(
+    ("answer", "moved"),
+    [
+        ("", (1, 2, 55)),
+        ("down 2", (1, 2, 58)),
+        ("x 1 y 1 up 1", (2, 3, 61)),
+        ("x", None),
+        ("x 1e9", None),
+        ("z 1", None),
+    ],
+)
+def test_an_answer_is_a_move_or_nothing(answer, moved):
+    assert _moved((1, 2, 60), answer) == moved
+
+
+def test_shades_are_those_that_fill_the_sensors_view():
+    places = np.array([[-20.0, 0.0], [-10.0, 0.0], [20.0, 0.0]])
+    np.testing.assert_array_equal(shades(HalfPlane(0.0, 0.0), places), [0, np.nan, 1])
+    np.testing.assert_array_equal(shades(Uniform(0.5), places), [np.nan] * 3)
+
+
+def edge(n=101):
+    return paper_plan().take(np.arange(n))
+
+
+def test_a_scan_that_starts_over_the_wrong_side_is_told_of_at_the_first_reading_that_shows_it():
+    watch = SheetWatch(edge(), white_is_bright=True)
+    said = [watch.heard(row, 58.0 if row < 40 else 14.0) for row in range(101)]
+    first = next(k for k, text in enumerate(said) if text)
+    assert first == 65  # the first that is all white, and dark
+    assert "at (15, 0) mm it is white, and reads 14, where black read 58" in said[first]
+
+
+def test_a_level_that_jumps_within_black_is_told_of_before_any_white():
+    watch = SheetWatch(edge(), white_is_bright=True)
+    said = [watch.heard(row, 58.0 if row < 10 else 14.0) for row in range(30)]
+    assert [k for k, text in enumerate(said) if text] == [10]
+
+
+def test_a_right_scan_is_not_told_of():
+    plan = edge()
+    noise = np.random.default_rng(3).normal(0.0, 1.5, len(plan))
+    watch = SheetWatch(plan, white_is_bright=True)
+    levels = 14 + 44 / (1 + np.exp(-plan.x_mm / 3))
+    assert not any(watch.heard(row, float(value)) for row, value in enumerate(levels + noise))
+
+
+def test_a_sheet_is_looked_at_over_its_white_and_its_black():
+    plan = paper_plan()
+    watch = SheetWatch(plan, white_is_bright=True)
+    everywhere = lambda places: np.ones(len(places), dtype=bool)  # noqa: E731
+    for name, pattern in plan.patterns.items():
+        places = watch.places(name, everywhere)
+        assert set(places) == {True, False}
+        for is_white, place in places.items():
+            assert shades(pattern, np.array([place]))[0] == is_white
+    assert watch.looked("boundary", {True: 55.0, False: 15.0}) is None
+    assert "reads 15 where it should be white and 55 where black" in watch.looked(
+        "quadrant_a", {True: 15.0, False: 55.0}
+    )
+
+
+@pytest.mark.parametrize("scene", ["edge:0,524", "corner:528,264,1,1", "circle:1,2,3", "uniform:0"])
+def test_a_scene_is_typed_as_it_is_read(scene):
+    assert parse_scene(scene_text(parse_scene(scene))) == parse_scene(scene)
+
+
+def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet(monkeypatch, capsys):
+    geometry = read_geometry(shipped_geometry())
+    arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
+    values = iter([12.0, 57.0])
+    monkeypatch.setattr(arm, "measure", lambda pose: dataclasses.replace(_reading(pose), value=next(values)))
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))
+    plan = paper_plan()
+    with arm:
+        hands = Hands(arm, plan, (524.0, 260.0), SheetWatch(plan, white_is_bright=True), typed=True)
+        hands(Request("lay sheet 'quadrant_c'", pattern="quadrant_c"))
+        hands(Request("turn the sensor", turned_rad=math.pi / 2))
+    said = capsys.readouterr().err
+    assert "in the emulator's terminal: corner:528,264,1,1" in said
+    assert "in the emulator's terminal: turn 90" in said
+    assert (
+        "warning: sheet 'quadrant_c' contradicts its pattern: it reads 12 where it should be white and 57 where" in said
+    )
+    assert isinstance(plan.patterns["quadrant_c"], Quadrant)
+
+
+def _reading(pose):
+    from probewise.arm import Reading
+
+    return Reading(0.0, pose, 1.0)

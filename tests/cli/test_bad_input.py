@@ -237,6 +237,7 @@ def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, r
         "audit": ["audit", recording_file, "--out", out],
         "challenge": ["challenge", "--out", out],
         "fit": ["fit", recording_file, "--simulator", recording_file, "--out", out],
+        "sheets": ["sheets", "field", "--out", out / "field.pdf"],
         "arm": ["arm", "check", "--out", out / "reach.png"],
         "emulate-nxt": ["emulate-nxt", "--log", out / "log.txt"],
     }[verb]

@@ -156,7 +156,7 @@ def test_marks_and_targets_are_at_their_places_of_the_field():
     for tile, page in zip(tiles, pages, strict=True):
         shift = np.array(tile.low_mm) - [LEFT_MM, BOTTOM_MM]
         for how, points in page[1]:
-            if how == "S" and len(points) == 2 and np.ptp(points) > 15 and abs(np.ptp(points[:, 0]) - 16) < 0.02:
+            if how == "S" and len(points) == 2 and np.ptp(points) > 15 and abs(np.ptp(points[:, 0]) - 30) < 0.02:
                 found.add(tuple(np.round(points.mean(axis=0) + shift, 1).tolist()))
     assert {tuple(mark) for mark in sheet.crosses_mm.tolist()} <= found
     cut = pages_of(sheets_pdf([target_sheet("circle", CIRCLE)], paper="a4", title="t"))[1:]

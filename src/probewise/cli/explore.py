@@ -304,6 +304,13 @@ def run(arguments: argparse.Namespace) -> int:
         learnt = posing.repaired(sensor, result.last, rng=np.random.default_rng(arguments.seed))
         write_text_atomically(stage / "sensor.json", learnt.to_json())
     say(result.summary(), quiet=arguments.quiet)
+    if geometry is not None and chosen.is_apart and geometry.accuracy is not None:
+        accuracy = geometry.accuracy
+        say(
+            f"arm          not in these sds: its place is known to {accuracy.place_sd_mm:.2f} mm, lengths on the field to "
+            f"{accuracy.scale_sd:.2%}, the same for all readings",
+            quiet=arguments.quiet,
+        )
     missing = posing.left_out_of(result.last, experiment.trust)
     if experiment.trust < 1:
         say(missing.sentence, quiet=arguments.quiet)

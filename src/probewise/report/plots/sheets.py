@@ -29,6 +29,7 @@ _PIXEL_MM = 0.25  # of patterns that no outline draws
 _ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
 _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
 _THUMB_MM = 38.0
+_CROSS_MM = 15.0  # its ends stand out from below a block of two LEGO studs
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
@@ -222,10 +223,10 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
         line = ax.add_patch(Outline(place(sheet.outline_mm), closed=True, fc="none", ec=BLACK, lw=0.4, zorder=2))
         line.set_clip_path(clip)
     for k, mark in enumerate([] if sheet.crosses_mm is None else sheet.crosses_mm):
-        for arm in ([[-8.0, 0.0], [8.0, 0.0]], [[0.0, -8.0], [0.0, 8.0]]):
+        for arm in ([[-_CROSS_MM, 0.0], [_CROSS_MM, 0.0]], [[0.0, -_CROSS_MM], [0.0, _CROSS_MM]]):
             (half,) = ax.plot(*place(mark + np.array(arm)).T, color=BLACK, lw=0.35, solid_capstyle="butt", zorder=2)
             half.set_clip_path(clip)
-        x, y = place((mark + 3.0)[None])[0].tolist()
+        x, y = place((mark + 10.0)[None])[0].tolist()
         if (low_mm[0] <= mark[0] < high_mm[0]) and (low_mm[1] <= mark[1] < high_mm[1]):
             told = ax.text(
                 x, y, f"{k + 1}: ({mark[0]:g}, {mark[1]:g})" if named else f"{k + 1}", fontsize=_SMALL, zorder=2

@@ -307,7 +307,7 @@ def run(arguments: argparse.Namespace) -> int:
     if geometry is not None and chosen.is_apart and geometry.accuracy is not None:
         accuracy = geometry.accuracy
         say(
-            f"arm          not in these sds: its place is known to {accuracy.place_sd_mm:.2f} mm, lengths on the field to "
+            f"arm          not in these sds: its place is known to {accuracy.place_sd_mm:.2f} mm, lengths to "
             f"{accuracy.scale_sd:.2%}, the same for all readings",
             quiet=arguments.quiet,
         )

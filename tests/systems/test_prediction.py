@@ -86,3 +86,15 @@ def test_predictions_are_written_row_by_row_with_the_columns_of_the_table(tmp_pa
     lines = (tmp_path / "p.csv").read_text().splitlines()
     assert lines[0] == "run,t_s,power_w,room_c,temp_c,mean,sd,log_density"
     assert len(lines) == 1 + len(runs())
+
+
+def test_the_density_of_a_new_run_does_not_hang_on_which_starts_were_drawn():
+    """The start is normal about 20 with sd 5: at time 0 a reading has that density, however small its noise."""
+    model = dataclasses.replace(fitted(), noise_sd=np.full(500, 0.001))
+    table = runs((20.0,), names="9", n=4)
+    readings = np.array([14.0, 20.0, 23.0, 26.0])
+    for reading in readings:
+        columns = {**table.columns, "temp_c": np.full(4, reading)}
+        found = predicted(model, dataclasses.replace(table, columns=columns))
+        expected = -0.5 * ((reading - 20) / 5) ** 2 - np.log(5 * np.sqrt(2 * np.pi))
+        assert abs(found.log_density[0] - expected) < 0.25

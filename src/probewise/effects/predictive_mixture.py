@@ -39,8 +39,12 @@ class PredictiveMixture:
         self._total, self._squares, self._of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
         self._log_sum = np.full(int(self.scored.sum()), -np.inf)
 
-    def add(self, mean: FloatArray, level: NoiseLevel) -> None:
-        """Add noise-free predictions, (n_samples, n_points), and the noise about them."""
+    def add(self, mean: FloatArray, level: NoiseLevel, between: FloatArray | None = None) -> None:
+        """Add noise-free predictions, (n_samples, n_points), and the noise about them.
+
+        `between` (n_points,) is the sd by which each sample stands for what lies between it and the next, where samples
+        lie farther apart than the noise is wide: the density alone is smoothed by it.
+        """
         if self._center is None:
             self._center = mean.mean(axis=0)  # sums about a nearby value keep their precision
         self.n_samples += len(mean)
@@ -49,6 +53,8 @@ class PredictiveMixture:
         self._of_noise += np.broadcast_to(variance(level), mean.shape).sum(axis=0)
         if self.step is not None:  # `variance` above leaves it out: the pooled sd includes a declared rounding
             level = replace(level, step=np.full((1, 1), self.step))
+        if between is not None:
+            level = replace(level, sd=np.hypot(np.broadcast_to(level.sd, mean.shape), between))
         if self._log_sum.size:
             log_p = log_density(_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))

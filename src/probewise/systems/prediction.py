@@ -31,6 +31,7 @@ __all__ = ["SystemPrediction", "as_recording", "predict_system", "write_system_p
 
 _FEW = 20  # samples that tell which rows cannot be predicted
 _BLOCK = 2_000_000  # numbers held at once by one pass over some samples
+_SOME = 200  # samples that tell how wide predictions scatter in each row
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +139,12 @@ def predict_system(
     own = cast(RunTable, recording.plan)
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
     chain = system.chain(own, bound_effects(fitted, own))
-    theta = _theta(fitted, chain, rng=rng)
+    theta, is_drawn = _theta(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
     lost = _lost(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
+    between = _between_samples(chain, theta, own) if is_drawn else None
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
@@ -151,7 +153,7 @@ def predict_system(
         n_failed += int((~there).sum())
         if there.any():
             sd = fitted.noise_sd[first : first + per_block][there, None]
-            mixture.add(mean[there], _noise_level(fitted, chain, block[there], mean[there], sd, own))
+            mixture.add(mean[there], _noise_level(fitted, chain, block[there], mean[there], sd, own), between)
     if n_failed == n_samples:
         raise ParameterError(
             "simulate" if system.caller else "rates",
@@ -221,8 +223,28 @@ def _columns_read(effects: Sequence[str], table: RunTable) -> set[str]:
     return {part for name in effects for part in name.split(":")[1:] if part in table.columns}
 
 
-def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator) -> FloatArray:
-    """Lay the samples out by the columns of a chain, with draws of what belongs to runs that were not recorded."""
+def _between_samples(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Choose how far each sample's prediction of a row is smoothed, (n_points,), by Silverman's rule.
+
+    A parameter of a new run is drawn from its prior, some thousand times: where that prior is wide the predictions lie
+    farther apart than the noise is wide, and whether a reading meets one of them would be chance.
+    """
+    some = chain.predict(theta[:: max(len(theta) // _SOME, 1)], table)
+    there = some[np.isfinite(some).all(axis=1)]
+    if len(there) < 2:
+        return np.zeros(len(table))
+    low, high = np.quantile(there, [0.25, 0.75], axis=0)
+    spread = np.minimum(there.std(axis=0), (high - low) / 1.349)
+    return np.asarray(0.9 * spread * len(theta) ** -0.2)
+
+
+def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator) -> tuple[FloatArray, bool]:
+    """Lay the samples out by the columns of a chain, with draws of what belongs to runs that were not recorded.
+
+    Returns
+    -------
+    The samples, and whether anything was drawn.
+    """
     at = {name: k for k, name in enumerate(fitted.names)}
     n, system = len(fitted.samples), chain.system
     out = np.empty((n, len(chain.names)))
@@ -238,7 +260,7 @@ def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
             positive = effect == NoisePerRun.name  # what scatters evenly is then the logarithm
             drawn = _of_another_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
-    return out
+    return out, any(name not in at for name in chain.names)
 
 
 def _of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:

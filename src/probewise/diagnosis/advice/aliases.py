@@ -22,6 +22,7 @@ from probewise.effects import NamedEffect, first_of
 __all__ = ["Alias", "aliased_pairs", "aliases", "settle", "surviving_cosine"]
 
 ALIAS_COSINE = 0.9
+_LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # that a reading must promise: less is rounding, and settles nothing
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def settle(
         z = np.concatenate([found.z, model.scores_of(effects[name].bank()[0][:1])[0]])
         here = model.predict(z[None, :])[0] - null
         shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
-    best = {pair.effects: (0.0, pair) for pair in pairs}
+    best = {pair.effects: (_LEAST_NATS, pair) for pair in pairs}
     scans = apparatus.commands(found.model.plan, level=null)
     if not (best and scans):
         return list(pairs)

@@ -107,7 +107,8 @@ class Model:
 class Fit:
     """The best point of a model: coordinates `z`, and at it the usable rows' predictions and slopes.
 
-    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` is the most likely sigma of its law.
+    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` is the most likely sigma of its law;
+    `settled` says that no step gained more than the tolerance any longer.
     """
 
     model: Model
@@ -117,6 +118,7 @@ class Fit:
     slopes: FloatArray
     sd: float
     objective: float
+    settled: bool = False
 
     def change_by(self, name: str, usable: IntArray) -> FloatArray:
         """Tell what one of its effects does to the usable readings, all else as it is, (n_usable,)."""
@@ -165,6 +167,7 @@ def fit(
     best = float(objective(predicted[None, :], z[None, :])[0])
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # nothing to go down from
         return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
+    settled = False
     for _ in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
         sigma = law.scale(whitened)
@@ -181,15 +184,16 @@ def fit(
         values = np.where(np.isfinite(values), values, np.inf)
         at = int(np.argmin(values))
         gained = best - float(values[at])
+        settled = gained < tolerance
         if gained <= 0:
             break
         z, best = tries[at], float(values[at])
         own = model.jacobian(z) if all_slopes is None else (all_predicted[at], all_slopes[at])
         predicted, slopes = (part[usable] for part in own)
-        if gained < tolerance:
+        if settled:
             break
     sd = float(law.scale(law(readings - predicted)[:, None])[0])
-    return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best)
+    return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
 
 
 def _steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:

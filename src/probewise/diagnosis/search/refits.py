@@ -27,6 +27,8 @@ from probewise.effects import NamedEffect
 
 __all__ = ["Refits", "is_significant"]
 
+_SAME_START = 0.1  # of a coordinate, whose prior has an sd of one: a start no farther from another leads where it does
+
 
 @dataclass(frozen=True, eq=False)
 class Refits:
@@ -98,8 +100,10 @@ class Refits:
         """Go a few steps from each start, then all the way from the best."""
         recording = self.noises.recording
         if len(starts) > 1:
-            tried = [fit(model, recording, start, law, max_steps=5) for start in starts]
-            starts = min(tried, key=lambda f: f.objective).z[None, :]
+            best = min((fit(model, recording, start, law, max_steps=5) for start in starts), key=lambda f: f.objective)
+            if best.settled:
+                return require_finite(best)
+            starts = best.z[None, :]
         return require_finite(fit(model, recording, starts[0], law, max_steps=max_steps))
 
     def _of_variant(
@@ -115,13 +119,15 @@ class Refits:
         model = parent.found.model.with_effect(templates.variants[variant])
         ranked = [(about, scores, own[np.argsort(-scores[own])]) for about, scores in seen]
         chosen = [(about, at) for about, scores, best in ranked for at in best[: 2 if scores[best[0]] > 5 else 1]]
-        starts = []
+        starts: list[FloatArray] = []
         for about, at in chosen:
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
             setting = effect.start(templates.settings[at], amount)
             z = parent.found.z + about.absorbed(parent.found, columns @ amount)
-            starts.append(np.concatenate([z, model.scores_of(setting[None, :])[0]]))
+            start = np.concatenate([z, model.scores_of(setting[None, :])[0]])
+            if all(np.abs(start - other).max() > _SAME_START for other in starts):
+                starts.append(start)
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # A null with several basins: with the effect the best may be another one than without.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_rng, require_takes
 from probewise.diagnosis.engine import Thorough, diagnose_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.noise.law import white_of
+from probewise.diagnosis.noise.law import NoiseLaw, white_of
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, PersonsSystem
@@ -27,6 +27,8 @@ __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", 
 
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 _MOST_COMPARED = 2400
+_STEPS_TRIED = 8  # of the fit of the simulator, from each start
+_BEST_STARTS = 3  # of which it goes on
 
 
 def diagnose_system(
@@ -196,7 +198,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     """
     table = cast(RunTable, recording.plan)
     law = white_of(recording)
-    found = min((fit(Model(system, (), recording.plan), recording, z, law) for z in system.starts), key=_height)
+    found = _from_best_start(system, recording, law)
     sd = _sd(system.simulator, table, recording, found)
     for _ in range(4):
         finer = system.standing_still(table, found.z[None, :], tolerance=_STANDS_STILL * sd)
@@ -206,6 +208,14 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
         found = fit(Model(system, (), recording.plan), recording, found.z, law)
         sd = _sd(system.simulator, table, recording, found)
     return system, found, sd
+
+
+def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit:
+    """Go some steps from every start, and on from those that are lowest by then."""
+    model = Model(system, (), recording.plan)
+    tried = sorted((fit(model, recording, z, law, max_steps=_STEPS_TRIED) for z in system.starts), key=_height)
+    further = [f if f.settled else fit(model, recording, f.z, law) for f in tried[:_BEST_STARTS]]
+    return min(further, key=_height)
 
 
 def _height(found: Fit) -> float:

@@ -114,10 +114,8 @@ def diagnose_prepared(
     """Go the road of `diagnose` for any apparatus; what is returned and raised is as there."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
     if searched.posterior.by_mean.get(("unknown",), 0.0) > _PROPOSED_FROM:
-        proposals = prepared.apparatus.proposals()
-        if proposals:
-            prepared = replace(prepared, effects={**prepared.effects, **proposals})
-            searched = search(prepared, progress=progress)
+        searched = _with_proposals(searched, progress=progress)
+        prepared = searched.prepared
     if prepared.too_little:
         searched = searched.by_prior_alone()
     elif thorough is not None:
@@ -152,6 +150,16 @@ def diagnose_prepared(
         report=VerdictReport(reason, found, noise, weighings, remainder, formula),
         apparatus=prepared.apparatus,
     )
+
+
+def _with_proposals(searched: Searched, *, progress: Progress) -> Searched:
+    """Search again, formulas proposed for what has no name; as it was where there are none, or no time for them."""
+    prepared = searched.prepared
+    proposals = {} if prepared.apparatus.refits_are_over() else prepared.apparatus.proposals()
+    if not proposals:
+        return searched
+    again = search(replace(prepared, effects={**prepared.effects, **proposals}), progress=progress)
+    return searched if prepared.apparatus.refits_are_over() else again
 
 
 def _grounds(

@@ -28,9 +28,11 @@ _SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
 
 @dataclass(eq=False)
 class Tally:
-    """Count samples at which a law raises an error."""
+    """Count what a law has cost: steps of its integration, and samples at which it raises an error."""
 
     n_failed: int = 0
+    n_steps: int = 0
+    cut_short: bool = False
 
 
 @dataclass(eq=False)

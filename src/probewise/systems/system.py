@@ -311,8 +311,10 @@ class SystemChain:
         law = self.system.simulator.law
         assert law is not None
         motion = self._applied(Stage.RATE, Motion(law), theta, plan)
+        places = RowsInRuns(plan)
+        self.system.tally.n_steps += int(places.n_steps(self.system.max_step).sum())
         try:
-            return integrate(motion, RowsInRuns(plan), parameters, columns, max_step=self.system.max_step)
+            return integrate(motion, places, parameters, columns, max_step=self.system.max_step)
         except ProbewiseError:
             raise
         except Exception:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,10 +18,31 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES
 
-__all__ = ["Fit", "Model", "fit", "residual_degrees_of_freedom", "start_with_more_gaussians", "starts_of_one_gaussian"]
+__all__ = [
+    "Fit",
+    "Model",
+    "fit",
+    "fits",
+    "residual_degrees_of_freedom",
+    "start_with_more_gaussians",
+    "starts_of_one_gaussian",
+]
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
+_AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
+
+
+def _points_about(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lay out a point z (n_params,) and one a step along each coordinate: (n_params + 1, n_params), (n_params,)."""
+    # Steps point inwards, so that no parameter leaves the bounds.
+    steps = np.where(z > 0, -_STEP, _STEP)
+    return np.concatenate([z[None, :], z + np.diag(steps)]), steps
+
+
+def _differentiated(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Turn predictions at such points (n_params + 1, n_points) to those at z and slopes (n_points, n_params)."""
+    return batch[0], (batch[1:] - batch[0]).T / steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,18 +96,8 @@ class Model:
 
     def jacobian(self, z: FloatArray, plan: Plan | None = None) -> tuple[FloatArray, FloatArray]:
         """Predict and differentiate at one point z (n_params,): (n_points,), (n_points, n_params)."""
-        # Steps point inwards, so that no parameter leaves the bounds.
-        steps = np.where(z > 0, -_STEP, _STEP)
-        batch = self.predict(np.concatenate([z[None, :], z + np.diag(steps)]), plan)
-        return batch[0], (batch[1:] - batch[0]).T / steps
-
-    def jacobians(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Predict and differentiate at several points z (n, n_params): (n, n_points), (n, n_points, n_params)."""
-        steps = np.where(z > 0, -_STEP, _STEP)
-        moved = z[:, None, :] + steps[:, :, None] * np.eye(z.shape[1])
-        batch = self.predict(np.concatenate([z[:, None, :], moved], axis=1).reshape(-1, z.shape[1]))
-        batch = batch.reshape(len(z), z.shape[1] + 1, -1)
-        return batch[:, 0], np.moveaxis(batch[:, 1:] - batch[:, :1], 1, 2) / steps[:, None, :]
+        points, steps = _points_about(z)
+        return _differentiated(self.predict(points, plan), steps)
 
     def with_effect(self, effect: NamedEffect[Any]) -> Model:
         """Add an effect behind the others."""
@@ -153,6 +164,46 @@ def fit(
     tolerance
         Stop when a step gains less, in nats.
     """
+    (found,) = fits(model, recording, [start], law, max_steps=max_steps, tolerance=tolerance)
+    return found
+
+
+def fits(
+    model: Model,
+    recording: Recording,
+    starts: Sequence[FloatArray],
+    law: NoiseLaw,
+    *,
+    max_steps: int = 30,
+    tolerance: float = 5e-3,
+) -> list[Fit]:
+    """Fit as `fit` does from each of several starts.
+
+    Where many predictions cost as much as one they go on side by side, as many as stay in a processor's cache.
+    """
+    walks = [_walk(model, recording, start, law, max_steps, tolerance) for start in starts]
+    at_once = 1
+    if model.sensor.in_bulk:
+        at_once = max(_AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
+    found: dict[int, Fit] = {}
+    for first in range(0, len(walks), at_once):
+        asked = {k: next(walks[k]) for k in range(first, min(first + at_once, len(walks)))}
+        while asked:
+            predicted = model.predict(np.concatenate(list(asked.values())))
+            ends = np.cumsum([len(points) for points in asked.values()])
+            for k, part in zip(list(asked), np.split(predicted, ends[:-1]), strict=True):
+                try:
+                    asked[k] = walks[k].send(part)
+                except StopIteration as end:
+                    found[k] = end.value
+                    del asked[k]
+    return [found[k] for k in range(len(walks))]
+
+
+def _walk(
+    model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
+) -> Generator[FloatArray, FloatArray, Fit]:
+    """Go down from one start: gives the points that it wants predicted, (n, n_params), and gets (n, n_points)."""
     usable = recording.usable
     readings = recording.readings[usable]
 
@@ -161,9 +212,13 @@ def fit(
         sigma = law.scale(whitened)
         return np.asarray(law.misfit(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
+    def jacobian(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+        points, steps = _points_about(z)
+        return _differentiated((yield points)[:, usable], steps)
+
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
-    predicted, slopes = (part[usable] for part in model.jacobian(z))
+    predicted, slopes = yield from jacobian(z)
     best = float(objective(predicted[None, :], z[None, :])[0])
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # nothing to go down from
         return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
@@ -179,8 +234,10 @@ def fit(
             break
         tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
         # Where many predictions cost as much as one, slopes are had along with them.
-        all_predicted, all_slopes = model.jacobians(tries) if model.sensor.in_bulk else (model.predict(tries), None)
-        values = objective(all_predicted[:, usable], tries)
+        about = [_points_about(at) for at in tries] if model.sensor.in_bulk else []
+        batch = yield np.concatenate([points for points, _ in about]) if about else tries
+        all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
+        values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)
         at = int(np.argmin(values))
         gained = best - float(values[at])
@@ -188,8 +245,10 @@ def fit(
         if gained <= 0:
             break
         z, best = tries[at], float(values[at])
-        own = model.jacobian(z) if all_slopes is None else (all_predicted[at], all_slopes[at])
-        predicted, slopes = (part[usable] for part in own)
+        if about:
+            predicted, slopes = _differentiated(all_predicted[at], about[at][1])
+        else:
+            predicted, slopes = yield from jacobian(z)
         if settled:
             break
     sd = float(law.scale(law(readings - predicted)[:, None])[0])

@@ -16,7 +16,7 @@ from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects
 from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemory
 from probewise.diagnosis.evidence.visible import log_visible
-from probewise.diagnosis.fitting.fit import Fit, Model, fit
+from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
@@ -100,7 +100,7 @@ class Refits:
         """Go a few steps from each start, then all the way from the best."""
         recording = self.noises.recording
         if len(starts) > 1:
-            best = min((fit(model, recording, start, law, max_steps=5) for start in starts), key=lambda f: f.objective)
+            best = min(fits(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
             if best.settled:
                 return require_finite(best)
             starts = best.z[None, :]

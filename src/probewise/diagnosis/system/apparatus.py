@@ -46,6 +46,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     DriftingNoise,
 )
 CALLS_OF_A_SEARCH = 16_000  # what judging and sampling ask beyond it stays within the 20,000 that a diagnosis may
+STEPS_OF_A_SEARCH = 600_000  # of the integration, some 70 microseconds each, of however many samples
 _N_BLOCKS = 5
 
 
@@ -95,9 +96,12 @@ class PersonsSystem:
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     def refits_are_over(self) -> bool:
-        """Tell whether `simulate`, called for one sample after the other, has been called often enough."""
-        caller = self.system.caller
-        if caller is None or caller.broadcasts or caller.n_calls < CALLS_OF_A_SEARCH:
+        """Tell whether `simulate`, one sample after the other, has been called often enough, or a law integrated."""
+        caller, tally = self.system.caller, self.system.tally
+        if caller is None:
+            tally.cut_short = tally.cut_short or tally.n_steps >= STEPS_OF_A_SEARCH
+            return tally.cut_short
+        if caller.broadcasts or caller.n_calls < CALLS_OF_A_SEARCH:
             return False
         caller.cut_short = True
         return True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -11,16 +11,17 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import require_rng, require_takes
 from probewise.diagnosis.engine import Thorough, diagnose_prepared
-from probewise.diagnosis.fitting.fit import Fit, Model, fit
+from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.noise.law import NoiseLaw, white_of
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, PersonsSystem
+from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, STEPS_OF_A_SEARCH, PersonsSystem
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording, table_for
+from probewise.systems.calls import Tally
 from probewise.systems.forms import About
 
 __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
@@ -135,9 +136,9 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, PersonsSystem):
         return ()
-    caller, n_failed = apparatus.system.caller, apparatus.system.tally.n_failed
+    caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:
-        return (f"rates raised an error for {n_failed:,} parameters tried: taken to be impossible",) if n_failed else ()
+        return tuple(_notes_on_law(tally))
     out = []
     if caller.cut_short:
         out.append(
@@ -150,6 +151,16 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         names = ", ".join(sorted(caller.interpolated))
         out.append(f"simulate takes no array of {names}: readings are interpolated between fixed values of it")
     return tuple(out)
+
+
+def _notes_on_law(tally: Tally) -> Iterator[str]:
+    if tally.cut_short:
+        yield (
+            f"integrating the law takes long: after {STEPS_OF_A_SEARCH:,} steps no further combination of effects "
+            "was fitted; a larger max_step_s, shorter runs side by side or fewer rows are searched in full"
+        )
+    if tally.n_failed:
+        yield f"rates raised an error for {tally.n_failed:,} parameters tried: taken to be impossible"
 
 
 def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
@@ -213,9 +224,10 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
 def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit:
     """Go some steps from every start, and on from those that are lowest by then."""
     model = Model(system, (), recording.plan)
-    tried = sorted((fit(model, recording, z, law, max_steps=_STEPS_TRIED) for z in system.starts), key=_height)
-    further = [f if f.settled else fit(model, recording, f.z, law) for f in tried[:_BEST_STARTS]]
-    return min(further, key=_height)
+    tried = sorted(fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_height)[:_BEST_STARTS]
+    if all(found.settled for found in tried):
+        return tried[0]
+    return min(fits(model, recording, [found.z for found in tried], law), key=_height)
 
 
 def _height(found: Fit) -> float:

@@ -46,6 +46,8 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated) for candidate in found]
     if len(rivals) > 1:
         return next_scans(rivals, sd, plan, apparatus)
+    if apparatus.refits_are_over():
+        return None
     others = dict.fromkeys(n for names in ranked for n in names if n in prepared.effects)
     imagined = (_imagined(searched, null, name) for name in others)
     tried = islice((rival for rival in imagined if rival is not None), _TRIED)

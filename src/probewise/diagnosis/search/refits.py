@@ -124,10 +124,12 @@ class Refits:
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
             setting = effect.start(templates.settings[at], amount)
-            z = parent.found.z + about.absorbed(parent.found, columns @ amount)
-            start = np.concatenate([z, model.scores_of(setting[None, :])[0]])
-            if all(np.abs(start - other).max() > _SAME_START for other in starts):
-                starts.append(start)
+            # What has no amplitude is there as a whole; to first order as much of it as the readings ask for.
+            for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
+                z = parent.found.z + about.absorbed(parent.found, columns @ taken)
+                start = np.concatenate([z, model.scores_of(setting[None, :])[0]])
+                if all(np.abs(start - other).max() > _SAME_START for other in starts):
+                    starts.append(start)
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # A null with several basins: with the effect the best may be another one than without.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]

@@ -6,6 +6,7 @@ from scipy.special import ndtr
 
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import About, forms_of
+from probewise.systems.forms.proposals import proposals
 
 SD = 0.01
 N_ROWS = 60
@@ -143,3 +144,11 @@ def test_forms_of_a_rate_add_to_the_law():
     capped = _read("limit:x", 2.5, about=about, forms=forms)
     np.testing.assert_allclose(capped, np.minimum(rate * _T, 2.5), atol=1e-6)
     assert {"drag:x", "friction:x", "forcing:x", "periodic_forcing:x", "cubic:x:x", "quadratic:x:x"} <= forms.keys()
+
+
+def test_a_switch_is_proposed_for_each_column_that_takes_many_values():
+    (switch,) = [form for form in proposals(_about(_simulator())) if form.name.endswith("sign(room_c - at)) / 2")]
+    assert switch.expression == "a (1 + sign(room_c - at)) / 2"
+    shifted = switch.apply(np.zeros((1, N_ROWS)), np.array([[0.3, 20.5]]), TABLE)
+    np.testing.assert_array_equal(shifted[0], np.where(TABLE.columns["room_c"] > 20.5, 0.3, 0.0))
+    assert all(low < high for low, high in zip(switch.moments.at[:-1], switch.moments.at[1:], strict=True))

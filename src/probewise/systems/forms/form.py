@@ -27,7 +27,7 @@ Say = Callable[[FloatArray, FloatArray], str]
 
 @dataclass(frozen=True)
 class Moments:
-    """Times, or row numbers, between which a change point lies; the last parameter of a form is one.
+    """Times, row numbers, or values of a column, between which a change point lies; a form's last parameter is one.
 
     `gated` says that the form does nothing before the change point and the same as everywhere after it, so that one
     prediction does for all of them.
@@ -37,9 +37,12 @@ class Moments:
     by_row: bool
     gated: bool
     few: int = 48
+    column: str = ""
 
     def along(self, table: RunTable) -> FloatArray:
         """Give what the change point is compared with, (n_points,)."""
+        if self.column:
+            return table.covariates[self.column]
         return np.arange(float(len(table))) if self.by_row else table.time_s
 
     def thinned(self) -> Moments:

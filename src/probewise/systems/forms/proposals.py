@@ -15,14 +15,16 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailed
+from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Act, Form, with_unit
+from probewise.systems.forms.form import Act, Form, Moments, with_unit
 from probewise.systems.motion import Motion
 from probewise.systems.table import RunTable
 
 __all__ = ["proposals"]
 
+_MOST_SWITCHES = 128  # values of a column that it may switch at
 _SAME = 0.9999  # cosine of two terms over the rows, beyond which the shorter one speaks for both
 
 
@@ -61,6 +63,8 @@ class _Term:
 def proposals(about: About) -> Iterator[Form]:
     """List the terms that could be added to the reading, and to the rate of each state."""
     yield from _of_reading(about)
+    for name in _columns(about):
+        yield from _switch(about, name)
     for state in about.states:
         yield from _of_rate(about, state)
 
@@ -118,6 +122,40 @@ def _of_reading(about: About) -> Iterator[Form]:
             yield from _proposal(
                 about, "reading", own.reading, Stage.OFFSET, act, term, {c: True for c in term_names(term)}
             )
+
+
+def _switch(about: About, name: str) -> Iterator[Form]:
+    """Shift the reading where a column is beyond a value that is not known."""
+    own, values = about.system.simulator, np.unique(about.table.covariates[name])
+    if len(values) <= 2:
+        return
+    at = np.append(values[: -1 : -(-(len(values) - 1) // _MOST_SWITCHES)], values[-1]).tolist()
+
+    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return np.asarray(value + theta[:, :1] * (table.covariates[name] > theta[:, 1:2]))
+
+    entry = np.array([[[about.sd, 0.5 * (at[0] + at[-1])]]])
+    typical = about.typical(Stage.OFFSET, act, entry, about.sd)
+    if typical is None:
+        return
+    entry[..., 0] = typical
+    text = f"(1 + sign({name} - at)) / 2"
+    yield Form(
+        f"formula:reading:{own.reading}:{text}",
+        Stage.OFFSET,
+        {"a": HeavyTailed(typical), "at": Uniform(at[0], at[-1])},
+        (own.unit, name),
+        (name,),
+        act,
+        entry,
+        (0,),
+        lambda mean, sd: (
+            f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} where {name} is above "
+            f"{with_unit(mean[1], sd[1], '')}: a proposal, not a known effect"
+        ),
+        moments=Moments(tuple(at), by_row=False, gated=True, column=name),
+        expression=f"a {text}",
+    )
 
 
 def _of_rate(about: About, state: str) -> Iterator[Form]:

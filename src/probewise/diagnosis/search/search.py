@@ -24,6 +24,7 @@ from probewise.diagnosis.search.constants import (
     FEW_READINGS,
     MAX_ORDER,
     MOST_REFITTED_LATE,
+    NULL_TRIED_AGAIN,
     REFITTED_LATE,
     WITH_UNKNOWN,
 )
@@ -36,7 +37,7 @@ from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.searched import Evidences, Posterior, Screening, Searched, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import Unknown
-from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import NoiseEffect
 from probewise.progress import Progress, silent
 
@@ -89,6 +90,8 @@ def search(
         return posterior_of(evidences(), prior, certain=noises.certain, n_forms=len(state.sensors))
 
     select_forward(state, beam=beam, depth=depth)
+    if prepared.null is not None:
+        _refit_null(state)
     eliminate_backward(state)
     # Beside a form of the SSF that the readings refute, it is the form that is missing.
     unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
@@ -117,6 +120,19 @@ def search(
         evidences=evidences(),
         posterior=posterior(),
     )
+
+
+def _refit_null(state: SearchState) -> None:
+    """Fit the null once more from where the best fits of one effect lie, whose gain may be but a deeper valley."""
+    null = state.null
+    single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
+    for candidate in sorted(single, key=lambda c: -c.log_z)[:NULL_TRIED_AGAIN]:
+        start = candidate.found.z[: null.found.model.sensor.n_params]
+        state.keep(max(state.null, state.refits.weighed(null.found.model, start[None, :], candidate.law), key=_log_z))
+
+
+def _log_z(candidate: WeighedFit) -> float:
+    return candidate.log_z
 
 
 def _unknown(state: SearchState, prepared: Prepared) -> Unknown:

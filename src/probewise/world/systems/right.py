@@ -11,6 +11,8 @@ from probewise.world.systems.fit import Beside, Model, free_numbers
 
 __all__ = ["right_predictions"]
 
+_MOMENTS = 8  # of a dead time that samples take: the integration stops at each of them in each gap, whatever the sample
+
 
 def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
     """Predict the rows kept back by posterior samples of the right model, (n_samples, n_rows).
@@ -29,6 +31,9 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
     x = fitted.at + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
+    for k, name in enumerate(name for b in beside for name in b.free):
+        if name == "tau_s" and kind.law is not None:
+            x[:, model.n_nominal + k] = _to_quantiles(x[:, model.n_nominal + k])
     later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
     ahead = Model(kind, later, beside)
     n_shared = len(kind.shared)
@@ -48,3 +53,9 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     ]
     with np.errstate(all="ignore"):
         return simulate(kind, later, ahead.parameters(there), effects).readings
+
+
+def _to_quantiles(values: FloatArray) -> FloatArray:
+    """Put each value (n_samples,) at the nearest of a few quantiles."""
+    few = np.quantile(values, (np.arange(_MOMENTS) + 0.5) / _MOMENTS)
+    return np.asarray(few[np.searchsorted(0.5 * (few[1:] + few[:-1]), values)])

@@ -146,6 +146,25 @@ def test_forms_of_a_rate_add_to_the_law():
     assert {"drag:x", "friction:x", "forcing:x", "periodic_forcing:x", "cubic:x:x", "quadratic:x:x"} <= forms.keys()
 
 
+def test_an_input_that_is_held_comes_late_also_where_rows_are_far_apart_and_close():
+    """x' = u - x, u held and late by tau: exactly, in each gap what was held before for tau, then what is held now."""
+    t_s = np.cumsum(np.random.default_rng(3).choice([0.02, 0.14], 40))
+    u, tau = np.random.default_rng(4).normal(size=40), 0.012
+    table = RunTable({"t_s": t_s, "u": u, "y": np.zeros(40)}, time="t_s")
+    law = Law({"x": 0.0}, lambda s, p, c: {"x": p["rate"] * (c["u"] - s["x"])}, max_step_s=0.02)
+    simulator = Simulator("y", "V", {"rate": (0.5, 1.5)}, law=law, time="t_s", noise=Noise(sd=1e-3))
+    system = System.of(simulator, table)
+    about = About(system, table, np.zeros(1), 1e-3)
+    form = forms_of(about)["input_delay:u"]
+    theta = np.concatenate([about.theta[0], [tau]])[None, :]
+    found = system.chain(table, [form]).predict(theta, table)[0]
+    exact, rate = [0.0], about.theta[0, 0]
+    for k, gap in enumerate(np.diff(t_s)):
+        between = u[max(k - 1, 0)] + (exact[-1] - u[max(k - 1, 0)]) * np.exp(-rate * tau)
+        exact.append(u[k] + (between - u[k]) * np.exp(-rate * (gap - tau)))
+    assert np.abs(found - exact).max() < 0.1 * np.abs(found - about.predicted).max()
+
+
 def test_a_switch_is_proposed_for_each_column_that_takes_many_values():
     (switch,) = [form for form in proposals(_about(_simulator())) if form.name.endswith("sign(room_c - at)) / 2")]
     assert switch.expression == "a (1 + sign(room_c - at)) / 2"

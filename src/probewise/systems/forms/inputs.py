@@ -48,7 +48,8 @@ def driving_columns(about: About) -> list[str]:
 
 def forms_on_inputs(about: About) -> Iterator[Form]:
     """List what may be wrong with each column that drives the simulator, and with the clock."""
-    table, time = about.table, about.table.time
+    table, time, law = about.table, about.table.time, about.system.simulator.law
+    holds = law is not None and law.hold == "previous"
     for name in driving_columns(about):
         values = table.covariates[name]
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
@@ -72,7 +73,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
                 about,
                 f"input_delay:{name}",
                 "tau_s",
-                _on(name, late),
+                _on(name, late_where_held if holds else late),
                 about.duration,
                 about.time_unit,
                 says,
@@ -195,6 +196,24 @@ def late(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
         out[:, rows] = earlier(table.time_s[rows], values[:, rows], theta[:, 0])
+    return out
+
+
+def late_where_held(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Give what a column that stays as in the row before makes, come late, of each gap between rows: its mean there.
+
+    Over the gap that follows a row it is, for the dead time, what it was in the row before that.
+    """
+    values = np.atleast_2d(c)
+    out = np.array(np.broadcast_to(values, (max(len(values), len(theta)), values.shape[1])))
+    by = theta[:, 0]
+    for rows in table.rows_by_scan():
+        time, own = table.time_s[rows], values[:, rows]
+        gaps = np.diff(time)
+        there = gaps > 0
+        total = np.concatenate([np.zeros((len(own), 1)), np.cumsum(own[:, :-1] * gaps, axis=1)], axis=1)
+        since = earlier(time, total, by) + own[:, :1] * np.minimum(time - by[:, None] - time[0], 0.0)
+        out[:, rows[:-1][there]] = np.diff(since, axis=1)[:, there] / gaps[there]
     return out
 
 

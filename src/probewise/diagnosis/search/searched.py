@@ -216,6 +216,23 @@ class Searched:
         }
         return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
 
+    def named_beside_unknown(self) -> dict[str, float]:
+        """Give, if something is unknown, the probability that each named effect stands beside it."""
+        scores = {
+            (names, noise): value
+            + self.prior.log_unknown(names)
+            + self.prior.log_noise(tuple(n for n in noise if n not in self.certain))
+            for (order, names, noise), value in self.evidences.unknown.items()
+            if not self.evidences.names_more(order, names, noise)
+        }
+        top = max(scores.values(), default=0.0)
+        weights = {key: math.exp(score - top) for key, score in scores.items()}
+        out: dict[str, float] = {}
+        for (names, _), weight in weights.items():
+            for name in names:
+                out[name] = out.get(name, 0.0) + weight / sum(weights.values())
+        return out
+
     def looks(self, found: Fit) -> list[Bank]:
         """List every template that a test looks at about a fit: of the effects that it lacks, and the unknown."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]

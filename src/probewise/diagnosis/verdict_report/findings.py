@@ -25,6 +25,7 @@ from probewise.recordings.plan import Plan
 __all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
 
 _LEAST_PROBABILITY = 1e-3
+_STANDS_BESIDE = 0.5  # share of what is unknown, from which an effect stands beside it
 _N_DRAWS = 999
 
 
@@ -84,9 +85,13 @@ def effects_found(
     """
     prepared = searched.prepared
     out, plan = [], prepared.recording.plan
+    beside = searched.named_beside_unknown()
+    unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
     unit = plan.instrumentation.unit
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
+        if beside.get(name, 0.0) >= _STANDS_BESIDE:
+            p += unknown * beside[name]
         if p <= _LEAST_PROBABILITY or not in_vocabulary((name,)) or out_of_vocabulary((name,)):
             continue
         holder, noise = (best.fit, best.noise) if name in samples.effects else _holder(searched, name)

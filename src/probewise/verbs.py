@@ -184,6 +184,7 @@ def explore(
     heights_mm: float | Sequence[float] = (),
     repeats: int | Sequence[int] = (1,),
     trust: float | None = None,
+    cards: Sequence[scene.Card] = (),
     max_readings: int = MAX_READINGS,
     journal: str | Path | None = None,
     rng: np.random.Generator,
@@ -234,6 +235,10 @@ def explore(
     trust
         Prior probability that the sensor model is complete; below 1 the run also infers which effect it leaves out.
         By default 0.9; 1 with the naive model, `learn_sensor`, another utility, several shapes, or the method "paper".
+    cards
+        Reference cards of known position and albedo on the field,
+        `probewise.scene.Card(x_mm, y_mm, width_mm, height_mm, albedo)`: they separate a tilt or a scale error from
+        another shape.
     max_readings
         Stop after so many readings at the latest.
     journal
@@ -320,6 +325,7 @@ def explore(
         heights_mm=require_one_or_several("heights_mm", heights_mm),
         repeats=tuple(require_whole("repeats", n) for n in require_one_or_several("repeats", repeats)),
         trust=None if trust is None else require_number("trust", trust, "a number greater than 0, up to 1"),
+        cards=tuple(cards),
     )
     path = None if journal is None else require_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
@@ -328,7 +334,9 @@ def explore(
     if arm is None:
         hidden = posing.Hidden.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
         world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
-        arm = posing.arm_over(world, hidden.surface, field, seed=streams.noise, taken=taken, scale=scale)
+        arm = posing.arm_over(
+            world, posing.with_cards(hidden.surface, asked.cards), field, seed=streams.noise, taken=taken, scale=scale
+        )
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
     instrument = instrument_of(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")

@@ -204,6 +204,36 @@ def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, mo
     assert "; widest sd" in moves[1]
 
 
+def test_a_known_card_lies_on_the_field_of_the_robot_and_of_the_world(explore, tmp_path, capsys):
+    """What it may leave out then holds a tilt; a run goes on only over the same cards."""
+    status, lines = explore("--max-readings", 1, "--reference", "120,100,80,60,1")
+    assert status == 0
+    effects = [h["effects"] for h in json.loads((tmp_path / "found/result.json").read_text())["left_out"]["hypotheses"]]
+    assert ["sensor_tilt"] in effects
+    assert "No reading of the field can show" not in capsys.readouterr().out
+    assert len(lines) == 2
+    status, lines = explore("--max-readings", 2, "--reference", "120,100,80,60,0.5", "--resume")
+    assert status == 2
+    assert len(lines) == 2
+
+
+@pytest.mark.parametrize(
+    "text", ["120,100,80,60", "a,100,80,60,1", "120,100,80,60,1.5", "5,5,80,60,1", "120,100,0,60,1"]
+)
+def test_a_card_that_cannot_lie_there_is_refused(text, sensor_file, tmp_path, capsys):
+    status = main(["explore", "--sensor", str(sensor_file), "--out", str(tmp_path / "o"), "--reference", text])
+    assert status == 2
+    assert "card" in (said := capsys.readouterr().err) or "--reference" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_naive_model_knows_no_card(sensor_file, tmp_path, capsys):
+    options = ["--model", "naive", "--reference", "120,100,80,60,1"]
+    assert main(["explore", "--sensor", str(sensor_file), "--out", str(tmp_path / "o"), *options]) == 2
+    assert "--reference" in capsys.readouterr().err
+
+
 PAPER = ("--method", "paper", "--nested-stop", "remaining")
 
 

@@ -13,7 +13,7 @@ from probewise.errors import ParameterError
 from probewise.experiment.evidence import bridged, redrawn
 from probewise.experiment.judging import information
 from probewise.experiment.kernels import LocalKernels
-from probewise.experiment.particles import Particles, prior_particles, resized, update
+from probewise.experiment.particles import Particles, _Bridge, _move, _parted, prior_particles, resized, update
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 
@@ -230,3 +230,21 @@ def test_kernels_follow_a_bent_shell():
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     away = np.hypot(*LocalKernels.about(points, rng=rng(2)).draw(2000, rng=rng(3)).T) - 100.0
     assert np.quantile(np.abs(away), 0.9) < 0.8
+
+
+def test_samples_that_all_descend_from_one_are_moved_as_one_part():
+    """Copies of one sample are in one part; a part with hardly any would have no kernels."""
+    alike = _parted(np.zeros(40, dtype=np.int64))
+    assert [len(part) for part in alike] == [40]
+    halves = _parted(np.arange(40))
+    assert [len(part) for part in halves] == [20, 20]
+
+
+def test_copies_of_one_sample_are_not_moved(small):
+    """They are left where they are, and the posterior is marked as strained."""
+    problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
+    theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
+    cloud = _Bridge(problem).cloud(theta)
+    moved, moves = _move(cloud, 1.0, _Bridge(problem), np.random.default_rng(1))
+    assert moves.accepted == 0.0
+    np.testing.assert_array_equal(moved.theta, theta)

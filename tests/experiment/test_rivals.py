@@ -12,7 +12,8 @@ from probewise.calibration import FittedSensor, mean_field
 from probewise.errors import ParameterError
 from probewise.experiment import CLEAN, Exploration, begin, left_out_of, repaired, result_json, step
 from probewise.experiment.asking import Field
-from probewise.experiment.rivals import Lost, Tailed, rivals_of
+from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
+from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
@@ -64,10 +65,12 @@ def rivals():
 
 
 def test_the_rivals_share_what_trust_leaves(doubting):
-    prior = {kind.left_out: math.exp(kind.log_prior) for kind in doubting.kinds}
+    prior: dict[str, float] = {}
+    for kind in doubting.kinds:
+        prior[kind.left_out] = prior.get(kind.left_out, 0.0) + math.exp(kind.log_prior)
     assert prior.pop("") == pytest.approx(0.9)
     np.testing.assert_allclose(list(prior.values()), 0.1 / len(prior))
-    assert {"backlash", "saturation", "dropouts", "outliers"} <= set(prior)
+    assert {"backlash", "saturation", "dropouts", "outliers", "flicker", "edge_shadow", "quantisation"} <= set(prior)
 
 
 def test_with_full_trust_there_is_one_kind():
@@ -86,16 +89,27 @@ def test_trust_is_a_probability(trust):
         replace(experiment_of(REFERENCE), trust=trust)
 
 
-@pytest.mark.parametrize("law", [rival.likelihood for rival in rivals() if rival.likelihood is not None])
+def laws(*kinds):
+    return [rival.likelihood for rival in rivals() if isinstance(rival.likelihood, kinds)]
+
+
+@pytest.mark.parametrize("law", laws(Tailed, Correlated, Flickering))
+def test_laws_of_the_residual_alone_are_densities(law):
+    """As the level goes over all levels, so does the residual; its density is one."""
+    level = np.linspace(-600.0, 670.0, 60_001)
+    density = np.exp(law.log_prob(np.array([35.0]), level[:, None]))
+    assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("law", laws(Lost, WithSignal, OnLattice))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
 
     def density(reading):
         return math.exp(law.log_prob(np.array([reading]), np.array([[35.0]]))[0])
 
-    total = quad(
-        density, -200.0, 270.0, points=[4.999, 5.001, 10.0, 15.0, 30.0, 35.0, 40.0, 60.0, 64.999, 65.001], limit=400
-    )[0]
+    breaks = [-0.001, 0.001, 9.99, 10.0, 10.01, 15.0, 30.0, 35.0, 40.0, 60.0, 64.999, 65.001]
+    total = quad(density, -200.0, 270.0, points=breaks, limit=400)[0]
     assert total == pytest.approx(1.0, abs=0.01)
 
 
@@ -181,3 +195,50 @@ def test_rows_of_the_study_are_summed_up():
     assert row["intervals_hold"].startswith("0.50")
     assert row["in_credible_set"].startswith("1.00")
     assert row["size"] == 6.0
+
+
+def test_a_memory_of_the_noise_is_heard():
+    """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
+    law, level = Correlated(1.0, 0.0), np.full((1, 12), 35.0)
+    alike, apart = 35.0 + np.full(12, 1.5), 35.0 + 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3)
+    plain = experiment_of(REFERENCE).likelihood
+    gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
+    assert gained[0] > 3.0
+    assert gained[1] < 0.5
+
+
+def test_readings_on_a_lattice_are_no_chance():
+    law, level = OnLattice(1.0, 0.0), np.full((1, 8), 35.0)
+    level[0, 4:] = 12.0
+    plain = experiment_of(REFERENCE).likelihood
+    coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
+    smooth = level[0] + np.array([0.31, -0.72, 1.13, 0.05, -1.41, 0.93, 0.27, -0.68])
+    assert law.log_prob(coarse, level)[0] > plain.log_prob(coarse, level)[0] + 5.0
+    assert law.log_prob(smooth, level)[0] == pytest.approx(plain.log_prob(smooth, level)[0])
+
+
+def test_noise_that_grows_with_the_light_is_heard():
+    law, level = WithSignal(1.0, 0.0, 10.0, 60.0), np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12)
+    read = level[0] + np.where(level[0] > 50, 4.0, 0.5) * np.tile([1.0, -1.0], 6)
+    plain = experiment_of(REFERENCE).likelihood
+    assert law.log_prob(read, level)[0] > plain.log_prob(read, level)[0] + 5.0
+
+
+def test_a_run_is_the_warier_the_less_it_could_end_wrong(stepped):
+    """To doubt ten times as readily multiplies the odds of every rival by ten and leaves evidences as they are."""
+    kinds = stepped[-1].kinds
+    wary = kinds.doubting(10.0)
+    np.testing.assert_allclose([p.log_z for p in wary.particles], [p.log_z for p in kinds.particles])
+    odds = [found.left_out["backlash"] / found.left_out[""] for found in (wary, kinds)]
+    assert odds[0] == pytest.approx(10.0 * odds[1])
+
+
+def test_readings_lost_to_exactly_black_are_no_chance():
+    """Noise never repeats a value; three readings that are black to the last digit were lost."""
+    law = laws(Lost)[0]
+    level = np.array([[60.0, 10.0, 10.0, 10.0, 60.0]])
+    plain = experiment_of(REFERENCE).likelihood
+    exact, noisy = np.array([60.3, 10.0, 10.0, 10.0, 59.1]), np.array([60.3, 10.4, 9.2, 10.9, 59.1])
+    gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (exact, noisy)]
+    assert gained[0] > 5.0
+    assert gained[1] < 0.5

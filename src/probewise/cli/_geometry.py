@@ -8,9 +8,9 @@ import numpy as np
 
 from probewise.errors import ParameterError
 from probewise.experiment import Hidden
-from probewise.scene import SHAPES, Field
+from probewise.scene import SHAPES, Card, Field
 
-__all__ = ["parse_field", "parse_truth"]
+__all__ = ["parse_cards", "parse_field", "parse_truth"]
 
 
 def parse_field(text: str) -> Field:
@@ -20,6 +20,25 @@ def parse_field(text: str) -> Field:
     except ValueError as error:
         raise ParameterError("--field", text, "WIDTH,HEIGHT in mm, such as 1048,520") from error
     return Field(width, height)
+
+
+def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
+    """Read each "X,Y,WIDTH,HEIGHT,ALBEDO": a card about (X, Y) in mm, which lies on the field."""
+    cards = []
+    for text in texts:
+        try:
+            x_mm, y_mm, width_mm, height_mm, albedo = (float(cell) for cell in text.split(","))
+        except ValueError as error:
+            allowed = "X,Y,WIDTH,HEIGHT,ALBEDO: centre and size in mm, albedo from 0 to 1, such as 100,80,60,40,1"
+            raise ParameterError("--reference", text, allowed) from error
+        card = Card(x_mm, y_mm, width_mm, height_mm, albedo)
+        low, high = card.corners_mm.min(axis=0), card.corners_mm.max(axis=0)
+        if min(low) < 0 or high[0] > field.width_mm or high[1] > field.height_mm:
+            raise ParameterError(
+                "--reference", text, f"a card on the field of {field.width_mm:g} x {field.height_mm:g} mm"
+            )
+        cards.append(card)
+    return tuple(cards)
 
 
 def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> Hidden:

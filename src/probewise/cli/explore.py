@@ -125,6 +125,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="probability that the sensor model leaves nothing out; below 1 the robot weighs what it may leave out "
         "along with the shape (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
     )
+    parser.add_argument(
+        "--reference",
+        action="append",
+        default=[],
+        metavar="X,Y,W,H,ALBEDO",
+        help="a card that lies on the field, its centre and size in mm, its albedo from 0 (as the field) to 1 (as the "
+        "shape); may be given again",
+    )
     parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
     more = parser.add_argument_group("more than a place", "what else the robot may choose, of an arm that can")
     more.add_argument(
@@ -151,7 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import experiment as posing
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
-    from probewise.cli._geometry import parse_truth
+    from probewise.cli._geometry import parse_cards, parse_truth
     from probewise.experiment import Exploration, beside, explore, read_journal
     from probewise.recordings import write_bytes_atomically, write_text_atomically
     from probewise.report import exploration as report
@@ -171,6 +179,10 @@ def run(arguments: argparse.Namespace) -> int:
     streams = posing.Streams.of(np.random.default_rng(arguments.seed))
     shape = posing.shape_named(arguments.shape, field)
     orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
+    cards = parse_cards(arguments.reference, field)
+    if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
+        allowed = "none with --both-models, --model naive or --method paper"
+        raise ParameterError("--reference", arguments.reference[0], allowed)
     levels_read = _levels(arguments, chosen, sensor, rng=streams.levels)
     pose_it = partial(
         posing.pose_experiment,
@@ -182,6 +194,7 @@ def run(arguments: argparse.Namespace) -> int:
         nested_stop=arguments.nested_stop,
         orientations_rad=orientations_rad,
         repeats=repeats,
+        cards=cards,
     )
     experiment = pose_it(
         model=arguments.model,
@@ -211,7 +224,7 @@ def run(arguments: argparse.Namespace) -> int:
             arm = open_nxt(chosen.where, geometry, start_s=start_s)
     else:
         hidden = parse_truth(arguments.truth, arguments.shape, field, rng=streams.truth)
-        world, surface = posing.world_like(sensor), hidden.surface
+        world, surface = posing.world_like(sensor), posing.with_cards(hidden.surface, cards)
         if chosen.is_lego and geometry is not None:
             built = chosen.built_as(arguments.geometry)
             arm, _ = open_emulated(geometry, built, world, surface, seed=streams.noise, start_s=start_s)
@@ -282,7 +295,8 @@ def run(arguments: argparse.Namespace) -> int:
             folder.mkdir(exist_ok=True)
             write_bytes_atomically(folder / f"{step.number:03d}.png", frames[-1])
             if arguments.live:
-                write_text_atomically(out / "live.html", report.live_page(step, frames[-1]))
+                live = report.live_page(step, frames[-1], earlier=steps[:-1], trust=experiment.trust)
+                write_text_atomically(out / "live.html", live)
                 if len(frames) == 1:
                     webbrowser.open((out / "live.html").absolute().as_uri())
     result = Exploration(experiment, tuple(steps))

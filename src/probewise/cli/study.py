@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["VERB"]
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
+_SIZES = ("small", "plain", "gross")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="conceal an effect from the robot in every row, three sizes each, and look for the same circles with and "
         "without doubt about the sensor (writes concealed.csv; no other row)",
+    )
+    parser.add_argument(
+        "--seed", type=int, metavar="S", help="with --concealed: circles, noise and robot of another seed"
+    )
+    parser.add_argument("--size", choices=_SIZES, help="with --concealed: one of the three sizes alone")
+    parser.add_argument(
+        "--clean", type=positive_int, metavar="N", help="with --concealed: circles of the row that conceals nothing"
     )
     parser.add_argument(
         "--beside-paper",
@@ -75,6 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
     out = check_out_directory(arguments.out)
     if arguments.concealed:
         return _run_concealed(arguments, out)
+    for name in ("seed", "size", "clean"):
+        if getattr(arguments, name) is not None:
+            raise ParameterError(f"--{name}", getattr(arguments, name), "with --concealed alone")
     rows = _rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
@@ -113,6 +124,9 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
             arguments.circles,
             path=trials,
             max_readings=arguments.max_readings,
+            sizes=(0, 1, 2) if arguments.size is None else (_SIZES.index(arguments.size),),
+            n_clean=arguments.clean,
+            **({} if arguments.seed is None else {"seed": arguments.seed}),
             executor=executor,
             progress=progress,
         )

@@ -41,6 +41,7 @@ from probewise.experiment.simulation import (
     shape_of,
     surface_of,
     usual_trust,
+    with_cards,
     world_like,
 )
 from probewise.experiment.start import run_from
@@ -106,5 +107,6 @@ __all__ = [
     "surface_of",
     "usual_trust",
     "value_digest",
+    "with_cards",
     "world_like",
 ]

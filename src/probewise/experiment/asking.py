@@ -14,6 +14,7 @@ from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.journal import PATTERN
 from probewise.experiment.setting import Experiment
 from probewise.inquiry import Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
+from probewise.inquiry.forecast import thinned
 from probewise.nested.importance import Weighted
 
 __all__ = ["Field", "inquire", "next_poses"]
@@ -71,11 +72,15 @@ def inquire(
     )
     drawn = drawn.copy()
     drawn.flags.writeable = False
+    theta, weight = posterior.theta, posterior.weight
+    if experiment.trust < 1:  # the samples of many kinds: no more than of one are asked
+        some, share = thinned(weight, experiment.n_particles)
+        theta, weight = theta[some], share / share.sum()
     prospect = Prospect(
         experiment.forecast,
         experiment.readout,
-        posterior.theta,
-        posterior.weight,
+        theta,
+        weight,
         drawn,
         designs,
         plan,

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 
 from probewise._arrays import FloatArray
 
-__all__ = ["LocalKernels"]
+__all__ = ["MOST_KERNELS", "LocalKernels"]
 
-_MOST_KERNELS = 250
+MOST_KERNELS = 250
 _NEIGHBOURS = 10  # for each parameter, so that their covariance is known
 _RIDGE = 1e-6  # of the overall covariance, so that none is singular
 _BLOCK = 256  # points at a time: their densities stay in the cache
@@ -38,13 +38,15 @@ class LocalKernels:
     form: FloatArray
 
     @classmethod
-    def about(cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0) -> Self:
-        """Fit to equally weighted samples, (n_samples, n_params); `widened` times as wide as the samples around."""
+    def about(
+        cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0, most: int = MOST_KERNELS
+    ) -> Self:
+        """Fit at most so many to equally weighted samples, (n_samples, n_params), `widened` times as wide as those."""
         n_samples, n_params = points.shape
         origin = points.mean(axis=0)
         away = points - origin
         scale = np.maximum(points.std(axis=0), 1e-300)
-        rows = rng.permutation(n_samples)[: min(_MOST_KERNELS, (n_samples + 1) // 2)]
+        rows = rng.permutation(n_samples)[: min(most, (n_samples + 1) // 2)]
         n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
         near = cKDTree(away / scale).query(away[rows] / scale, k=n_near)[1].reshape(len(rows), n_near)
         centre = away[rows]

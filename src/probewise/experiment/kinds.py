@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +13,10 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
+from probewise.experiment.pace import Paced
 from probewise.experiment.rivals import Rival
 from probewise.inference.problem import Likelihood, SensorProblem
+from probewise.inquiry import TabledChain
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene.albedo import Shape
@@ -55,7 +58,7 @@ class Kind:
     likelihood: Likelihood
     placed: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
-    effect: NamedEffect[Any] | None = None
+    effect: NamedEffect[Any] | Paced | None = None
 
     def problem(self, recording: Recording) -> SensorProblem:
         """Set up the inference of this kind from a recording."""
@@ -87,16 +90,17 @@ def kinds_of(
     trust
         Probability that the sensor model leaves nothing out; the rivals share the rest evenly.
     rivals
-        What it may leave out, beside each shape.
+        What it may leave out, beside each shape; those of one name share what one has.
     """
     quick, chain = models
+    ways = Counter(rival.name for rival in rivals)
     kinds = []
     for part in _parts(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
         kinds.append(Kind(part.label, "", plain, own, part.model(quick), likelihood, part.placed, prior.names))
         for rival in rivals:
-            log_p = log_prior + math.log((1.0 - trust) / len(rivals))
+            log_p = log_prior + math.log((1.0 - trust) / (len(ways) * ways[rival.name]))
             if rival.effect is None:
                 model, law = part.model(quick), rival.likelihood or likelihood
                 kinds.append(Kind(part.label, rival.name, log_p, own, model, law, part.placed, prior.names))
@@ -104,7 +108,8 @@ def kinds_of(
             if not isinstance(chain, Chain):
                 raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
             both = Joint((own, _Called(rival.name, rival.effect.prior)))
-            model = part.model(chain.with_effects(rival.effect))
+            acting = chain.with_effects(rival.effect)
+            model = part.model(TabledChain.of(acting, quick) or acting)
             kinds.append(
                 Kind(part.label, rival.name, log_p, both, model, likelihood, part.placed, prior.names, rival.effect)
             )

@@ -10,6 +10,8 @@ import numpy as np
 
 from probewise.calibration import FittedSensor
 from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
+from probewise.experiment.pace import clocked
+from probewise.experiment.rivals import WITH_CARDS
 from probewise.experiment.values import Step
 
 __all__ = ["CLEAN", "LeftOut", "left_out_of", "repaired"]
@@ -64,16 +66,18 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
         return LeftOut(probability, "The sensor model was taken for complete, as it was told to be.")
     name, p = next(iter(probability.items()))
     others = [spoken_name(n) for n in LeftOut(probability, "").credible_set[1:] if n != CLEAN]
+    aliases = _ALIASES if WITH_CARDS.keys().isdisjoint(last.left_out) else ""
     beside = f" Not excluded: {', '.join(others)}." if others else ""
     if name == CLEAN:
         return LeftOut(
-            probability, f"The sensor model leaves nothing out that shows (probability {p:.3g}).{beside} {_ALIASES}"
+            probability,
+            f"The sensor model leaves nothing out that shows (probability {p:.3g}).{beside} {aliases}".strip(),
         )
     if p < _NAMED:
         said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
     else:
         said = f"The sensor model leaves something out: {_said(last, name)} (probability {p:.3g})."
-    return LeftOut(probability, f"{said}{beside} {_ALIASES}")
+    return LeftOut(probability, f"{said}{beside} {aliases}".strip())
 
 
 def _said(last: Step, name: str) -> str:
@@ -86,7 +90,8 @@ def _said(last: Step, name: str) -> str:
         return spoken_name(name)
     own = slice(-len(kind.effect.prior.names), None)
     posterior = last.kinds.particles[best].weighted
-    return kind.effect.sentence(posterior.mean()[own], posterior.sd()[own])
+    mean, sd = (clocked(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd()))
+    return kind.effect.sentence(mean, sd)
 
 
 def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
@@ -104,7 +109,7 @@ def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> F
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     n_own, n = len(effect.prior.names), len(sensor.samples)
-    own = last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:]
+    own = clocked(effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace)
     return replace(
         sensor,
         names=(*sensor.names, *(f"{name}.{parameter}" for parameter in effect.prior.names)),

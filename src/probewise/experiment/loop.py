@@ -29,13 +29,18 @@ from probewise.experiment.journal import (
     require_same_settings,
 )
 from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, information, learnt, moments, stop_reason
-from probewise.experiment.posterior import prior_posterior
+from probewise.experiment.pace import Pace
+from probewise.experiment.posterior import Posterior, prior_posterior
 from probewise.experiment.setting import Experiment
 from probewise.experiment.settling import settling
 from probewise.experiment.values import Exploration, State, Step
 from probewise.inquiry import bits_gained, prior_entropy
+from probewise.nested.importance import Weighted
 
 __all__ = ["begin", "explore", "run", "step"]
+
+WARY = 12.0
+"""Times as readily as it is believed that something is left out, by which a run chooses its readings and its end."""
 
 
 def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> State:
@@ -115,6 +120,7 @@ def step(
         carried = experiment.learning.updated(state.posterior, problem.recording, rng=rng)
     posterior = carried.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
+    wary, believed = (carried, posterior) if experiment.trust == 1 else _wary(carried, rng)
     off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
     leader = carried.kinds[carried.leader]
     p_value, worst = fit(experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording))
@@ -124,10 +130,10 @@ def step(
     if p_value < experiment.doubt_p:
         notes = (*notes, doubt(p_value, worst, readings))
     drawn = experiment.learning.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
-    prospect, outlook = inquire(experiment, posterior, drawn, field, at=reading)
+    prospect, outlook = inquire(experiment, believed, drawn, field, at=reading)
     if experiment.trust < 1:
-        outlook = settling(experiment, carried, prospect, outlook, readings, rng=rng)
-    known = experiment.is_known(sd, shapes, off)
+        outlook = settling(experiment, wary, prospect, outlook, readings, rng=rng)
+    known = experiment.is_known(sd, shapes, off) and (believed is posterior or _is_known(experiment, believed))
     reason = stop_reason(experiment, sd, known, p_value, outlook, len(readings), max_readings)
     pose, *planned = state.planned or next_poses(experiment, prospect, outlook, rng=rng)
     info = Step(
@@ -149,8 +155,21 @@ def step(
         chance_off=off,
         stop_reason=reason,
         notes=notes,
+        pace=Pace.of(readings),
     )
     return State(readings, carried, pose, tuple(planned)), info
+
+
+def _wary(carried: Posterior, rng: np.random.Generator) -> tuple[Posterior, Weighted]:
+    """Doubt the sensor more than it is believed that it deserves: what the next reading and the end are decided by."""
+    wary = carried.doubting(WARY)
+    return wary, wary.joined(rng=rng)
+
+
+def _is_known(experiment: Experiment, posterior: Weighted) -> bool:
+    """Tell whether a posterior meets the stopping rule."""
+    _, sd, shapes = moments(experiment, posterior)
+    return experiment.is_known(sd, shapes, chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm))
 
 
 def explore(

@@ -21,20 +21,33 @@ from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
-from probewise.experiment.kernels import LocalKernels
+from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
 from probewise.inference.problem import SensorProblem, scores
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Prior
 
-__all__ = ["Particles", "prior_particles", "resized", "sampled", "update"]
+__all__ = ["BRIEF", "THOROUGH", "Effort", "Particles", "prior_particles", "resized", "sampled", "update"]
 
 KEEP = 0.5  # share of the samples that must count for them to be kept
 SURPRISED = 12.5  # nats by which every sample misses the last reading, five sds of Gaussian noise: none expected it
 STIFF = 0.5  # accepted steps a sample, below which the moves cannot be trusted
-ENOUGH = 1.5  # accepted steps a sample that will do
 MOST_ROUNDS = 6
+MANY_DEGREES = 4
+_LEAST_PART = 0.05  # of the samples: of fewer no kernels can be fitted
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Accepted steps a sample that will do, and kernels to propose from."""
+
+    enough: float
+    n_kernels: int
+
+
+THOROUGH = Effort(1.5, MOST_KERNELS)
+BRIEF = Effort(1.0, 75)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +67,9 @@ class Particles:
     strained
         Whether, since then, no sample expected a reading, or the samples could not be moved: their evidence may
         be wrong by more than the genealogy tells.
+    hurried
+        Whether, since then, a reading was taken in by many degrees: few samples stood where it led, and the product of
+        mean weights is then nearly always too small.
     """
 
     weighted: Weighted
@@ -61,6 +77,7 @@ class Particles:
     start_variance: float = 0.0
     n_resampled: int = 0
     strained: bool = False
+    hurried: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -104,6 +121,7 @@ def update(
     *,
     rng: np.random.Generator,
     fall_back: Callable[[], NestedResult] | None = None,
+    effort: Effort | None = None,
 ) -> Particles:
     """Take in the last reading of a problem.
 
@@ -118,6 +136,8 @@ def update(
     fall_back
         Runs the whole problem from scratch: where no sample expected the reading, or they cannot be moved. Without,
         the samples go on as best they can, and are marked as strained.
+    effort
+        How much to spend where samples are moved; by default all that the evidence of what counts deserves.
 
     Returns
     -------
@@ -154,7 +174,7 @@ def update(
         if share == 1.0 and n_eff >= KEEP * n:
             break
         rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
-        now, moves = _move(now.take(rows), share, bridge, rng, _parted(rows) if fall_back is None else None)
+        now, moves = _move(now.take(rows), share, bridge, rng, _parted(rows) if fall_back is None else None, effort)
         n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
         if moves.accepted < STIFF:
             if fall_back is not None:
@@ -175,7 +195,8 @@ def update(
         before.n_calls + n_calls,
         tail,
     )
-    return Particles(found, ancestor, previous.start_variance, n_resampled, strained)
+    hurried = previous.hurried or n_resampled - previous.n_resampled >= MANY_DEGREES
+    return Particles(found, ancestor, previous.start_variance, n_resampled, strained, hurried)
 
 
 def resized(particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
@@ -288,6 +309,7 @@ def _move(
     bridge: _Bridge,
     rng: np.random.Generator,
     parts: Sequence[IntArray] | None = None,
+    effort: Effort | None = None,
 ) -> tuple[_Cloud, _Moves]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density as it is.
 
@@ -298,9 +320,12 @@ def _move(
     Kernels about the very samples that are moved find them denser than they are, and the samples drift
     apart: of `parts`, rows of the samples, each is moved by kernels fitted to the part before it.
     """
-    n = len(start.theta)
+    n, n_params = start.theta.shape
+    if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # copies of so few say nothing of where the others are
+        return start, _Moves(0.0, 0)
     parts = [np.arange(n)] if parts is None else parts
-    kernels = [LocalKernels.about(start.theta[rows], rng=rng) for rows in parts]
+    effort = THOROUGH if effort is None else effort
+    kernels = [LocalKernels.about(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
     for _ in range(MOST_ROUNDS):
         for propose in (_from_kernels, _along_differences):
@@ -313,7 +338,7 @@ def _move(
             now = now.put(taken, proposed)
             n_calls += n
             accepted += float(taken.mean())
-        if accepted >= ENOUGH:
+        if accepted >= effort.enough:
             break
     return now, _Moves(accepted, n_calls)
 
@@ -335,8 +360,9 @@ def _along_differences(
 
 
 def _parted(rows: IntArray) -> list[IntArray]:
-    """Part samples drawn anew from `rows`, so that copies of one are together."""
-    return [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
+    """Part samples drawn anew from `rows`, copies of one together; where a part would have hardly any, all are one."""
+    parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
+    return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
 def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:

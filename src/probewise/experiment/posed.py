@@ -12,7 +12,7 @@ from probewise.experiment.simulation import Model, experiment_for, usual_trust
 from probewise.inference import Naive
 from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
 from probewise.nested import NestedStop
-from probewise.scene import Field, Shape
+from probewise.scene import Card, Field, Shape
 
 __all__ = ["MethodName", "pose_experiment"]
 
@@ -35,6 +35,7 @@ def pose_experiment(
     orientations_rad: tuple[float, ...] = (0.0,),
     repeats: tuple[int, ...] = (1,),
     heights_mm: tuple[float, ...] = (),
+    cards: tuple[Card, ...] = (),
 ) -> Experiment:
     """Pose an experiment; what is None is as usual with the method.
 
@@ -47,7 +48,7 @@ def pose_experiment(
         What a reading is worth: a name (see `inquiry.utility_named`) or a utility.
     nested_stop, naive
         For the method "paper" alone; see `paper_experiment`.
-    sensor, shape, field, model, learn_sensor, batch, trust, orientations_rad, repeats, heights_mm
+    sensor, shape, field, model, learn_sensor, batch, trust, orientations_rad, repeats, heights_mm, cards
         See `experiment_for`.
 
     Raises
@@ -61,6 +62,7 @@ def pose_experiment(
             ("utility", utility, worth is None or isinstance(worth, ReadingEntropy), "entropy, which is the paper's,"),
             ("learn_sensor", learn_sensor, not learn_sensor, "False, since the sensor is known,"),
             ("batch", batch, batch == 1, "1, since each reading is chosen by all before it,"),
+            ("cards", cards, not cards, "none, since its scene is the shape alone,"),
             ("trust", trust, trust in (None, 1), "1, since the sensor model is taken for complete,"),
         )
         for name, value, fits, allowed in refused:
@@ -96,4 +98,5 @@ def pose_experiment(
         orientations_rad=orientations_rad,
         repeats=repeats,
         heights_mm=heights_mm,
+        cards=cards,
     )

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import Bridged, bridged, redrawn
 from probewise.experiment.kinds import Kind
-from probewise.experiment.particles import Particles, prior_particles, resized, sampled, update
+from probewise.experiment.particles import BRIEF, THOROUGH, Particles, prior_particles, resized, sampled, update
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
@@ -32,11 +32,13 @@ FromScratch = Callable[[SensorProblem], NestedResult]
 
 _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times
-_SUSPECTED = ((0.2, 1), (0.02, 2), (0.0, 5))  # probability from which on a rival has which fraction of the samples
+_SUSPECTED = ((0.2, 1), (0.02, 2), (0.0, 6))  # probability from which on a rival has which fraction of the samples
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
 _TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
+_HOPELESS = 60.0  # nats behind the best kind, from which on no evidence is taken anew
+_DRAWS = 1000
 _LOST = 0.01  # probability of a kind that must not be overlooked
 
 
@@ -74,6 +76,12 @@ class Posterior:
     def leader(self) -> int:
         """Number of the most probable kind."""
         return int(self.log_odds.argmax())
+
+    def doubting(self, times: float) -> Posterior:
+        """Believe that something is left out `times` as readily as it was believed."""
+        more = math.log(times)
+        kinds = tuple(replace(k, log_prior=k.log_prior + more) if k.left_out else k for k in self.kinds)
+        return replace(self, kinds=kinds)
 
     def joined(self, *, rng: np.random.Generator) -> Weighted:
         """Write the samples of all kinds as those of one posterior; of one kind they are that."""
@@ -142,8 +150,21 @@ def updated(
         (only,), (problem,) = previous.particles, problems
         found = update(only, problem, rng=rng, fall_back=lambda: from_scratch(problem))
         return replace(previous, particles=(found,))
-    particles = [update(p, problem, rng=rng) for p, problem in zip(previous.particles, problems, strict=True)]
+    few = [
+        bool(kind.left_out) and p < _SUSPECTED[1][0]
+        for kind, p in zip(previous.kinds, previous.probability, strict=True)
+    ]
+    particles = [
+        update(p, problem, rng=rng, effort=BRIEF if improbable else THOROUGH)
+        for p, problem, improbable in zip(previous.particles, problems, few, strict=True)
+    ]
     now = replace(previous, particles=tuple(particles))
+    if any(kind.left_out for kind in now.kinds):
+        particles = [
+            _weighed_again(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
+            for p, problem, odds in zip(particles, problems, now.log_odds, strict=True)
+        ]
+        now = replace(previous, particles=tuple(particles))
     settled: set[int] = set()
     while (k := _most_doubtful(now, settled)) is not None:
         settled.add(k)
@@ -213,6 +234,14 @@ def _renewed(
     fresh = sampled(replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng)
     fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=n))
     return replace(fresh, weighted=replace(fresh.weighted, run=run))
+
+
+def _weighed_again(particles: Particles, problem: SensorProblem, rng: np.random.Generator) -> Particles:
+    """Take the evidence of samples that had to hurry anew, by the bridge; the samples are good once they have moved."""
+    found = bridged(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
+    return (
+        replace(_from_here(particles, found), strained=particles.strained) if math.isfinite(found.log_z) else particles
+    )
 
 
 def _from_here(particles: Particles, found: Bridged) -> Particles:

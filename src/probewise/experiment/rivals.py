@@ -9,27 +9,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.effects import VOCABULARY, Extent, NamedEffect, Outliers, log_density
+from probewise.effects import (
+    VOCABULARY,
+    AmbientStep,
+    Extent,
+    GainDrift,
+    Lag,
+    NamedEffect,
+    OffsetDrift,
+)
 from probewise.errors import ParameterError
+from probewise.experiment.noise_rivals import noise_laws
+from probewise.experiment.pace import EACH_S, Paced
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
-from probewise.priors import LogUniform
+from probewise.inquiry import cards_of
 from probewise.recordings.plan import Instrumentation, Plan
-from probewise.sensor import Chain, FixedLevels, NoiseLevel
+from probewise.sensor import Chain, FixedLevels
 from probewise.sensor.stages import SensorModel
 
 __all__ = ["ON_FIELD", "Rival", "rivals_of"]
 
 _DURATION_S = 300.0
-_READING_S = 8.0
 _SCAN_MM = 100.0
-_REACH = 5.0  # sds beyond its range that a sensor may read
-_SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
 
 ON_FIELD = {
     "ambient_gradient": True,
@@ -43,9 +50,15 @@ ON_FIELD = {
     "lag": False,
     "backlash": False,
     "edge_blur": False,
+    "edge_shadow": False,
     "halo": False,
 }
 """Effects on the mean of the readings that one shape on a field can show, and whether their scale is the field's."""
+
+WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
+"""Those that amount to another shape, unless a card lies there whose place is known."""
+
+_IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +66,7 @@ class Rival:
     """One thing that the sensor model may leave out: an effect on the mean, or another law of the noise."""
 
     name: str
-    effect: NamedEffect[FloatArray] | None = None
+    effect: NamedEffect[FloatArray] | Paced | None = None
     likelihood: Likelihood | None = None
 
 
@@ -83,71 +96,48 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     ends = sorted((model.levels.i_min, model.levels.i_max))
     carried = {effect.name for effect in model.effects}
     found = []
-    for name, wide in ON_FIELD.items():
+    shown = {**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD
+    for name, wide in shown.items():
         reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
         effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _scan(reach_mm)))
         if effect is not None and name not in carried:
-            found.append(Rival(name, effect=effect))
+            found += [Rival(name, effect=way) for way in _ways(effect)]
     noise = _noise_of(likelihood)
     if noise is not None:
-        sd, step = noise
-        shares, sizes = Outliers().bank()[:, 0].T
-        found.append(Rival("outliers", likelihood=Tailed(sd, step, shares, sizes)))
-        found.append(Rival("dropouts", likelihood=Lost(sd, step, model.levels.i_min, ends[0], ends[1])))
+        laws = noise_laws(*noise, (model.levels.i_min, model.levels.i_max))
+        found += [Rival(name, likelihood=law) for name, law in laws.items()]
     return tuple(found)
 
 
-@dataclass(frozen=True, eq=False)
-class Tailed:
-    """Score readings of which some scatter more widely, over the prior of how many and how widely.
-
-    `sd` and `step` are those of the plain noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
-    weighted nodes.
-    """
-
-    sd: float
-    step: float
-    shares: FloatArray
-    sizes: FloatArray
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
-        narrow = _each(readings, predicted, self.sd, self.step)
-        nodes = []
-        for share, size in zip(self.shares, self.sizes, strict=True):
-            wide = _each(readings, predicted, self.sd * size, self.step)
-            nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
-        return np.asarray(logsumexp(nodes, axis=0) - math.log(len(nodes)))
+def _ways(effect: NamedEffect[FloatArray]) -> list[NamedEffect[FloatArray] | Paced]:
+    """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
+    if effect.name not in _IN_TIME:
+        return [effect]
+    ways = [effect, GainLoss.like(effect)] if isinstance(effect, GainDrift) else [effect]
+    return [Paced(way) for way in ways]
 
 
-@dataclass(frozen=True, eq=False)
-class Lost:
-    """Score readings of which some are lost, whatever lies under the sensor: to black, or to anything in its range."""
+@dataclass(frozen=True)
+class GainLoss(GainDrift):
+    """A lamp that begins as calibrated and changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
-    sd: float
-    step: float
-    black: float
-    low: float
-    high: float
+    @classmethod
+    def like(cls, drift: GainDrift) -> Self:
+        """Take over the scales of a drift that ends as calibrated."""
+        return cls(drift.typical, drift.shortest_s, drift.longest_s)
 
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
-        kept = _each(readings, predicted, self.sd, self.step)
-        to_black = _each(readings, np.array([[self.black]]), self.sd, self.step)
-        low, high = self.low - _REACH * self.sd, self.high + _REACH * self.sd
-        within = (readings >= low) & (readings <= high)
-        anywhere = np.where(within, math.log((self.step or 1.0) / (high - low)), -np.inf)
-        lost = np.logaddexp(to_black, anywhere) - math.log(2.0)
-        nodes = [
-            np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()
-        ]
-        return np.asarray(logsumexp(nodes, axis=0) - math.log(len(nodes)))
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Scale the signal, (n_samples, n_points), never the dark level."""
+        gone = -np.expm1(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
+        return np.asarray(value * np.maximum(1 + theta[:, :1] * gone, 0.0))
 
-
-def _each(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
-    """Log density of each reading, or log probability of its cell, (n_samples, n_points)."""
-    level = NoiseLevel(np.array([[sd]]), np.zeros((1, 1)), step=np.array([[step]]))
-    return np.asarray(log_density(level, readings, predicted) + (math.log(step) if step else 0.0))
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say by how many percent the signal changes, and how fast."""
+        way = "rises" if mean[0] > 0 else "falls"
+        return (
+            f"the signal {way} by {100 * abs(mean[0]):.2g} % in the end, {100 * abs(mean[0]) / mean[1] * 60:.2g} % in "
+            "the first minute of this: the lamp or its battery changes"
+        )
 
 
 def _noise_of(likelihood: Likelihood) -> tuple[float, float] | None:
@@ -160,7 +150,7 @@ def _noise_of(likelihood: Likelihood) -> tuple[float, float] | None:
 
 def _scan(length_mm: float) -> Plan:
     """Lay out one scan of some length over the time that a run may take: what scales are taken from."""
-    n = int(_DURATION_S / _READING_S) + 1
+    n = int(_DURATION_S / EACH_S) + 1
     zeros = np.zeros(n, dtype=np.int64)
     return Plan(
         x_mm=np.linspace(0.0, length_mm, n),

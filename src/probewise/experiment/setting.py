@@ -19,6 +19,7 @@ from probewise.experiment.digest import value_digest
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import Kind, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
+from probewise.experiment.pace import Pace
 from probewise.experiment.rivals import Rival, rivals_of
 from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
 from probewise.inference.student_t import StudentT
@@ -31,10 +32,12 @@ from probewise.inquiry import (
     InformationGain,
     Readout,
     Utility,
+    cards_of,
     forecast_of,
 )
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
+from probewise.scene import Card
 from probewise.scene.albedo import Shape, require_shape
 from probewise.scene.shapes import AnyOf
 from probewise.sensor.stages import SensorModel
@@ -206,6 +209,11 @@ class Experiment:
         """Parameter names, one a column of theta: the sensor's that are not known, then the shape's."""
         return self.prior.names
 
+    @property
+    def cards(self) -> tuple[Card, ...]:
+        """Cards of known place and albedo that lie on the field."""
+        return cards_of(self.model)
+
     @cached_property
     def shape_columns(self) -> IntArray:
         """Columns of theta that hold the shape's parameters."""
@@ -246,6 +254,8 @@ class Experiment:
     def problem(self, readings: Sequence[Reading]) -> SensorProblem:
         """Set up the inference from these readings."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
+        if self.trust < 1:
+            recording = Pace.of(readings).on_recording(recording)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     @cached_property

@@ -1,9 +1,9 @@
-"""Value a reading by how much narrower it leaves the shape, whatever the sensor leaves out.
+"""Value a reading by what it tells of the shape and of what the sensor leaves out, and by whether it ends the run.
 
-Several kinds of hypotheses may agree on every reading so far and differ in the shape. What tells
-them apart is worth a reading as far as it narrows the lengths under all of them together; what tells only which
-of them is true, where they agree on the shape, is worth nothing. So the value is the expected fall of the
-lengths' variance under the mixture, in bits of a Gaussian: half the log of the ratio, summed over lengths.
+Several kinds of hypotheses may agree on every reading so far and differ in the shape. A reading is worth the bits
+that it is expected to tell about all of them together. Where some reading may well be the last one, what
+counts is how probable that is: every length known under the mixture, and hardly any chance that one is far off. What
+cannot be told apart and does not matter for the shape then need not be told apart.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
+from probewise.experiment.judging import OFF_SDS
+from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.setting import Experiment
-from probewise.inquiry import Prospect, UtilityMap
+from probewise.experiment.setting import MOST_OFF, Experiment
+from probewise.inquiry import Prospect, UtilityMap, entropy_bits
+from probewise.inquiry.forecast import spread_levels
 from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
@@ -25,13 +28,19 @@ from probewise.scene.regions import EllipseRegion, PolygonRegion
 __all__ = ["settling"]
 
 _NEAR = 15.0  # times the sd that is asked for: farther off than that, bits about everything serve as well
-_HYPOTHESES = 400
+_HYPOTHESES = 800
+_FAIRNESS = 0.75  # power of its probability by which a kind is asked
 _LEAST_EACH = 6
 _COUNTS = 1e-5  # probability of a kind that is asked
 _BEST = 60  # places, by the information about everything
 _AT_EDGES = 40
 _ANYWHERE = 20
-_LABEL = "expected bits about the shape, whatever the sensor leaves out"
+_PER_SD = 2.0  # levels of the predicted reading
+_LEAST = 1e-12
+_LEAST_CHANCE = 0.25  # of ending the run, from which on that is all that counts
+_ENDING = 60  # places, by the bits, that may end it
+_LABEL = "expected information about the shape and what the sensor leaves out (bits)"
+_ENDS = "probability that a reading there ends the run, whatever the sensor leaves out"
 
 
 def settling(
@@ -43,7 +52,7 @@ def settling(
     *,
     rng: np.random.Generator,
 ) -> UtilityMap:
-    """Value designs by what they tell about the lengths under all kinds; before the shape is met, the map as it is.
+    """Value designs by what they tell about all kinds, or by whether they end the run; at first, the map as it is.
 
     Asked are the designs that are best by the information about everything, those at edges and in the middle of
     shapes that are believed, places that were read before, and some anywhere.
@@ -55,15 +64,20 @@ def settling(
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return outlook
     rows = _candidates(experiment, prospect, outlook, theta, readings, rng)
-    plan = _plan(prospect, rows, readings[-1])
+    plan = Pace.of(readings).on(_plan(prospect, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
-    bits = _bits(lengths, weight, spread, answers, prospect)
+    worth, label = _bits(weight, answers, prospect), _LABEL
+    best = np.argsort(-worth, kind="stable")[:_ENDING]
+    chance = _ends(lengths, weight, answers[:, best], prospect, experiment.stop_sd_mm)
+    if chance.max() >= _LEAST_CHANCE:
+        worth, label = np.zeros(len(worth)), _ENDS
+        worth[best] = chance
     values = np.zeros(len(prospect.designs))
-    values[prospect.rows[rows]] = bits
+    values[prospect.rows[rows]] = worth
     values.flags.writeable = False
-    return UtilityMap(prospect.designs, values, outlook.reachable, _LABEL)
+    return UtilityMap(prospect.designs, values, outlook.reachable, label)
 
 
 def _drawn(
@@ -74,7 +88,7 @@ def _drawn(
     Improbable kinds are asked more often than they are probable: they may be those that differ in the shape.
     """
     probability = posterior.probability
-    asked = np.where(probability > _COUNTS, np.sqrt(probability), 0.0)
+    asked = np.where(probability > _COUNTS, probability**_FAIRNESS, 0.0)
     counts = np.where(asked > 0, np.maximum(_HYPOTHESES * asked / asked.sum(), _LEAST_EACH), 0).astype(int)
     columns = np.array(experiment.goal.columns) if experiment.goal is not None else np.empty(0, dtype=int)
     theta, lengths, weight = [], [], []
@@ -103,6 +117,7 @@ def _candidates(
     shapes = np.concatenate([own[:, start : start + n_shape] for own in theta if len(own)])
     some = shapes[rng.choice(len(shapes), _AT_EDGES)]  # each as often, however probable
     places = [np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings])]
+    places += [card.telling_mm for card in experiment.cards]
     region = experiment.shape.region(some)
     if isinstance(region, EllipseRegion | PolygonRegion):
         edges = outlines(region)
@@ -127,13 +142,31 @@ def _plan(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
     return replace(taken, x_mm=x_mm, y_mm=y_mm, time_s=time_s, scan=scan, scan_names=tuple(str(k) for k in range(n)))
 
 
-def _bits(
-    lengths: FloatArray, weight: FloatArray, spread: FloatArray, answers: FloatArray, prospect: Prospect
-) -> FloatArray:
-    """Half the log2 ratio of each length's variance before and, on average, after a reading, summed, (n_designs,)."""
+def _bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatArray:
+    """Bits expected about all hypotheses, (n,), of their predictions, (n, n_designs): (n_designs,)."""
     given = GivenReading(answers, weight, prospect.readout)
-    bits = np.zeros(answers.shape[1])
-    for length, now in zip((lengths - weight @ lengths).T, spread, strict=True):
-        after = now - (given.sum(length) ** 2 / given.mass).sum(axis=1)
-        bits += 0.5 * np.log2(now / np.maximum(after, 1e-3 * now))
-    return np.maximum(bits, 0.0)
+    middle = np.array([0.5 * float(answers.min() + answers.max())])
+    of_noise = float(entropy_bits(prospect.readout.probability(middle, fine=1.0))[0])
+    return np.maximum(entropy_bits(given.mass) - of_noise, 0.0)
+
+
+def _ends(
+    lengths: FloatArray, weight: FloatArray, answers: FloatArray, prospect: Prospect, stop_sd_mm: float
+) -> FloatArray:
+    """Probability of a reading after which every length is known and hardly any far off, (n_designs,)."""
+    away = lengths - weight @ lengths
+    levels = spread_levels(float(answers.min()), float(answers.max()), prospect.readout.noise_sd / _PER_SD)
+    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+    chance = prospect.readout.probability(levels, fine=1.0)
+    out = np.empty(answers.shape[1])
+    for design, own in enumerate(index.T):
+        joint = weight[:, None] * chance[own]  # (n, n_cells)
+        mass = np.maximum(joint.sum(axis=0), _LEAST)
+        ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
+        for length in away.T:
+            mean = length @ joint / mass
+            ends &= length**2 @ joint / mass - mean**2 < stop_sd_mm**2
+            off |= np.abs(length[:, None] - mean) > OFF_SDS * stop_sd_mm
+        ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
+        out[design] = mass[ends].sum() / mass.sum()
+    return out

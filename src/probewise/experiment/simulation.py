@@ -27,6 +27,8 @@ from probewise.recordings import Disc, Instrumentation, Polygon
 from probewise.scene import (
     SHAPES,
     AnyOf,
+    Card,
+    CardedScene,
     EllipseRegion,
     Field,
     HypothesisScene,
@@ -36,7 +38,7 @@ from probewise.scene import (
 )
 from probewise.scene.albedo import require_shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage
-from probewise.world import Oval, Spot, Surface, World
+from probewise.world import Covered, Oval, Spot, Surface, World
 
 __all__ = [
     "TRUST",
@@ -138,6 +140,7 @@ def experiment_for(
     repeats: tuple[int, ...] = (1,),
     heights_mm: tuple[float, ...] = (),
     trust: float = 1.0,
+    cards: tuple[Card, ...] = (),
 ) -> Experiment:
     """Pose the experiment: a fitted sensor over a shape that is not known, read on the sensor's own scale.
 
@@ -168,13 +171,15 @@ def experiment_for(
     trust
         Probability that the sensor model leaves nothing out, before the first reading; below 1 for the SSF model of
         a sensor that is known.
+    cards
+        Cards of known place and albedo that lie on the field; for the SSF model.
     """
     require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
     sensor = sensor.leading()  # a mean over rivals is true of none of them
     levels = levels_of(sensor)
-    scene = HypothesisScene(shape)
+    scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     noise_sd = float(sensor.noise_sd.mean())
     scale = scale_of(sensor.instrumentation)
     pose = partial(
@@ -194,6 +199,8 @@ def experiment_for(
         trust=trust,
     )
     if model == "naive":
+        if cards:
+            raise ParameterError("cards", cards, 'none with the model "naive", which knows two levels alone')
         if learn_sensor:
             raise ParameterError("learn_sensor", learn_sensor, 'False with the model "naive", which has no SSF')
         sd = math.hypot(noise_sd, (scale.step or 0.0) / math.sqrt(12))
@@ -291,6 +298,14 @@ def surface_under(region: Region, name: str) -> Surface:
     if np.isnan(outline).any():
         raise ParameterError("shape", name, "one whose outline is one closed line")
     return Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
+
+
+def with_cards(surface: Surface, cards: Sequence[Card]) -> Surface:
+    """Lay cards on a surface of the world: geometry and albedo alone cross over."""
+    if not cards or isinstance(surface, Covered):
+        return surface
+    laid = [Polygon(tuple((float(x), float(y)) for x, y in card.corners_mm), inside=card.albedo) for card in cards]
+    return Covered(surface, tuple(laid))
 
 
 def arm_over(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from probewise._kinds import require_kind
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import recording_of
+from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.setting import Experiment, widest_mm
 from probewise.inquiry import UtilityMap
@@ -80,6 +81,8 @@ class Step(ShowsItself):
         Why this step should not be trusted blindly.
     replayed
         Whether the reading comes from a journal.
+    pace
+        Of the run so far.
     """
 
     number: int
@@ -101,6 +104,7 @@ class Step(ShowsItself):
     stop_reason: str | None
     notes: tuple[str, ...]
     replayed: bool = False
+    pace: Pace = field(default_factory=Pace)
 
     @property
     def log_z(self) -> float:

@@ -10,6 +10,7 @@ tables of what the unit Gaussian sees of a corner and of a bent edge (`Silhouett
 
 from probewise.inquiry.batch import choose_several
 from probewise.inquiry.bound import Bound, capacity_bits, fewest_readings, target_entropy
+from probewise.inquiry.carded import CardedForecast, cards_of
 from probewise.inquiry.choice import best_places, choose
 from probewise.inquiry.designs import Design, Designs
 from probewise.inquiry.discs import DiscTable
@@ -22,6 +23,7 @@ from probewise.inquiry.named import UTILITY_NAMES, utility_named
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.inquiry.tabled import DiscForecast, SilhouetteForecast, forecast_of
+from probewise.inquiry.tabled_effects import TabledChain
 from probewise.inquiry.telling_apart import Rival, tell_apart
 from probewise.inquiry.utility import (
     InformationAbout,
@@ -37,6 +39,7 @@ __all__ = [
     "UTILITY_NAMES",
     "AskedForecast",
     "Bound",
+    "CardedForecast",
     "Design",
     "Designs",
     "DiscForecast",
@@ -57,12 +60,14 @@ __all__ = [
     "Readout",
     "Rival",
     "SilhouetteForecast",
+    "TabledChain",
     "Utility",
     "UtilityMap",
     "WhichShape",
     "best_places",
     "bits_gained",
     "capacity_bits",
+    "cards_of",
     "choose",
     "choose_several",
     "entropy_bits",

@@ -19,7 +19,7 @@ from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.spans import ROWS, Interval, Ring, Spans, single
 from probewise.recordings.plan import Plan
-from probewise.scene import Circle, HypothesisScene
+from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
 from probewise.sensor.stages import SensorModel, require_columns
 
@@ -68,6 +68,8 @@ class DiscTable:
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
+        if isinstance(model.scene, CardedScene):
+            return None
         shape = model.scene.shape
         if not isinstance(shape, Circle) or model.names != NAMES:
             return None
@@ -97,15 +99,30 @@ class DiscTable:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Noise-free readings, theta (n_samples, 3) -> (n_samples, n_points), interpolated in all three numbers."""
+        return self.predict_at(theta, plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
+
+    def predict_at(
+        self, theta: FloatArray, x_mm: FloatArray, y_mm: FloatArray, orientation_rad: FloatArray
+    ) -> FloatArray:
+        """Noise-free readings where each hypothesis stands in places of its own.
+
+        Parameters
+        ----------
+        theta
+            Discs, (n_samples, 3).
+        x_mm, y_mm, orientation_rad
+            Where the sensor stands, and how it is turned: broadcasting to (n_samples, n_points).
+        """
         require_columns(theta, NAMES)
-        away_x, away_y = plan.x_mm - theta[:, :1], plan.y_mm - theta[:, 1:2]
+        away_x, away_y = x_mm - theta[:, :1], y_mm - theta[:, 1:2]
         distance = np.hypot(away_x, away_y) - theta[:, 2:]
         out = np.asarray(self.dark + (self.bright - self.dark) * (distance <= 0.0), dtype=np.float64)
         near = np.flatnonzero(np.abs(distance) < self.margin_mm)
         if not near.size:
             return out
-        hypothesis, point = np.divmod(near, len(plan))
-        cosine, sine = np.cos(plan.orientation_rad)[point], np.sin(plan.orientation_rad)[point]
+        hypothesis, point = np.divmod(near, distance.shape[1])
+        turn_rad = orientation_rad[0][point] if len(orientation_rad) == 1 else orientation_rad[hypothesis, point]
+        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         x, y, distance = (values.ravel()[near] for values in (away_x, away_y, distance))
         angle = _pseudo_angle(cosine * x + sine * y, cosine * y - sine * x)
         n_bends, n_directions, n_distances = self.levels.shape

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.scene import HypothesisScene, outlines
+from probewise.scene import CardedScene, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.commanded import is_commanded
 from probewise.sensor.stages import SensorModel
@@ -41,7 +41,7 @@ class Sight:
             return None
         if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
             return None
-        if not isinstance(model.scene, HypothesisScene):
+        if not isinstance(model.scene, HypothesisScene) or isinstance(model.scene, CardedScene):
             return None
         region = model.scene.shape.region(theta)
         try:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.carded import CardedForecast, cards_of
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.discs import DiscTable
 from probewise.inquiry.forecast import (
@@ -211,10 +212,20 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
     `highest` is the greatest height at which the sensor may stand, over that of its calibration, where it can be
     chosen; None: it stands as it was calibrated.
     """
+    if cards_of(model):
+        return _over_cards(model, highest)
     table = DiscTable.of(model) if highest is None else None
     if table is not None:
         return DiscForecast(table if table.margin_mm else model, table)
     return SilhouetteForecast.of(model, highest=highest or 1.0) or AskedForecast(model)
+
+
+def _over_cards(model: SensorModel, highest: float | None) -> Forecast:
+    """Take tables of the shape alone, where there are such, and lay the cards over them."""
+    if not isinstance(model, Chain) or model.effects or highest is not None:
+        return AskedForecast(model)
+    base = forecast_of(replace(model, scene=HypothesisScene(model.scene.shape)))  # type: ignore[attr-defined]
+    return AskedForecast(model) if isinstance(base, AskedForecast) else CardedForecast(base, model)
 
 
 def _heights(plan: Plan) -> FloatArray:

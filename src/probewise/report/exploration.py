@@ -79,6 +79,7 @@ def view(
         levels=levels,
         next_mm=None if pose is None else (pose.x_mm, pose.y_mm),
         truth_mm=truth_mm,
+        cards_mm=[card.corners_mm for card in experiment.cards],
         utility_label=step.map.label,
         title=title or f"after {count(step.number, 'reading')}, {number(step.bits, 1)} bits known",
         ax=ax,
@@ -118,13 +119,40 @@ def frame_of_both(
     return png(axes, dpi=75, tight=False)
 
 
-def live_page(step: Step, picture: bytes) -> str:
-    """Write the page that shows a run while it works: it loads itself anew every second until the run is over."""
+def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0) -> str:
+    """Write the page that shows a run while it works: it loads itself anew every second until the run is over.
+
+    Where the sensor is trusted less than wholly, beliefs about it follow the picture, of the `earlier` steps too.
+    """
     state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
     found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
-    return page("The robot's search", answer=f"{state}.", key_figure=found, sections=(), reload_s=every_s)
+    sections = (_doubt((*earlier, step), trust),) if trust < 1 else ()
+    return page("The robot's search", answer=f"{state}.", key_figure=found, sections=sections, reload_s=every_s)
+
+
+def _doubt(steps: Sequence[Step], trust: float) -> Section:
+    """Show what the robot believes about its sensor after each reading, and say it of the last."""
+    doubted = left_out_of(steps[-1], trust)
+    beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
+    changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
+    dashed = " A dashed line: another became the most probable." if changed else ""
+    named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN]
+    return Section(
+        "What the sensor model leaves out",
+        (
+            paragraph(doubted.sentence),
+            figure(
+                png(belief_in_the_sensor(beliefs)),
+                f"What the robot believes about its sensor after each reading.{dashed}",
+            ),
+            table(
+                ("left out", "probability"),
+                (("nothing" if n == CLEAN else spoken_name(n), probability(p)) for n, p in named[:_MOST_SHOWN]),
+            ),
+        ),
+    )
 
 
 def errors_text(step: Step, truth: Mapping[str, float]) -> str:
@@ -232,27 +260,6 @@ def write_page(
         for name, (mean, sd) in run.last.sensor.items()
     ]
     learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)
-    doubted = left_out_of(run.last, run.experiment.trust)
-    beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in run.steps]
-    changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
-    dashed = " A dashed line: another became the most probable." if changed else ""
-    named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN]
-    doubt = (
-        Section(
-            "What the sensor model leaves out",
-            (
-                paragraph(doubted.sentence),
-                figure(
-                    png(belief_in_the_sensor(beliefs)),
-                    f"What the robot believes about its sensor after each reading.{dashed}",
-                ),
-                table(
-                    ("left out", "probability"),
-                    (("nothing" if n == CLEAN else spoken_name(n), probability(p)) for n, p in named[:_MOST_SHOWN]),
-                ),
-            ),
-        ),
-    )
     shapes = (table(("shape", "probability"), ((n, probability(p)) for n, p in run.last.shapes.items())),)
     sections = [
         Section(
@@ -265,7 +272,7 @@ def write_page(
                 *(paragraph(f"Doubtful: {note}.") for note in run.notes),
             ),
         ),
-        *(doubt if run.experiment.trust < 1 else ()),
+        *((_doubt(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
         Section(
             "How fast",
             (

@@ -5,6 +5,7 @@ Collection for SSF Estimation" (the patterns S_BW and S_a to S_d).
 """
 
 from probewise.scene.albedo import Region, Scene, Shape
+from probewise.scene.cards import Card, CardedRegion, CardedScene
 from probewise.scene.patterns import region_of
 from probewise.scene.regions import (
     EllipseRegion,
@@ -26,6 +27,9 @@ from probewise.scene.shapes import SHAPES, AnyOf, Circle, Ellipse, Field, Placed
 __all__ = [
     "SHAPES",
     "AnyOf",
+    "Card",
+    "CardedRegion",
+    "CardedScene",
     "Circle",
     "Ellipse",
     "EllipseRegion",

@@ -15,7 +15,7 @@ from probewise.recordings.patterns import Pattern
 from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.patterns import region_of
 
-__all__ = ["HypothesisScene", "KnownScene"]
+__all__ = ["HypothesisScene", "KnownScene", "SameForAll"]
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ class HypothesisScene:
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return the shape's region, theta (n_samples, n_params), under any pattern name."""
-        return _SameForAll(self.shape.region(theta))
+        return SameForAll(self.shape.region(theta))
 
 
 @dataclass(frozen=True, eq=False)
-class _SameForAll(Mapping[str, Region]):
+class SameForAll(Mapping[str, Region]):
     """A mapping from every name to one region; it lists the name "hypothesis"."""
 
     region: Region

@@ -235,6 +235,12 @@ class Chain:
             seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
+    def poses(self, theta: FloatArray, plan: Plan) -> Poses:
+        """Stand where each hypothesis says that the sensor really stands: the way up to POSE, as `predict` goes it."""
+        told = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
+        found: Poses = self._applier(theta, plan)(Stage.POSE, told)
+        return found
+
     def _geometries(self, theta: FloatArray, footprint: Footprint) -> _Geometries | None:
         """Group hypotheses that differ only in the weights of many Gaussians; None where grouping saves nothing."""
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
@@ -264,7 +270,7 @@ class Chain:
         apply = self._applier(theta, plan)
         start = len(self.ssf.names) + len(self.levels.names)
         regions = self.scene.regions(theta[:, start : start + len(self.scene.names)])
-        poses = apply(Stage.POSE, Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]))
+        poses = self.poses(theta, plan)
         view: SceneView = apply(Stage.SCENE, SceneView(regions))
         x_mm, y_mm = poses.x_mm - view.dx_mm, poses.y_mm - view.dy_mm
         layout = Layout(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)

@@ -18,6 +18,7 @@ from scipy.special import ndtr, owens_t
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, SlowWarning
 from probewise.scene.albedo import Region
+from probewise.scene.cards import CardedRegion
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -327,6 +328,13 @@ def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         angle[near] -= 2 * np.pi * _mass_beyond(height[near], start[near], end[near])
         turning += angle
     return _between(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
+
+
+@seen_by_one.register
+def _(region: CardedRegion, spot: Spot, n_nodes: int) -> FloatArray:
+    """Of the region and of each card by itself, the cards laid over it."""
+    covered = [seen_by_one(card.region, spot, n_nodes) for card in region.cards]
+    return region.over(seen_by_one(region.region, spot, n_nodes), covered)
 
 
 def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:

@@ -24,11 +24,11 @@ class Population:
     name: str
     shape: Circle
 
-    def circles(self, n: int) -> FloatArray:
-        """Draw the first `n` circles, x_mm, y_mm and radius_mm, (n, 3): always the same ones."""
+    def circles(self, n: int, *, seed: int = _SEED) -> FloatArray:
+        """Draw the first `n` circles, x_mm, y_mm and radius_mm, (n, 3): of one seed always the same ones."""
         if n < 1:
             raise ParameterError("n", n, "1 or more")
-        return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(_SEED).random((n, 3))))
+        return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(seed).random((n, 3))))
 
 
 POPULATIONS: Mapping[str, Population] = {

@@ -7,32 +7,67 @@ with the models. Every row looks for the same circles, with the same noise, with
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from probewise._arrays import FloatArray
 from probewise._version import __version__
-from probewise.arm import Pose, Reach, SimulatedArm
+from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
 from probewise.campaign import run_campaign
-from probewise.experiment import CLEAN, TRUST, left_out_of
+from probewise.experiment import CLEAN, TRUST, left_out_of, recording_of
 from probewise.progress import Progress, silent
 from probewise.recordings import Disc
-from probewise.study.circles import FIELD
+from probewise.study.circles import FIELD, POPULATIONS
 from probewise.study.rows import REFERENCE
 from probewise.study.table import WRONG_MM, share_within
-from probewise.study.trial import BRIGHT, DARK, SEED, Trial, experiment_of, judged, reached, spot_of, timed_steps
+from probewise.study.trial import BRIGHT, DARK, SEED, experiment_of, judged, reached, spot_of, timed_steps
 from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
-from probewise.world.concealed import AlbedoGradient, AmbientStep, Dropouts, EdgeBlur, Halo, OffsetDrift, Outliers
+from probewise.world.concealed import (
+    AlbedoGradient,
+    AmbientStep,
+    CorrelatedNoise,
+    Dropouts,
+    EdgeBlur,
+    EdgeShadow,
+    Flicker,
+    Halo,
+    Hysteresis,
+    Lag,
+    OffsetDrift,
+    Outliers,
+    PositionScale,
+    Quantisation,
+    SensorTilt,
+    SignalDependentNoise,
+)
+from probewise.world.concealed.stages import Stage
+from probewise.world.rows import Rows
 
 __all__ = ["CONCEALED", "ConcealedTrial", "concealed_table", "run_concealed", "run_concealed_trial"]
 
 _EACH_S = 8.0  # between readings, about
+_SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
+
+
+@dataclass(frozen=True)
+class Fading:
+    """A lamp that loses a share of the signal with every reading, eight seconds."""
+
+    share: float
+
+    name: ClassVar[str] = "gain_loss"
+    stage: ClassVar[Stage] = "gain"
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        """Scale the signal."""
+        return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / _EACH_S, 0.0))
+
 
 CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, float]]] = {
     "backlash": (Backlash, (1.5, 6.0, 12.0)),
@@ -47,19 +82,55 @@ CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, 
     "halo": (lambda share: Halo(share, 25.0), (0.05, 0.2, 0.4)),
     "dropouts": (lambda share: Dropouts(share, DARK), (0.03, 0.1, 0.2)),
     "outliers": (lambda share: Outliers(share, 12.0), (0.03, 0.1, 0.2)),
+    "gain_loss": (Fading, (0.001, 0.005, 0.01)),
+    "hysteresis": (Hysteresis, (1.0, 4.0, 10.0)),
+    "lag": (Lag, (2.0, 4.0, 8.0)),
+    "flicker": (lambda units: Flicker(units, 0.37, 1.0), (1.5, 4.0, 8.0)),
+    "edge_shadow": (lambda share: EdgeShadow(share, 8.0), (0.05, 0.2, 0.4)),
+    "correlated_noise": (CorrelatedNoise, (0.3, 0.6, 0.9)),
+    "signal_dependent_noise": (SignalDependentNoise, (1.0, 8.0, 30.0)),
+    "quantisation": (Quantisation, (2.0, 5.0, 10.0)),
+    "sensor_tilt": (lambda mm: SensorTilt(mm, 0.0), (2.0, 6.0, 12.0)),
+    "position_scale": (lambda share: PositionScale(share, share), (0.005, 0.02, 0.05)),
 }
 """What the world conceals, by name, from a number, and the three sizes: barely detectable, plain, gross."""
+
+NAMES: Mapping[str, str] = {"": CLEAN, "gain_loss": GainDrift.name, "sensor_tilt": CLEAN, "position_scale": CLEAN}
+"""What a run is to say of a row, where that is not its name: what amounts to another circle no reading shows."""
+
+_IN_ARM_FRAME: Mapping[str, Callable[[float, FloatArray], FloatArray]] = {
+    "sensor_tilt": lambda mm, circle: circle - np.array([mm, 0.0, 0.0]),
+    "position_scale": lambda share, circle: circle / (1.0 + share),
+}
+_REMEMBERING = frozenset({"lag", "correlated_noise"})  # a reading depends on those before
 
 
 @dataclass(frozen=True)
 class ConcealedTrial:
-    """One run: what is concealed (empty: nothing) at which of its sizes, which circle, at what trust."""
+    """One run: what is concealed (empty: nothing) at which of its sizes, which circle of a seed, at what trust."""
 
     effect: str
     size: int
     circle: int
     trust: float
     max_readings: int = 100
+    seed: int = SEED
+
+    @property
+    def circle_mm(self) -> FloatArray:
+        """The circle that lies there: x_mm, y_mm, radius_mm, (3,)."""
+        return np.asarray(POPULATIONS[REFERENCE.population].circles(self.circle + 1, seed=self.seed)[self.circle])
+
+    @property
+    def truth(self) -> FloatArray:
+        """The circle as it lies in the arm's own frame, (3,)."""
+        frame = _IN_ARM_FRAME.get(self.effect)
+        return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
+
+    @property
+    def name(self) -> str:
+        """What the run is to say."""
+        return NAMES.get(self.effect, self.effect)
 
     @property
     def key(self) -> str:
@@ -77,44 +148,47 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     run itself says that something is wrong (`noticed`), and processor time a decision (`cpu_s`: median, 95 %).
     """
     experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
-    plain = Trial(REFERENCE, trial.circle, trial.max_readings)
     cpu = []
-    for step, cpu_s in timed_steps(_arm(trial, plain), experiment, plain):
+    steps = timed_steps(_arm(trial), experiment, seed=trial.seed, circle=trial.circle, max_readings=trial.max_readings)
+    for step, cpu_s in steps:
         last = step
         cpu.append(cpu_s)
     left_out = left_out_of(last, trial.trust)
     return {
         "known": reached(last, experiment),
         "readings": last.number,
-        **judged(last, experiment, plain.truth),
-        "p_truth": round(left_out.probability.get(trial.effect or CLEAN, 0.0), 4),
+        **judged(last, experiment, trial.truth),
+        "p_truth": round(left_out.probability.get(trial.name, 0.0), 4),
         "credible": list(left_out.credible_set),
         "noticed": bool(last.p_value < experiment.doubt_p or left_out.leading != CLEAN),
         "cpu_s": [round(float(np.quantile(cpu, q)), 3) for q in (0.5, 0.95)],
     }
 
 
-def _arm(trial: ConcealedTrial, plain: Trial) -> SimulatedArm:
+def _arm(trial: ConcealedTrial) -> SimulatedArm:
     """Stand an arm in the world that conceals; its noise goes by the reading's number alone."""
     concealed: tuple[Concealed, ...] = ()
     if trial.effect:
         make, sizes = CONCEALED[trial.effect]
         concealed = (make(sizes[trial.size]),)
     world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=REFERENCE.noise_sd, concealed=concealed)
-    x_mm, y_mm, radius_mm = plain.truth.tolist()
-    disc, number = Disc((x_mm, y_mm), radius_mm), itertools.count()
-    came: list[tuple[float, float, tuple[float, float]]] = []
+    x_mm, y_mm, radius_mm = trial.circle_mm.tolist()
+    disc = Disc((x_mm, y_mm), radius_mm)
+    came: list[tuple[Pose, float, tuple[float, float]]] = []
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:
         direction = came[-1][2] if came else (0.0, 0.0)
-        if came and (away := math.hypot(pose.x_mm - came[-1][0], pose.y_mm - came[-1][1])) > 0:
-            direction = ((pose.x_mm - came[-1][0]) / away, (pose.y_mm - came[-1][1]) / away)
-        came.append((pose.x_mm, pose.y_mm, direction))
-        rng = np.random.default_rng([SEED, trial.circle, next(number)])
+        if came and (away := math.hypot(pose.x_mm - came[-1][0].x_mm, pose.y_mm - came[-1][0].y_mm)) > 0:
+            direction = ((pose.x_mm - came[-1][0].x_mm) / away, (pose.y_mm - came[-1][0].y_mm) / away)
+        came.append((pose, time_s, direction))
+        if trial.effect in _REMEMBERING:
+            so_far = recording_of([Reading(0.0, was, at_s) for was, at_s, _ in came], patterns={"field": disc}).plan
+            return float(world.simulate(so_far, rng=np.random.default_rng([trial.seed, trial.circle])).readings[-1])
+        rng = np.random.default_rng([trial.seed, trial.circle, len(came) - 1])
         return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
 
     everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
-    return SimulatedArm(light, reach=everywhere, scale=None)
+    return SimulatedArm(light, reach=everywhere, speed=_SPEED, scale=None)
 
 
 def run_concealed(
@@ -124,6 +198,8 @@ def run_concealed(
     max_readings: int = 100,
     effects: Sequence[str] = tuple(CONCEALED),
     sizes: Sequence[int] = (0, 1, 2),
+    n_clean: int | None = None,
+    seed: int = SEED,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> dict[ConcealedTrial, dict[str, Any]]:
@@ -139,21 +215,26 @@ def run_concealed(
         A run that knows too little after so many readings counts as a miss.
     effects, sizes
         Rows beside that in which nothing is concealed.
+    n_clean
+        Circles of that row; by default as many as of the others.
+    seed
+        Of circles, noise and robot.
     executor, progress
         As for `run_study`.
     """
-    rows = [("", 0), *((name, size) for name in effects for size in sizes)]
+    rows = {("", 0): n_clean or n_circles, **{(name, size): n_circles for name in effects for size in sizes}}
     trials = [
-        ConcealedTrial(name, size, circle, trust, max_readings)
-        for circle in range(n_circles)
-        for name, size in rows
+        ConcealedTrial(name, size, circle, trust, max_readings, seed)
+        for circle in range(max(rows.values()))
+        for (name, size), n in rows.items()
+        if circle < n
         for trust in (TRUST, 1.0)
     ]
     results = run_campaign(
         run_concealed_trial,
         {trial.key: trial for trial in trials},
         path=path,
-        settings={"concealed": __version__, "max_readings": max_readings},
+        settings={"concealed": __version__, "max_readings": max_readings, "seed": seed},
         executor=executor,
         progress=progress,
         noun="runs",
@@ -165,7 +246,7 @@ def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list
     """Sum up each row, (effect, size, trust): shares with Wilson's 95 % intervals as text."""
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
     for trial, result in results.items():
-        rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.effect or CLEAN, result))
+        rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.name, result))
     return [_summed(key, runs) for key, runs in rows.items()]
 
 

@@ -122,7 +122,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     """
     experiment = experiment_for_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
-    for step, cpu_s in timed_steps(arm_of(trial), experiment, trial):
+    for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):
         last = step
         cpu.append(cpu_s)
         widest.append(round(step.widest_mm, 3))
@@ -142,11 +142,13 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     }
 
 
-def timed_steps(arm: SimulatedArm, experiment: Experiment, trial: Trial) -> Iterator[tuple[Step, float]]:
-    """Yield the steps of a run and the processor time of each (s); its randomness goes by the circle alone."""
-    rng = np.random.default_rng([SEED, trial.circle])
+def timed_steps(
+    arm: SimulatedArm, experiment: Experiment, *, circle: int, max_readings: int, seed: int = SEED
+) -> Iterator[tuple[Step, float]]:
+    """Yield the steps of a run and the processor time of each (s); its randomness goes by seed and circle alone."""
+    rng = np.random.default_rng([seed, circle])
     with arm:
-        steps = explore(arm, experiment, rng=rng, max_readings=trial.max_readings)
+        steps = explore(arm, experiment, rng=rng, max_readings=max_readings)
         while True:
             before = time.process_time()
             step = next(steps, None)

@@ -13,7 +13,7 @@ from probewise.world.concealed import (
     Nonlinearity,
     Saturation,
 )
-from probewise.world.painting import Oval, Surface, paint
+from probewise.world.painting import Covered, Oval, Surface, paint
 from probewise.world.rays import seen_white
 from probewise.world.rows import Rows
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
@@ -25,6 +25,7 @@ __all__ = [
     "Blob",
     "Concealed",
     "CorrelatedNoise",
+    "Covered",
     "GainDrift",
     "Look",
     "Nonlinearity",

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
-from probewise.world.painting import Oval, Surface
+from probewise.world.painting import Covered, Oval, Surface
 
 __all__ = ["across_edge", "edge_distance"]
 
@@ -21,6 +21,9 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
     A picture's edges are nobody's knowledge: it counts as having none.
     """
     match surface:
+        case Covered():
+            below = [edge_distance(part, x_mm, y_mm) for part in (surface.below, *surface.cards)]
+            return np.asarray(np.min(below, axis=0))
         case Uniform() | Ramp() | Image():
             return np.full(x_mm.shape, np.inf)
         case HalfPlane():

@@ -22,7 +22,7 @@ from probewise.recordings.patterns import (
     Uniform,
 )
 
-__all__ = ["Oval", "Surface", "paint"]
+__all__ = ["Covered", "Oval", "Surface", "paint"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,15 @@ class Oval:
     outside: float = 0.0
 
 
-Surface: TypeAlias = Pattern | Oval
+@dataclass(frozen=True)
+class Covered:
+    """A surface with cards on it, each a polygon of its own albedo inside; the last lies on top."""
+
+    below: Pattern | Oval
+    cards: tuple[Polygon, ...]
+
+
+Surface: TypeAlias = Pattern | Oval | Covered
 
 
 def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
@@ -48,6 +56,11 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         If the surface is of no known kind.
     """
     match surface:
+        case Covered():
+            seen = paint(surface.below, x_mm, y_mm)
+            for card in surface.cards:
+                seen = np.where(_within_polygon(card, x_mm, y_mm), card.inside, seen)
+            return seen
         case Uniform():
             return np.full(x_mm.shape, surface.albedo)
         case Ramp():

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.patches import Polygon as PolygonPatch
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 
@@ -19,6 +20,7 @@ __all__ = ["bar_beside", "explain_field", "out_of_reach", "playing_field"]
 
 LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
 NEXT_GREEN = "#00e08a"  # the palette's green, lighter: the next place must stand out on copper
+CARD_YELLOW = "#ffd54a"
 OUTLINE_BLUE = "#3fa7ff"  # likewise; the paper's hypotheses are blue
 DARK_EDGE = "#c8c8c8"  # of a square whose reading was dark
 GROUND = "#2a1a12"  # of the key, the map's darkest: on it all that is drawn on the map is seen
@@ -35,6 +37,7 @@ def playing_field(
     levels: tuple[float, float] = (1.0, 100.0),
     next_mm: tuple[float, float] | None = None,
     truth_mm: FloatArray | None = None,
+    cards_mm: Sequence[FloatArray] = (),
     title: str = "",
     utility_label: str = "entropy (bits)",
     utility_max: float | None = None,
@@ -59,6 +62,8 @@ def playing_field(
         The place chosen next.
     truth_mm
         Outline of what really lies there, drawn dashed; left out where nobody knows.
+    cards_mm
+        Corners of each card whose place and albedo are known, (4, 2).
     title, utility_label
         Text of the figure and of its colour bar.
     utility_max
@@ -90,6 +95,10 @@ def playing_field(
         dashes = (0, (5, 3))
         label = "what really lies there"
         ax.plot(truth_mm[:, 0], truth_mm[:, 1], color="white", linewidth=1.4, linestyle=dashes, label=label)
+    for n, corners in enumerate(cards_mm):
+        label = "" if n else "known card"
+        card = PolygonPatch(corners, fill=False, edgecolor=CARD_YELLOW, linewidth=1.4, hatch="//", label=label)
+        ax.add_patch(card)
     if places_mm is not None and readings is not None and len(places_mm):
         low, high = levels
         shade = np.clip((np.asarray(readings) - low) / max(high - low, 1e-9), 0, 1)

@@ -1,0 +1,211 @@
+"""Other laws of the noise than the one that a sensor is said to have: rivals that leave the mean as it is.
+
+Each scores all readings of a run at once, over equally weighted nodes of its prior.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.effects import CorrelatedNoise, HeavyTailed, Outliers, SignalDependentNoise, lattice_step, log_density
+from probewise.effects.density import log_gaussian_density
+from probewise.priors import LogUniform
+from probewise.sensor import NoiseLevel
+
+__all__ = ["Correlated", "Flickering", "Lost", "OnLattice", "Tailed", "WithSignal", "noise_laws"]
+
+_REACH = 5.0  # sds beyond its range that a sensor may read
+_SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
+_EXACT = 1e-3  # of the noise sd: how exactly a lost reading holds its value
+_PHASES = 7
+_PER_PHASE = 0.16  # of the amplitude: as far as the sines of neighbouring phases lie apart, about, they are spread
+_COARSE = 0.3  # noise sds, from which on a lattice of the readings matters
+_PRINTED = 0.05  # noise sds: how closely readings that are not rounded would lie on a lattice by chance
+_FREE = 2  # readings that lie on a lattice of their own choice
+
+
+def _mean_over(nodes: list[FloatArray]) -> FloatArray:
+    return np.asarray(logsumexp(nodes, axis=0) - math.log(len(nodes)))
+
+
+@dataclass(frozen=True, eq=False)
+class Tailed:
+    """Score readings of which some scatter more widely, over the prior of how many and how widely.
+
+    `sd` and `step` are those of the plain noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
+    weighted nodes.
+    """
+
+    sd: float
+    step: float
+    shares: FloatArray
+    sizes: FloatArray
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """See `Likelihood.log_prob`."""
+        narrow = _each(readings, predicted, self.sd, self.step)
+        nodes = []
+        for share, size in zip(self.shares, self.sizes, strict=True):
+            wide = _about(readings, predicted, self.sd * size, self.step)
+            nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
+        return _mean_over(nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class Lost:
+    """Score readings of which some are lost, whatever lies under the sensor.
+
+    To black, exactly or within the noise, or to anything in its range.
+    """
+
+    sd: float
+    step: float
+    black: float
+    low: float
+    high: float
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """See `Likelihood.log_prob`."""
+        kept = _each(readings, predicted, self.sd, self.step)
+        to_black = _each(readings, np.array([[self.black]]), self.sd, self.step)
+        exactly = _each(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
+        low, high = min(self.low - _REACH * self.sd, 0.0), self.high + _REACH * self.sd
+        within = (readings >= low) & (readings <= high)
+        anywhere = np.where(within, math.log((self.step or 1.0) / (high - low)), -np.inf)
+        lost = logsumexp(np.broadcast_arrays(exactly, to_black, anywhere), axis=0) - math.log(3.0)
+        return _mean_over(
+            [np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Correlated:
+    """Score readings whose noise remembers that of the reading before, over the prior of how well."""
+
+    sd: float
+    step: float
+    n_nodes: int = 6
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """See `Likelihood.log_prob`."""
+        u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
+        before = np.zeros_like(predicted)
+        before[:, 1:] = (readings - predicted)[:, :-1]
+        first = _each(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
+        nodes = []
+        for rho in CorrelatedNoise().prior.from_unit_cube(u)[:, 0].tolist():
+            sd = self.sd * math.sqrt(1.0 - rho**2)
+            later = _each(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
+            nodes.append(first + later.sum(axis=1))
+        return _mean_over(nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class WithSignal:
+    """Score readings whose noise grows with the light, over the prior of how much."""
+
+    sd: float
+    step: float
+    dark: float
+    bright: float
+    n_nodes: int = 6
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """See `Likelihood.log_prob`."""
+        u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
+        seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
+        return _mean_over(
+            [
+                _each(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(axis=1)
+                for ratio in SignalDependentNoise().prior.from_unit_cube(u)[:, 0].tolist()
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Flickering:
+    """Score readings under a lamp that flickers faster than they come: each has a phase of its own.
+
+    `amplitudes` are equally weighted nodes. A sine of even phase is a mixture of a few, each spread as far as its
+    neighbours are away.
+    """
+
+    sd: float
+    step: float
+    amplitudes: tuple[float, ...]
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """See `Likelihood.log_prob`."""
+        sines = np.cos((np.arange(_PHASES) + 0.5) / _PHASES * np.pi)
+        nodes = []
+        for amplitude in self.amplitudes:
+            sd = math.hypot(self.sd, _PER_PHASE * amplitude)
+            phases = [_about(readings, predicted + amplitude * sine, sd, self.step) for sine in sines.tolist()]
+            nodes.append(_mean_over(phases).sum(axis=1))
+        return _mean_over(nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class OnLattice:
+    """Score readings that come in coarser steps than is declared; where they lie on no lattice, as the plain noise."""
+
+    sd: float
+    step: float
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """See `Likelihood.log_prob`."""
+        coarse = lattice_step(readings)
+        if coarse <= max(_COARSE * self.sd, 1.5 * self.step):
+            return np.asarray(_each(readings, predicted, self.sd, self.step).sum(axis=1))
+        fine = self.step or _PRINTED * self.sd
+        surprise = (len(readings) - _FREE) * math.log(coarse / fine)
+        density = _each(readings, predicted, self.sd, coarse) - math.log(coarse)
+        return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
+
+
+Law = Tailed | Lost | Correlated | WithSignal | Flickering | OnLattice
+
+
+def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, Law]:
+    """List the laws by the names of the vocabulary.
+
+    Parameters
+    ----------
+    sd, step
+        Of the plain noise; step 0: readings are not rounded.
+    ends
+        What the sensor reads over black and over white.
+    """
+    dark, bright = ends
+    low, high = sorted(ends)
+    shares, sizes = Outliers().bank()[:, 0].T
+    amplitudes = HeavyTailed(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
+    return {
+        "outliers": Tailed(sd, step, shares, sizes),
+        "dropouts": Lost(sd, step, dark, low, high),
+        "correlated_noise": Correlated(sd, step),
+        "signal_dependent_noise": WithSignal(sd, step, dark, bright),
+        "flicker": Flickering(sd, step, tuple(amplitudes.tolist())),
+        "quantisation": OnLattice(sd, step),
+    }
+
+
+def _each(readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, step: float) -> FloatArray:
+    """Log density of each reading, or log probability of its cell, (n_samples, n_points)."""
+    if not step:
+        return log_gaussian_density(readings, predicted, np.asarray(sd))
+    level = NoiseLevel(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
+    return np.asarray(log_density(level, readings, predicted) + math.log(step))
+
+
+def _about(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
+    """As `_each`, of noise that is wider than its cell: by the density in the cell's middle, its own width added."""
+    if sd < step:
+        return _each(readings, predicted, sd, step)
+    wide = math.hypot(sd, step / math.sqrt(12.0))
+    return log_gaussian_density(readings, predicted, np.asarray(wide)) + (math.log(step) if step else 0.0)

@@ -1,0 +1,94 @@
+"""Count a run's time in readings: whether one takes a second or a minute, a lamp warms up over some of them.
+
+What drifts in a run, or happens at one moment of it, has its prior before anything is known of how fast the
+instrument is. So effects that change with time are asked at a time of the run's own, eight seconds a reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.arm.instrument import Reading
+from probewise.effects import NamedEffect
+from probewise.priors import Prior
+from probewise.recordings.plan import Plan, Recording
+from probewise.sensor.stages import Effect, Stage
+
+__all__ = ["EACH_S", "Pace", "Paced", "clocked"]
+
+EACH_S = 8.0
+"""Seconds of a run's own time that each reading takes on average."""
+
+_COLUMN = "paced_s"
+
+
+@dataclass(frozen=True)
+class Pace:
+    """When a run began, and the seconds from one reading to the next, on average."""
+
+    start_s: float = 0.0
+    each_s: float = EACH_S
+
+    @classmethod
+    def of(cls, readings: Sequence[Reading]) -> Self:
+        """Measure it."""
+        if len(readings) < 2 or readings[-1].time_s <= readings[0].time_s:
+            return cls(readings[0].time_s if readings else 0.0)
+        return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
+
+    def on(self, plan: Plan) -> Plan:
+        """Write the run's own time beside the clock's."""
+        own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
+        return replace(plan, covariates={**plan.covariates, _COLUMN: own})
+
+    def on_recording(self, recording: Recording) -> Recording:
+        """Write it into a recording's plan."""
+        return replace(recording, plan=self.on(recording.plan))
+
+
+@dataclass(frozen=True, eq=False)
+class Paced(Effect[FloatArray]):
+    """An effect that changes with time, in the run's own time where a plan has it."""
+
+    effect: NamedEffect[FloatArray]
+
+    powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        """The effect's stage."""
+        return self.effect.stage
+
+    @property
+    def prior(self) -> Prior:
+        """Of the effect, in the run's own time."""
+        return self.effect.prior
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Apply it."""
+        own = plan.covariates.get(_COLUMN)
+        return self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own))
+
+    def by_the_clock(self, theta: FloatArray, pace: Pace) -> FloatArray:
+        """Turn parameters in the run's own time into seconds of the clock, any shape (..., n_params)."""
+        powers = np.array([self.powers.get(name, 0) for name in self.prior.names])
+        return np.asarray(theta * (pace.each_s / EACH_S) ** powers)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say what it does."""
+        return self.effect.sentence(mean, sd)
+
+
+def clocked(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
+    """Give an effect's parameters by the clock, whether or not it is a `Paced` one."""
+    return effect.by_the_clock(theta, pace) if isinstance(effect, Paced) else theta

@@ -1,0 +1,166 @@
+"""Known cards on the field, over what tables tell of the shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.designs import Designs
+from probewise.inquiry.forecast import Forecast, Outlook, thinned
+from probewise.recordings.plan import Plan
+from probewise.scene.cards import Card, CardedScene
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor.chain import Layout, response
+from probewise.sensor.stages import Poses, SensorModel
+
+__all__ = ["CardedForecast", "CardedModel", "cards_of"]
+
+_REACH = 6.0  # sds of the footprint
+_SHOWS = 1e-4  # share of the view on a card, from which on the card counts
+_MOST_ASKED = 400
+
+
+def cards_of(model: SensorModel) -> tuple[Card, ...]:
+    """List the known cards on a model's field."""
+    scene = getattr(model, "scene", None)
+    return scene.cards if isinstance(scene, CardedScene) else ()
+
+
+@dataclass(frozen=True, eq=False)
+class CardedModel:
+    """A sensor without effects over a shape, from its tables, and over known cards, in closed form."""
+
+    chain: Chain
+    plain: SensorModel
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The shape's parameters."""
+        return self.plain.names
+
+    @property
+    def cards(self) -> tuple[Card, ...]:
+        """The cards."""
+        return cards_of(self.chain)
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """See `SensorModel.predict`."""
+        covered = self.covered(Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan)
+        dark, bright = self.ends
+        seen = (self.plain.predict(theta, plan) - dark) / (bright - dark)
+        return np.asarray(dark + (bright - dark) * self.over(seen, covered))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """What is read over black and over white."""
+        levels = self.chain.levels
+        assert isinstance(levels, FixedLevels)
+        return levels.i_min, levels.i_max
+
+    def over(self, seen: FloatArray, covered: list[FloatArray]) -> FloatArray:
+        """Lay the cards over what is seen of the shape."""
+        for card, share in zip(self.cards, covered, strict=True):
+            seen = seen * (1.0 - share) + card.albedo * share
+        return seen
+
+    def covered(self, poses: Poses, plan: Plan) -> list[FloatArray]:
+        """Tell which share of each view is on each card, (n_samples or 1, n_points) each."""
+        mixture = self.chain.ssf
+        assert isinstance(mixture, FixedMixture)
+        sd = np.sqrt(np.linalg.eigvalsh(mixture.covs_mm2)[:, -1])
+        reach = float((np.linalg.norm(mixture.means_mm, axis=1) + _REACH * sd).max())
+        footprint = mixture.footprint(np.empty((1, 0)))
+        found = []
+        for card in self.cards:
+            out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
+            within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
+                np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
+            )
+            rows = np.flatnonzero(within.any(axis=0))
+            if rows.size:
+                there = Poses(*(a[:, rows] for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+                part = plan.take(rows)
+                regions = dict.fromkeys(part.pattern_names, card.region)
+                out[:, rows] = response(Layout(regions, there, part), footprint, n_nodes=self.chain.n_nodes)
+            found.append(out)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class CardedForecast:
+    """All hypotheses, from the tables of a shape alone; where a card is seen, some are asked."""
+
+    base: Forecast
+    chain: Chain
+
+    @property
+    def model(self) -> CardedModel:
+        """See `Forecast.model`."""
+        return CardedModel(self.chain, self.base.model)
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """See `Forecast.predict`."""
+        return CardedModel(self.chain, _Predicts(self.base)).predict(theta, plan)
+
+    def outlook(
+        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
+    ) -> Outlook:
+        """See `Forecast.outlook`."""
+        base = self.base.outlook(theta, weight, designs, plan, rows, noise_sd)
+        there, model = plan.take(rows), self.model
+        covered = model.covered(Poses(there.x_mm[None], there.y_mm[None], there.orientation_rad[None]), there)
+        near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
+        if not near.size:
+            return base
+        asked, share = thinned(weight, _MOST_ASKED)
+        answers = model.predict(theta[asked], there.take(near))
+        return _CardedOutlook(base, asked, share / weight[asked], answers, near, len(rows))
+
+
+@dataclass(frozen=True, eq=False)
+class _Predicts:
+    """A forecast's predictions as a sensor model's."""
+
+    forecast: Forecast
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.forecast.model.names
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        return self.forecast.predict(theta, plan)
+
+
+@dataclass(frozen=True, eq=False)
+class _CardedOutlook:
+    """What the tables say, but for the designs that see a card: `answers` are those of `asked` hypotheses there."""
+
+    base: Outlook
+    asked: IntArray
+    stands_for: FloatArray
+    answers: FloatArray
+    near: IntArray
+    n_rows: int
+
+    @property
+    def levels(self) -> FloatArray:
+        return self.base.levels
+
+    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """See `Outlook.maps`."""
+        own, n = weight[self.asked] * self.stands_for, len(self.near)
+        levels = self.levels
+        index = np.rint((self.answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+        key = np.clip(index, 0, len(levels) - 1) + np.arange(n) * len(levels)
+        mass_there = np.bincount(key.ravel(), np.repeat(own, n), minlength=n * len(levels)).reshape(n, -1)
+        number = np.full(self.n_rows, -1)
+        number[self.near] = np.arange(n)
+        for at, mass in self.base.maps(weight):
+            sees = np.flatnonzero(number[at] >= 0)
+            if sees.size:
+                mass = mass.copy()
+                mass[sees] = mass_there[number[at[sees]]]
+            yield at, mass

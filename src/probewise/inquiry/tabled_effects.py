@@ -1,0 +1,51 @@
+"""Effects before and after what the sensor sees of a disc: what it sees there comes from the table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.inquiry.carded import CardedModel
+from probewise.inquiry.discs import DiscTable
+from probewise.recordings.plan import Plan
+from probewise.sensor import Chain
+from probewise.sensor.stages import SensorModel, Stage, View
+
+__all__ = ["TabledChain"]
+
+
+@dataclass(frozen=True, eq=False)
+class TabledChain:
+    """A chain over one disc whose effects change neither the disc nor the footprint."""
+
+    chain: Chain
+    table: DiscTable
+    cards: CardedModel | None = None
+
+    @classmethod
+    def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
+        """Look up what `chain` sees in the table that `plain`, the same chain without effects, is; None where not."""
+        cards = plain if isinstance(plain, CardedModel) else None
+        table = plain if cards is None else cards.plain
+        if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
+            return None
+        if any(effect.stage in (Stage.SCENE, Stage.FOOTPRINT) for effect in chain.effects):
+            return None
+        return cls(chain, table, cards)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The chain's."""
+        return self.chain.names
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """See `SensorModel.predict`."""
+        poses, disc, table = self.chain.poses(theta, plan), theta[:, :3], self.table
+        level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
+        seen = (level - table.dark) / (table.bright - table.dark)
+        if self.cards is not None:
+            seen = self.cards.over(seen, self.cards.covered(poses, plan))
+        return self.chain.read(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

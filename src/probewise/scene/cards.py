@@ -1,0 +1,113 @@
+"""Cards whose place and albedo are known: they lie on the field, over whatever lies there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise._kinds import require_number
+from probewise.errors import ParameterError
+from probewise.scene.albedo import Region
+from probewise.scene.regions import PolygonRegion, edge_distance, outlines
+from probewise.scene.scenes import HypothesisScene, SameForAll
+
+__all__ = ["Card", "CardedRegion", "CardedScene"]
+
+
+@dataclass(frozen=True)
+class Card:
+    """A rectangle along X and Y about (x_mm, y_mm), of one albedo from 0, as dark as the field, to 1, as the shape."""
+
+    x_mm: float
+    y_mm: float
+    width_mm: float
+    height_mm: float
+    albedo: float
+
+    def __post_init__(self) -> None:
+        for name in ("x_mm", "y_mm", "width_mm", "height_mm", "albedo"):
+            require_number(name, getattr(self, name))
+        if not (math.isfinite(self.x_mm) and math.isfinite(self.y_mm)):
+            raise ParameterError("(x_mm, y_mm) of a card", (self.x_mm, self.y_mm), "finite: its centre")
+        for name in ("width_mm", "height_mm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ParameterError(f"{name} of a card", getattr(self, name), "finite, greater than 0")
+        if not 0 <= self.albedo <= 1:
+            raise ParameterError(
+                "albedo of a card", self.albedo, "0 to 1: 0 is as dark as the field, 1 as white as the shape"
+            )
+
+    @property
+    def corners_mm(self) -> FloatArray:
+        """Its corners in order, (4, 2)."""
+        half = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) / 2
+        return np.asarray(np.array([self.x_mm, self.y_mm]) + half * (self.width_mm, self.height_mm))
+
+    @cached_property
+    def region(self) -> PolygonRegion:
+        """Where it lies, as an albedo of 1 on 0."""
+        return PolygonRegion.simple(self.corners_mm[None])
+
+    @property
+    def telling_mm(self) -> FloatArray:
+        """Places that tell most about a sensor: its middle, and the middles of its sides, (5, 2)."""
+        half_x, half_y = self.width_mm / 2, self.height_mm / 2
+        away = np.array([[0.0, 0.0], [-half_x, 0.0], [half_x, 0.0], [0.0, -half_y], [0.0, half_y]])
+        return np.asarray(np.array([self.x_mm, self.y_mm]) + away)
+
+
+@dataclass(frozen=True, eq=False)
+class CardedRegion:
+    """A region with cards on it; what follows in the list lies on top."""
+
+    region: Region
+    cards: tuple[Card, ...]
+
+    @property
+    def n_regions(self) -> int:
+        """How many hypotheses it holds, or 1."""
+        return self.region.n_regions
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        return self.over(self.region.albedo(points_mm), [card.region.albedo(points_mm) for card in self.cards])
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Mean albedo over turned square pixels, (n_regions, n_points)."""
+        covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
+        return self.over(self.region.coverage(centers_mm, pixel_mm, turn_rad), covered)
+
+    def over(self, seen: FloatArray, covered: list[FloatArray]) -> FloatArray:
+        """Lay the cards over what would be seen without them; `covered` is the share of the view on each card.
+
+        Exact where a view holds no edge but a card's, or none of a card's: a view that holds both takes the shape
+        for as white under the card as beside it.
+        """
+        for card, share in zip(self.cards, covered, strict=True):
+            seen = np.asarray(seen * (1.0 - share) + card.albedo * share)
+        return seen
+
+
+@outlines.register
+def _(region: CardedRegion, *, n_vertices: int = 96) -> list[FloatArray]:
+    return outlines(region.region, n_vertices=n_vertices)
+
+
+@edge_distance.register
+def _(region: CardedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    return edge_distance(region.region, x_mm, y_mm)
+
+
+@dataclass(frozen=True)
+class CardedScene(HypothesisScene):
+    """One shape of unknown parameters, and known cards on it, under every reading."""
+
+    cards: tuple[Card, ...] = field(default=())
+
+    def regions(self, theta: FloatArray) -> SameForAll:
+        """Give the shape's region with the cards on it, theta (n_samples, n_params), under any pattern name."""
+        return SameForAll(CardedRegion(self.shape.region(theta), self.cards))

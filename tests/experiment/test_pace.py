@@ -1,0 +1,64 @@
+"""A run's own time: what drifts does so over so many readings, whatever the clock says of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.arm import Pose, Reading
+from probewise.experiment.pace import EACH_S, Pace, Paced
+from probewise.experiment.rivals import GainLoss, rivals_of
+from probewise.study import experiment_of
+from probewise.study.rows import REFERENCE
+
+
+def readings(each_s, start_s=0.0):
+    return [Reading(20.0, Pose(100.0 * k, 50.0 * (k % 3), 0.0), start_s + each_s * k) for k in range(8)]
+
+
+def rivals(name):
+    plain = experiment_of(REFERENCE)
+    return [r.effect for r in rivals_of(plain.model, plain.likelihood, (1048.0, 520.0)) if r.name == name]
+
+
+@pytest.mark.parametrize("name", ["ambient_step", "offset_drift", "gain_drift", "lag"])
+def test_a_fast_instrument_drifts_over_as_many_readings_as_a_slow_one(name):
+    """The clock may even be that of the world, in seconds since 1970."""
+    experiment = replace(experiment_of(REFERENCE), trust=0.9)
+    slow, fast = (experiment.problem(readings(*clock)).recording.plan for clock in ((8.0,), (0.02, 1.7e9)))
+    for effect in rivals(name):
+        assert isinstance(effect, Paced)
+        theta = effect.prior.from_unit_cube(np.random.default_rng(1).random((20, len(effect.prior.names))))
+        value = np.tile(np.linspace(10.0, 60.0, 8), (20, 1))
+        np.testing.assert_allclose(effect.apply(value, theta, fast), effect.apply(value, theta, slow), rtol=1e-4)
+
+
+def test_parameters_are_told_by_the_clock():
+    (step,) = rivals("ambient_step")
+    pace = Pace.of(readings(2.0))
+    assert pace.each_s == pytest.approx(2.0)
+    np.testing.assert_allclose(step.by_the_clock(np.array([5.0, 4 * EACH_S]), pace), [5.0, 8.0])
+    (drift,) = rivals("offset_drift")
+    np.testing.assert_allclose(drift.by_the_clock(np.array([1.0]), pace), [4.0])
+
+
+def test_one_reading_has_the_usual_pace():
+    assert Pace.of(readings(2.0)[:1]).each_s == EACH_S
+    assert Pace.of([]) == Pace()
+
+
+def test_a_lamp_that_begins_as_calibrated_may_fade():
+    plan = experiment_of(REFERENCE).problem(readings(8.0)).recording.plan
+    faded = GainLoss().apply(np.full((1, 8), 50.0), np.array([[-0.5, 800.0]]), plan)[0]
+    assert faded[0] == 50.0
+    assert (np.diff(faded) < 0).all()
+    np.testing.assert_allclose(faded[-1], 50.0 * (1 - 0.5 * (1 - np.exp(-56.0 / 800.0))))
+
+
+def test_the_ways_of_one_name_share_what_it_has():
+    experiment = replace(experiment_of(REFERENCE), trust=0.9)
+    shares: dict[str, float] = {}
+    for kind in experiment.kinds:
+        shares[kind.left_out] = shares.get(kind.left_out, 0.0) + float(np.exp(kind.log_prior))
+    assert shares["gain_drift"] == pytest.approx(shares["backlash"])
+    assert sum(kind.left_out == "gain_drift" for kind in experiment.kinds) == 2

@@ -7,13 +7,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Never
+from typing import TYPE_CHECKING, NamedTuple, Never
 
 from tqdm import tqdm
 
 from probewise._kinds import require_takes
 from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from probewise.calibration import Rung
 
 __all__ = ["of_nested", "progress_or_bar", "progress_shown"]
 
@@ -80,11 +83,14 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         yield progress
 
 
-def of_nested(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
-    """Adapt a progress function to nested sampling; each run is named or has a number of Gaussians."""
+def of_nested(progress: Progress) -> Callable[[int | str, RoundSummary | Rung], None]:
+    """Adapt a progress function to nested sampling and climbs; each is named or has a number of Gaussians."""
 
-    def tell(what: int | str, state: RoundSummary) -> None:
+    def tell(what: int | str, state: RoundSummary | Rung) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
+        if not isinstance(state, RoundSummary):
+            progress(stage, note=f"temperature {state.temperature:.3f} of 1, ln Z {state.log_z:.1f}")
+            return
         to_come = state.log_ratio_remaining
         progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")
 

@@ -44,7 +44,7 @@ __all__ = [
 # Defaults of the command line and of the functions below.
 ORDERS = (1, 2, 3, 4)
 N_LIVE = 300
-CALIBRATION: Literal["refined", "paper"] = "refined"
+CALIBRATION: Literal["refined", "quick", "paper"] = "refined"
 SHAPE = "circle"
 MODEL: Model = "ssf"
 METHOD: MethodName = "particles"
@@ -57,7 +57,7 @@ def calibrate(
     *,
     orders: Sequence[int] = ORDERS,
     n_live: int = N_LIVE,
-    method: Literal["refined", "paper"] = CALIBRATION,
+    method: Literal["refined", "quick", "paper"] = CALIBRATION,
     nested_stop: NestedStop | None = None,
     rng: np.random.Generator,
     progress: bool | Progress = True,
@@ -74,6 +74,8 @@ def calibrate(
         Live points of nested sampling: fewer are faster but make the evidences less precise.
     method
         "refined": widths evenly probable over orders of magnitude, each evidence refined by importance sampling.
+        "quick": the same prior; only that of one Gaussian is searched, and each further number of Gaussians is
+        reached from the one below by sequential Monte Carlo; what is doubtful is searched all the same.
         "paper": uniform priors, and the evidence of nested sampling alone. Both have the Student-t likelihood.
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or
@@ -112,8 +114,8 @@ def calibrate(
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
 
-    if method not in ("refined", "paper"):
-        raise ParameterError("method", method, "'refined' or 'paper'")
+    if method not in ("refined", "quick", "paper"):
+        raise ParameterError("method", method, "'refined', 'quick' or 'paper'")
     paper = method == "paper"
     if nested_stop is not None and not (paper and nested_stop in NESTED_STOP):
         allowed = " or ".join(map(repr, NESTED_STOP)) if paper else "None"
@@ -123,6 +125,7 @@ def calibrate(
             recording,
             orders=orders,
             n_live=n_live,
+            quick=method == "quick",
             prior=calibration.paper_prior if paper else calibration.default_prior,
             stop=NESTED_STOP[nested_stop or "change"] if paper else None,
             refined=not paper,

@@ -96,6 +96,19 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
     assert not (out / "report.html").exists()
 
 
+@pytest.mark.parametrize(("option", "quick"), [((), False), (("--method", "quick"), True)])
+def test_a_calibration_is_quick_where_asked(option, quick, recording_file, tmp_path, monkeypatch):
+    asked = []
+
+    def stop(*_, **options):
+        asked.append(options["quick"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("probewise.calibration.calibrate", stop)
+    assert run("calibrate", recording_file, "--out", tmp_path / "out", *option) == 130
+    assert asked == [quick]
+
+
 def test_a_calibration_that_is_stopped_writes_nothing(recording_file, tmp_path, monkeypatch, capsys):
     def stop(*_, **__):
         raise KeyboardInterrupt

@@ -4,9 +4,12 @@ Paper, sections "Estimating SSF MoG Model Parameters" and "Light Sensor SSF MoG 
 and "studentT", the table of log evidences, and the weighted mean of sampled SSF fields.
 """
 
+from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
-from probewise.calibration.fit import Calibration, OrderFit, calibrate, problem_for
+from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
+from probewise.calibration.order_search import Found
+from probewise.calibration.posing import problem_for
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,
@@ -22,11 +25,14 @@ from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 
 __all__ = [
     "Calibration",
+    "Climb",
     "FittedSensor",
+    "Found",
     "OrderEvidence",
     "OrderFit",
     "PriorRow",
     "Quantity",
+    "Rung",
     "SSFPrior",
     "ScanGeometry",
     "ScanNoise",

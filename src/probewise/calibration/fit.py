@@ -15,57 +15,57 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
-from probewise._kinds import require_rng, require_whole
-from probewise.calibration.distinct import DistinctRows
+from probewise._kinds import require_flag, require_rng, require_whole
+from probewise.calibration.climb import Climb
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field, mixture_moments
+from probewise.calibration.ladder import climb_orders
 from probewise.calibration.noise import noise_by_scan, pooled_sd
+from probewise.calibration.order_search import Found, Progress, search_order
+from probewise.calibration.posing import Posing
 from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
-from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
-from probewise.inference import SensorProblem, sd_ceiling, sd_floor, student_t
-from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
+from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.inference import SensorProblem, sd_ceiling, sd_floor
+from probewise.nested import NestedResult, StopRule, Weighted
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_described, require_recording
-from probewise.scene import KnownScene
-from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture, SSFField
+from probewise.sensor import SSFField
 
-__all__ = ["Calibration", "OrderFit", "calibrate", "problem_for"]
+__all__ = ["Calibration", "OrderFit", "calibrate"]
 
 _N_SAMPLES = 1000
-_N_DRAWS = 8000
-# Two estimates of the evidence this many errors apart disagree: one false alarm in 16 000.
-_DISAGREE = 4.0
 # Ratio of posterior to prior sd above which the recording is not informative.
 _UNINFORMED = 0.7
 
 
 @dataclass(frozen=True, eq=False)
 class OrderFit:
-    """The fit of an SSF of `n_gaussians` Gaussians: prior, nested sampling run, fitted sensor.
-
-    `refined` holds the evidence by importance sampling, an independent estimate, more precise where it is sound; None
-    where nested sampling alone was asked for.
-    """
+    """The fit of an SSF of `n_gaussians` Gaussians: prior, evidence and posterior samples, fitted sensor."""
 
     n_gaussians: int
     prior: SSFPrior
-    result: NestedResult
-    refined: Weighted | None
+    found: Found
     sensor: FittedSensor
+
+    @property
+    def result(self) -> NestedResult | Climb:
+        """The posterior samples: a nested sampling run, or a climb of a quick calibration."""
+        return self.found.result
+
+    @property
+    def refined(self) -> Weighted | None:
+        """The evidence of a nested sampling run refined by importance sampling; None where that was not done."""
+        return self.found.refined
 
     @property
     def log_z(self) -> float:
         """Natural log of the evidence: the refined estimate where it is sound."""
-        return self._best.log_z
+        return self.found.evidence.log_z
 
     @property
     def log_z_error(self) -> float:
         """Standard error of log Z."""
-        return self._best.log_z_error
-
-    @property
-    def _best(self) -> Weighted | NestedResult:
-        return self.result if self.refined is None or not self.refined.sound else self.refined
+        return self.found.evidence.log_z_error
 
     @property
     def field(self) -> SSFField:
@@ -116,34 +116,14 @@ class Calibration(ShowsItself):
         return self.sensor.summary()
 
 
-def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
-    """Make the inference problem of one order: a chain over known patterns, Student-t with one sigma per data set.
-
-    Parameters
-    ----------
-    recording
-        The readings.
-    prior
-        Prior of the order's parameters.
-    data_sets
-        Data set of each row, (n_points,) from 0; default: its scan.
-    """
-    plan = recording.plan
-    groups = plan.scan if data_sets is None else np.asarray(data_sets)
-    if groups.shape != (len(plan),):
-        raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
-    # The error at curved edges, 1e-4 of I_max - I_min, is below a tenth of the least noise sd of the prior.
-    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
-    return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)
-
-
 def calibrate(
     recording: Recording,
     *,
     orders: Sequence[int] = (1, 2, 3, 4),
     n_live: int = 300,
     rng: np.random.Generator,
-    progress: Callable[[int, RoundSummary], None] | None = None,
+    quick: bool = False,
+    progress: Progress | None = None,
     prior: Callable[[Recording, int], SSFPrior] = default_prior,
     stop: StopRule | None = None,
     refined: bool = True,
@@ -164,8 +144,12 @@ def calibrate(
         Live points of nested sampling.
     rng
         Source of randomness; spawned for each order.
+    quick
+        Whether to search the prior of one Gaussian alone and climb from each order to the next by sequential Monte
+        Carlo. An order whose climb is doubtful is searched by nested sampling, and a note says so.
     progress
-        Called with the order and a `RoundSummary` after every round; not with a process pool.
+        Called with the order and a `RoundSummary` after every round, or a `Rung` after every temperature of a climb;
+        not with a process pool.
     prior
         Function that makes the prior from the recording and an order; `paper_prior` is the paper's.
     stop
@@ -203,24 +187,24 @@ def calibrate(
     require_whole("n_live", n_live)
     wanted = _orders(orders)
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
-    one = partial(
-        _fit_order,
-        recording,
-        n_live=n_live,
-        progress=progress,
-        prior=prior,
-        stop=stop,
-        refined=refined,
-        data_sets=data_sets,
-        pixel_mm=pixel_mm,
-        n_samples=n_samples,
-    )
+    require_flag("quick", quick)
+    if quick and not refined:
+        raise ParameterError("refined", refined, "True with quick=True, which starts from a refined evidence")
+    posing = Posing(recording, prior, data_sets)
+    search = partial(search_order, posing, n_live=n_live, stop=stop, refined=refined, progress=progress)
+    one = partial(_fit_order, posing, search, pixel_mm=pixel_mm, n_samples=n_samples)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
+    climbed: dict[int, Found] = {}
+    why: tuple[str, ...] = ()
+    if quick:
+        climbing = rng.spawn(1)[0]
+        climbed, why = climb_orders(posing, wanted, n_live=n_live, rng=climbing, progress=progress, executor=executor)
+    each = {n: partial(one, n, streams[n], found=climbed.get(n), why=why) for n in wanted}
     if executor is None:
-        fits = [one(n, stream) for n, stream in streams.items()]
+        fits = [fit() for fit in each.values()]
     else:
         # The costliest order first, so that no worker waits for it at the end.
-        running = {n: executor.submit(one, n, streams[n]) for n in sorted(wanted, reverse=True)}
+        running = {n: executor.submit(each[n]) for n in sorted(wanted, reverse=True)}
         fits = [running[n].result() for n in wanted]
     table = tuple(OrderEvidence(fit.n_gaussians, fit.log_z, fit.log_z_error) for fit in fits)
     close = _close_call(table)
@@ -244,68 +228,44 @@ def _orders(orders: object) -> tuple[int, ...]:
 
 
 def _fit_order(
-    recording: Recording,
+    posing: Posing,
+    search: Callable[[int, np.random.Generator], Found],
     n_gaussians: int,
     rng: np.random.Generator,
     *,
-    n_live: int,
-    progress: Callable[[int, RoundSummary], None] | None,
-    prior: Callable[[Recording, int], SSFPrior],
-    stop: StopRule | None,
-    refined: bool,
-    data_sets: IntArray | None,
+    found: Found | None,
+    why: tuple[str, ...],
     pixel_mm: float | None,
     n_samples: int,
 ) -> OrderFit:
-    """Fit one order; at module level, so that another process can run it."""
+    """Fit one order, searching it if it is not found yet; at module level, so that another process can run it."""
+    recording = posing.recording
     geometry = scan_geometry(recording)
     n_usable = int(recording.usable.sum())
     notes: tuple[str, ...] = ()
     if n_usable < 6 * n_gaussians + 2:
         notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the result depends on the prior",)
         warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
-    order_prior = prior(recording, n_gaussians)
-    problem = problem_for(recording, order_prior, data_sets=data_sets)
-    report = None if progress is None else _for_order(progress, n_gaussians)
-    result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
-    more_precise = None
-    if refined:
-        more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
-        notes = (*notes, *_disagreement(n_gaussians, result, more_precise))
-    else:
-        notes = (*notes, f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}")
+    if found is None:
+        found = search(n_gaussians, rng)
+        notes = (*notes, *why)
     sensor = _fitted(
         recording,
-        problem,
-        result,
+        posing.problem(n_gaussians),
+        found.result,
         n_samples=n_samples,
         pixel_mm=pixel_mm,
         step_mm=geometry.step_mm,
-        notes=notes,
+        notes=(*notes, *found.notes),
         rng=rng,
     )
-    return OrderFit(n_gaussians, order_prior, result, more_precise, sensor)
-
-
-def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
-    """Say so where the two estimates of an evidence do not agree within their errors."""
-    apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
-    if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
-        return ()
-    return (
-        f"two estimates of the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
-        f"{result.log_z_error:.2f} and {refined.log_z:.2f} ± {refined.log_z_error:.2f}; use more live points",
-    )
-
-
-def _for_order(progress: Callable[[int, RoundSummary], None], n_gaussians: int) -> Callable[[RoundSummary], None]:
-    return lambda state: progress(n_gaussians, state)
+    return OrderFit(n_gaussians, posing.belief(n_gaussians), found, sensor)
 
 
 def _fitted(
     recording: Recording,
     problem: SensorProblem,
-    result: NestedResult,
+    result: NestedResult | Climb,
     *,
     n_samples: int,
     pixel_mm: float | None,
@@ -313,7 +273,7 @@ def _fitted(
     notes: tuple[str, ...],
     rng: np.random.Generator,
 ) -> FittedSensor:
-    """Make the fitted sensor of a nested sampling run."""
+    """Make the fitted sensor of posterior samples."""
     prior = problem.prior
     if not isinstance(prior, SSFPrior):
         raise ParameterError("prior", prior, "an SSFPrior")

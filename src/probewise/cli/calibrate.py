@@ -35,10 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--method",
-        choices=("refined", "paper"),
+        choices=("refined", "quick", "paper"),
         default=CALIBRATION,
         help="refined (default): widths evenly probable over orders of magnitude, each evidence refined by importance "
-        "sampling; or as in the paper: uniform priors, the evidence of nested sampling alone",
+        "sampling; quick: the same prior, but only one Gaussian is searched for, more are reached by sequential Monte "
+        "Carlo; or as in the paper: uniform priors, the evidence of nested sampling alone",
     )
     parser.add_argument(
         "--nested-stop",

@@ -1,0 +1,123 @@
+"""Hold `calibrate(quick=True)` against itself over seeds, and against nested sampling of every order.
+
+python benchmarks/quick_calibration.py --seeds 12 --sensors 2 --seed 28 --out docs/results/quick_calibration.json
+
+`--seeds` climbs on the shipped paper recording tell whether the stated errors cover the scatter: chi-square a
+run, about the log of the mean evidence. `--sensors` concealed sensors of one Gaussian, and as many of two, are
+calibrated both ways: differences in units of both errors, the chosen orders, and cpu seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from probewise import __version__
+from probewise.calibration import Calibration, calibrate, default_prior
+from probewise.calibration.coverage import draw_truth, simulate_truth
+from probewise.calibration.ladder import next_order
+from probewise.calibration.order_search import search_order
+from probewise.calibration.posing import Posing
+from probewise.errors import DoubtfulResultWarning
+from probewise.recordings import Recording, paper_plan, read_recording, shipped, write_text_atomically
+from probewise.world import Blob, World, gaussian_spot
+
+
+def timed(recording: Recording, rng: np.random.Generator, *, quick: bool) -> dict[str, object]:
+    """Calibrate; keep evidences, errors, evaluations and cpu seconds."""
+    began = time.process_time()
+    found: Calibration = calibrate(recording, quick=quick, rng=rng)
+    return {
+        "cpu_s": round(time.process_time() - began, 1),
+        "log_z": [round(o.log_z, 3) for o in found.orders],
+        "log_z_error": [round(o.log_z_error, 3) for o in found.orders],
+        "n_calls": [fit.result.n_calls for fit in found.fits],
+        "chosen": found.chosen.n_gaussians,
+        "notes": sorted({note for fit in found.fits for note in fit.sensor.notes}),
+    }
+
+
+def climbs(recording: Recording, rng: np.random.Generator) -> dict[str, object]:
+    """Climb to four Gaussians, without the search of the highest order that vouches for it."""
+    began = time.process_time()
+    posing = Posing(recording, default_prior)
+    found = [search_order(posing, 1, rng, n_live=100, progress=None)]
+    for n in (2, 3, 4):
+        found.append(next_order(posing, n, found[-1], rng, n_live=300, progress=None))
+    return {
+        "cpu_s": round(time.process_time() - began, 1),
+        "log_z": [round(one.evidence.log_z, 3) for one in found],
+        "log_z_error": [round(one.evidence.log_z_error, 3) for one in found],
+        "n_calls": [one.result.n_calls for one in found],
+        "notes": [note for one in found for note in one.notes],
+    }
+
+
+def two_lobes(rng: np.random.Generator) -> Recording:
+    """Record with a sensor of two Gaussians, 4 to 12 mm apart."""
+    half, angle = rng.uniform(2, 6), rng.uniform(0, np.pi)
+    u, v = half * np.cos(angle), half * np.sin(angle)
+    spot = gaussian_spot([Blob(0.5, (u, v), (2.5, 3.0)), Blob(0.5, (-u, -v), (2.5, 3.0))])
+    return World(spot, noise_sd=0.4).simulate(paper_plan(), rng=rng)
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--sensors", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=28)
+    parser.add_argument("--out", type=Path, required=True)
+    asked = parser.parse_args()
+    warnings.simplefilter("ignore", DoubtfulResultWarning)
+    rng = np.random.default_rng(asked.seed)
+    paper = read_recording(shipped("paper"))
+    document: dict[str, object] = {
+        "command": f"benchmarks/quick_calibration.py --seeds {asked.seeds} --sensors {asked.sensors} "
+        f"--seed {asked.seed}",
+        "date": datetime.date.today().isoformat(),
+        "version": __version__,
+    }
+
+    def save() -> None:
+        write_text_atomically(asked.out, json.dumps(document, indent=1) + "\n")
+
+    runs: list[dict[str, object]] = []
+    for stream in tqdm(rng.spawn(asked.seeds), desc="seeds"):
+        runs.append(climbs(paper, stream))
+        document["paper"] = {"runs": runs, **scatter(runs)}
+        save()
+    pairs: list[dict[str, object]] = []
+    for stream in tqdm(rng.spawn(asked.sensors), desc="sensors"):
+        for kind in ("one", "two"):
+            recording = simulate_truth(draw_truth(rng=stream), rng=stream) if kind == "one" else two_lobes(stream)
+            quick, full = (timed(recording, stream, quick=way) for way in (True, False))
+            apart = np.subtract(quick["log_z"], full["log_z"])  # type: ignore[arg-type]
+            error = np.hypot(quick["log_z_error"], full["log_z_error"])  # type: ignore[call-overload]
+            pairs.append({"gaussians": kind, "quick": quick, "full": full, "z": np.round(apart / error, 2).tolist()})
+            document["sensors"] = pairs
+            save()
+
+
+def scatter(runs: list[dict[str, object]]) -> dict[str, list[float]]:
+    """Tell how the runs scatter beside their errors, by order."""
+    log_z, error = (np.array([run[key] for run in runs], dtype=float) for key in ("log_z", "log_z_error"))
+    mean = np.log(np.mean(np.exp(log_z - log_z.max()), axis=0)) + log_z.max()
+    spread = log_z.std(axis=0, ddof=1) if len(runs) > 1 else np.zeros(log_z.shape[1])
+    return {
+        "log_mean_z": np.round(mean, 3).tolist(),
+        "sd": np.round(spread, 3).tolist(),
+        "rms_error": np.round(np.sqrt((error**2).mean(axis=0)), 3).tolist(),
+        "chi2_a_run": np.round((((log_z - mean) / error) ** 2).mean(axis=0), 2).tolist(),
+    }
+
+
+if __name__ == "__main__":
+    main()

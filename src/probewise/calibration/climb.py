@@ -1,0 +1,299 @@
+"""Climb from the posterior of N - 1 Gaussians to that of N by sequential Monte Carlo (Del Moral, Doucet & Jasra 2006).
+
+Particles drawn from a `Reference` are carried in small changes of temperature to the posterior of N: weighed,
+resampled, and moved by Metropolis steps. They form clouds that are weighed and resampled each by itself, so that
+the scatter of the clouds' evidences is an honest error: it holds what one cloud found and another missed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._display import ShowsItself
+from probewise.calibration.reference import Reference
+from probewise.inference import SensorProblem
+from probewise.nested.weights import n_effective, resampled
+
+__all__ = ["Climb", "Rung", "climb"]
+
+# Effective share of the particles that a change of temperature leaves.
+_KEPT = 0.5
+_N_STEPS = 20
+_BISECTIONS = 40
+# A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
+_MOST_TEMPERATURES = 12
+# A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', a fresh last one, a split.
+_BLOCK_FROM, _FRESH_FROM, _SPLIT_FROM = 0.4, 0.8, 0.9
+_WHOLE_JUMP = 0.1
+_JITTER = 1e-5
+# Doubt the clouds where they agree less than this.
+_MOST_ERROR = 0.5
+_LEAST_CLOUDS = 0.3
+_LEAST_ACCEPTED = 0.02
+
+
+@dataclass(frozen=True)
+class Rung:
+    """Show how far a climb has come: temperature from 0 to 1, ln Z so far, likelihood evaluations so far."""
+
+    temperature: float
+    log_z: float
+    n_calls: int
+
+
+@dataclass(frozen=True, eq=False)
+class Climb(ShowsItself):
+    """Weighted samples of a posterior and its evidence, by sequential Monte Carlo.
+
+    Attributes
+    ----------
+    names
+        Parameters, one a column of theta.
+    theta
+        Samples, (n, n_params), cloud after cloud, the Gaussians sorted by mass.
+    log_likelihood, log_weight
+        Of each, (n,); the weights sum to one.
+    log_z_of_clouds
+        Natural log of the evidence from each cloud, (n_clouds,).
+    start_error
+        Standard error of ln Z of the order that the first climb began with.
+    temperatures
+        From 0, the reference, to 1, the posterior, (n_temperatures,).
+    accepted
+        Share of the moves accepted at the last temperature.
+    n_calls
+        Likelihood evaluations, those of the order below included.
+    """
+
+    names: tuple[str, ...]
+    theta: FloatArray
+    log_likelihood: FloatArray
+    log_weight: FloatArray
+    log_z_of_clouds: FloatArray
+    start_error: float
+    temperatures: FloatArray
+    accepted: float
+    n_calls: int
+
+    def __post_init__(self) -> None:
+        for name in ("theta", "log_likelihood", "log_weight", "log_z_of_clouds", "temperatures"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def log_z(self) -> float:
+        """Natural log of the evidence: that of the clouds' mean."""
+        return float(logsumexp(self.log_z_of_clouds)) - math.log(len(self.log_z_of_clouds))
+
+    @property
+    def log_z_error(self) -> float:
+        """Standard error of log Z, from the scatter of the clouds."""
+        relative = np.exp(self.log_z_of_clouds - self.log_z)
+        return math.hypot(float(relative.std(ddof=1)) / math.sqrt(len(relative)), self.start_error)
+
+    @property
+    def weight(self) -> FloatArray:
+        """Posterior weights, summing to one, (n,)."""
+        return np.asarray(np.exp(self.log_weight))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the evidence is not to be trusted, in words; empty where nothing speaks against it."""
+        share = n_effective(self.log_z_of_clouds) / len(self.log_z_of_clouds)
+        told = (
+            (self.temperatures[-1] != 1.0, f"the posterior was not reached in {_MOST_TEMPERATURES} temperatures"),
+            (not self.log_z_error < _MOST_ERROR, f"the error of ln Z is {self.log_z_error:.2f}"),
+            (not share >= _LEAST_CLOUDS, f"{len(self.log_z_of_clouds)} clouds are worth {share:.0%} of them"),
+            (not self.accepted >= _LEAST_ACCEPTED, f"{self.accepted:.1%} of the moves were accepted"),
+        )
+        return tuple(words for so, words in told if so)
+
+    def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
+        return np.asarray(self.theta[rng.permutation(resampled(self.weight, n, rng))])
+
+    def summary(self) -> str:
+        """Describe evidence and cost in plain text."""
+        lines = [
+            f"log Z        {self.log_z:.3f} ± {self.log_z_error:.3f}",
+            f"samples      {len(self.theta)} in {len(self.log_z_of_clouds)} clouds",
+            f"cost         {self.n_calls} likelihood evaluations, {len(self.temperatures) - 1} temperatures",
+        ]
+        return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    """Particles in coordinates, (n, d): log density of prior, log likelihood, log reference over the prior, (n,)."""
+
+    x: FloatArray
+    log_prior: FloatArray
+    log_likelihood: FloatArray
+    log_reference: FloatArray
+
+    def take(self, rows: IntArray) -> _Cloud:
+        return _Cloud(self.x[rows], self.log_prior[rows], self.log_likelihood[rows], self.log_reference[rows])
+
+    def put(self, rows: IntArray, other: _Cloud) -> _Cloud:
+        out = self.take(np.arange(len(self.x)))
+        out.x[rows], out.log_prior[rows] = other.x, other.log_prior
+        out.log_likelihood[rows], out.log_reference[rows] = other.log_likelihood, other.log_reference
+        return out
+
+    def tempered(self, beta: float) -> FloatArray:
+        return np.asarray(self.log_prior + beta * self.log_likelihood + (1.0 - beta) * self.log_reference)
+
+
+def climb(
+    problem: SensorProblem,
+    reference: Reference,
+    rest: FloatArray,
+    *,
+    log_z_below: FloatArray,
+    error_below: float,
+    n_calls_below: int = 0,
+    rng: np.random.Generator,
+    n_steps: int = _N_STEPS,
+    told: Callable[[Rung], None] | None = None,
+) -> Climb:
+    """Climb to the posterior of N Gaussians.
+
+    Parameters
+    ----------
+    problem
+        Of N Gaussians.
+    reference
+        What the particles are drawn from, made for N.
+    rest
+        Samples of the posterior of N - 1, sorted by mass, (n, 6 N - 4), cloud after cloud.
+    log_z_below
+        Natural log of the evidence of N - 1 from each cloud, (n_clouds,); n_clouds divides n.
+    error_below
+        Standard error of what the clouds have in common of it.
+    n_calls_below
+        Likelihood evaluations so far.
+    rng
+        Source of randomness.
+    n_steps
+        Moves of each particle at each temperature.
+    told
+        Called after every temperature.
+    """
+    space = reference.prior.coordinates
+    n_calls = n_calls_below
+
+    def known(x: FloatArray) -> _Cloud:
+        nonlocal n_calls
+        theta, log_prior = space.leave(x)
+        # What is impossible weighs nothing, but was drawn.
+        log_likelihood, log_reference = np.full(len(x), -np.inf), np.zeros(len(x))
+        possible = np.flatnonzero(np.isfinite(log_prior))
+        if possible.size:
+            n_calls += 2 * possible.size
+            log_likelihood[possible] = problem.log_likelihood(theta[possible])
+            log_reference[possible] = reference.log_likelihood(theta[possible])
+        return _Cloud(x, log_prior, log_likelihood, log_reference)
+
+    n_clouds = len(log_z_below)
+    n = len(rest) // n_clouds
+    log_z = np.array(log_z_below)
+    with np.errstate(invalid="ignore"):
+        now = known(space.enter(reference.draw(rest, rng=rng)))
+    temperatures, accepted = [0.0], 0.0
+    while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
+        rise = now.log_likelihood - now.log_reference
+        beta = _next(rise, temperatures[-1])
+        log_weight = ((beta - temperatures[-1]) * rise).reshape(n_clouds, n)
+        log_z += logsumexp(log_weight, axis=1) - math.log(n)
+        if not np.isfinite(log_z).all():
+            break
+        weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
+        now = now.take(np.concatenate([k * n + resampled(own, n, rng) for k, own in enumerate(weight)]))
+        temperatures.append(beta)
+        shares = []
+        for _ in range(n_steps):
+            now, share = _moved(now, known, reference, beta, rng)
+            shares.append(share)
+        accepted = float(np.mean(shares))
+        if told is not None:
+            told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
+    theta, _ = space.leave(now.x)
+    return Climb(
+        names=reference.prior.names,
+        theta=theta,
+        log_likelihood=now.log_likelihood,
+        log_weight=np.repeat(log_z - float(logsumexp(log_z)) - math.log(n), n),
+        log_z_of_clouds=log_z,
+        start_error=error_below,
+        temperatures=np.array(temperatures),
+        accepted=accepted,
+        n_calls=n_calls,
+    )
+
+
+def _next(rise: FloatArray, beta: float) -> float:
+    """Find the next temperature: that whose weights leave `_KEPT` of the particles."""
+    if n_effective((1.0 - beta) * rise) >= _KEPT * len(rise):
+        return 1.0
+    # What is impossible is lost at any temperature.
+    least = _KEPT * float(np.isfinite(rise).sum())
+    low, high = beta, 1.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if n_effective((middle - beta) * rise) >= least else (low, middle)
+    return high
+
+
+def _moved(
+    now: _Cloud, known: Callable[[FloatArray], _Cloud], reference: Reference, beta: float, rng: np.random.Generator
+) -> tuple[_Cloud, float]:
+    """Move each particle once, one half after the other; tell the share of moves accepted.
+
+    Differences of two particles of one half are the directions of the other (differential evolution, ter Braak 2006).
+    """
+    n, d = now.x.shape
+    n_gaussians = (d - 2) // 6
+    space = reference.prior.coordinates
+    block_of = np.minimum(np.arange(d) // 6, n_gaussians)
+    jitter = _JITTER * now.x.std(axis=0)
+    order = rng.permutation(n)
+    n_accepted = 0
+    for half in (0, 1):
+        own, other = order[half::2], order[1 - half :: 2]
+        m = len(own)
+        kind = rng.random(m)
+        old = now.take(own)
+        in_block = block_of == rng.integers(n_gaussians + 1, size=m)[:, None]
+        by_block = kind > _BLOCK_FROM
+        scale = 2.38 / math.sqrt(2 * d) * np.exp(0.4 * rng.standard_normal(m))
+        scale *= np.where(by_block, math.sqrt(d / 6), 1.0)
+        scale[rng.random(m) < _WHOLE_JUMP] = 1.0
+        one, two = rng.choice(other, (2, m))
+        step = scale[:, None] * (now.x[one] - now.x[two]) + jitter * rng.standard_normal((m, d))
+        x = old.x + np.where(by_block[:, None] & ~in_block, 0.0, step)
+        fresh = np.flatnonzero(kind > _FRESH_FROM)
+        here, _ = space.leave(old.x[fresh])
+        split = kind[fresh] > _SPLIT_FROM
+        there = np.where(
+            split[:, None],
+            reference.split(reference.merged(here), rng=rng),
+            reference.with_last(reference.without_last(here), rng=rng),
+        )
+        with np.errstate(invalid="ignore"):
+            x[fresh] = space.enter(there)
+            new = known(x)
+            log_accept = new.tempered(beta) - old.tempered(beta)
+            # A fresh Gaussian comes from the reference's density: only the rest of the target counts.
+            drawn_here = np.where(split, reference.log_split(here), reference.log_added(here))
+            drawn_there = np.where(split, reference.log_split(there), reference.log_added(there))
+            log_accept[fresh] += drawn_here - drawn_there + old.log_prior[fresh] - new.log_prior[fresh]
+            log_accept[fresh[~np.isfinite(drawn_there)]] = -np.inf
+            better = np.log(rng.random(m)) < log_accept
+        n_accepted += int(better.sum())
+        now = now.put(own[better], new.take(np.flatnonzero(better)))
+    return now, n_accepted / n

@@ -1,0 +1,74 @@
+"""Find the evidence and the posterior of one order by searching its whole prior."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise.calibration.climb import Climb, Rung
+from probewise.calibration.posing import Posing
+from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
+
+__all__ = ["Found", "Progress", "search_order"]
+
+Progress = Callable[[int, RoundSummary | Rung], None]
+
+_N_DRAWS = 8000
+# Two estimates of the evidence this many errors apart disagree: one false alarm in 16 000.
+_DISAGREE = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Posterior samples and evidence of an order, before a sensor is made of them.
+
+    `result` is a nested run or a climb; `refined` the evidence of a nested run by importance sampling.
+    """
+
+    result: NestedResult | Climb
+    refined: Weighted | None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def evidence(self) -> NestedResult | Climb | Weighted:
+        """What log Z is taken from: the refined one where it is sound."""
+        return self.refined if self.refined is not None and self.refined.sound else self.result
+
+
+def search_order(
+    posing: Posing,
+    n_gaussians: int,
+    rng: np.random.Generator,
+    *,
+    n_live: int,
+    stop: StopRule | None = None,
+    refined: bool = True,
+    progress: Progress | None = None,
+) -> Found:
+    """Search the prior of an order by nested sampling, and refine the evidence unless asked not to."""
+    problem = posing.problem(n_gaussians)
+    report = None if progress is None else _for_order(progress, n_gaussians)
+    result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
+    if not refined:
+        note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
+        return Found(result, None, (note,))
+    more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
+    return Found(result, more_precise, _disagreement(n_gaussians, result, more_precise))
+
+
+def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
+    """Say so where the two estimates of an evidence do not agree within their errors."""
+    apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
+    if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
+        return ()
+    return (
+        f"two estimates of the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "
+        f"{result.log_z_error:.2f} and {refined.log_z:.2f} ± {refined.log_z_error:.2f}; use more live points",
+    )
+
+
+def _for_order(progress: Progress, n_gaussians: int) -> Callable[[RoundSummary], None]:
+    return lambda state: progress(n_gaussians, state)

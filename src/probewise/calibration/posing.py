@@ -1,0 +1,60 @@
+"""Pose the calibration of one order as a problem of inference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise.calibration.distinct import DistinctRows
+from probewise.calibration.priors import SSFPrior
+from probewise.errors import ParameterError, ShapeError
+from probewise.inference import SensorProblem, student_t
+from probewise.recordings import Recording
+from probewise.scene import KnownScene
+from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+
+__all__ = ["Posing", "problem_for"]
+
+
+@dataclass(frozen=True, eq=False)
+class Posing:
+    """A recording, what is believed of each order before it, and which readings share a noise sd."""
+
+    recording: Recording
+    prior: Callable[[Recording, int], SSFPrior]
+    data_sets: IntArray | None = None
+
+    def belief(self, n_gaussians: int) -> SSFPrior:
+        """Give the prior of an order."""
+        found = self.prior(self.recording, n_gaussians)
+        if not isinstance(found, SSFPrior):
+            raise ParameterError("prior", found, "an SSFPrior")
+        return found
+
+    def problem(self, n_gaussians: int) -> SensorProblem:
+        """Pose an order."""
+        return problem_for(self.recording, self.belief(n_gaussians), data_sets=self.data_sets)
+
+
+def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
+    """Make the inference problem of one order: a chain over known patterns, Student-t with one sigma per data set.
+
+    Parameters
+    ----------
+    recording
+        The readings.
+    prior
+        Prior of the order's parameters.
+    data_sets
+        Data set of each row, (n_points,) from 0; default: its scan.
+    """
+    plan = recording.plan
+    groups = plan.scan if data_sets is None else np.asarray(data_sets)
+    if groups.shape != (len(plan),):
+        raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
+    # The error at curved edges, 1e-4 of I_max - I_min, is below a tenth of the least noise sd of the prior.
+    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
+    return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)

@@ -1,0 +1,236 @@
+"""A density of N Gaussians to start from: the posterior of N - 1 with one more Gaussian, lighter than they are.
+
+The new one is added to the others, or taken out of the first so that light, centre and covariance of the two stay
+(split and merge moves: Richardson & Green 1997).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp, ndtr, ndtri
+
+from probewise._arrays import FloatArray
+from probewise.calibration.priors import SSFPrior
+from probewise.errors import ParameterError
+from probewise.inference import SensorProblem
+from probewise.priors import Uniform
+
+__all__ = ["Reference", "has_reference"]
+
+# Share of the new Gaussians that lie near one of the others, and how near: of the cube's side, in precision and
+# correlation; in place, by the other's own width.
+_NEAR = 0.25
+_NEAR_PRECISION = 0.12
+_NEAR_CORRELATION = 0.2
+_LEAST_WIDTH, _MOST_WIDTH = 0.005, 1.0
+# The new mass over the least of the others': a share uniform, the rest log-uniform above the least ratio.
+_EVEN_MASS = 0.3
+_LEAST_RATIO = 1e-4
+_SHAPE = slice(1, 6)
+# Share of the draws that split the first Gaussian instead.
+_SPLIT = 0.3
+_TINY = float(np.finfo(float).tiny)
+
+
+def has_reference(prior: SSFPrior) -> bool:
+    """Whether the light that a Gaussian holds is uniform from nothing: what `Reference` is made for."""
+    return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The posterior of N - 1 Gaussians with one more, lighter than each of them.
+
+    Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N
+    the prior of N unsorted Gaussians, L the likelihood and Z the evidence of N - 1, the density mixes two:
+
+    - One is added. With m the least mass of the N - 1 in the prior's unit and r the new one's density over its prior's
+      below m: N! p_N L r / (N m Z). r mixes Gaussians of the prior, light ones more often, and some near one of the
+      others.
+    - The first is split. The moments of the first (mass, mass times centre, mass times second moment) lose those of
+      the new one, which lies near it; at a fixed new one that is a shift, so volumes of moments stay.
+
+    Both integrate to one, so that the evidence of N over that of N - 1 is the mean of posterior density over
+    reference, both without their Z, over draws from the reference.
+
+    Parameters
+    ----------
+    prior
+        Of N Gaussians, 2 or more, with uniform mass; see `has_reference`.
+    below
+        Problem of N - 1 Gaussians.
+    """
+
+    prior: SSFPrior
+    below: SensorProblem
+
+    def __post_init__(self) -> None:
+        if self.prior.n_gaussians < 2 or not has_reference(self.prior):
+            raise ParameterError("prior", self.prior, "of 2 Gaussians or more, mass uniform from 0 to 1 unit")
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
+        added = self.below.log_likelihood(self.without_last(theta)) + self.log_added(theta) + math.log(1.0 - _SPLIT)
+        log_split = self.log_split(theta)
+        possible = np.flatnonzero(log_split > -np.inf)
+        if possible.size:
+            log_split[possible] += self.below.log_likelihood(self.merged(theta[possible])) + math.log(_SPLIT)
+        return np.asarray(np.logaddexp(added, log_split) - math.log(self.prior.n_gaussians))
+
+    def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw one Gaussian more for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
+        split = rng.random(len(rest)) < _SPLIT
+        return np.where(split[:, None], self.split(rest, rng=rng), self.with_last(rest, rng=rng))
+
+    def without_last(self, theta: FloatArray) -> FloatArray:
+        """Leave out the last Gaussian, (n, 6 N + 2) -> (n, 6 N - 4)."""
+        return np.concatenate([theta[:, :-8], theta[:, -2:]], axis=1)
+
+    def with_last(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Add a Gaussian drawn from r to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
+        n, others = len(rest), self.prior.n_gaussians - 1
+        u = rng.random((n, len(self.prior.names)))
+        near = rng.random(n) < _NEAR
+        centre, width = self._places(rest)
+        chosen = np.arange(n), rng.integers(others, size=n)
+        u[:, _SHAPE] = np.where(near[:, None], _drawn_near(centre[chosen], width[chosen], rng), u[:, _SHAPE])
+        ratio = np.where(near, 1.0 - rng.random(n), _drawn_ratio(n, rng))
+        last = self.prior.from_unit_cube(u)[:, :6]
+        last[:, 0] = ratio * self._masses(rest).min(axis=1) * self._scale(last)
+        return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
+
+    def log_added(self, theta: FloatArray) -> FloatArray:
+        """Log of r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
+        mass = self._masses(theta)
+        least = mass[:, :-1].min(axis=1)
+        centre, width = self._places(theta)
+        near = logsumexp(_log_near(centre[:, -1:], centre[:, :-1], width[:, :-1]), axis=1)
+        near -= math.log(self.prior.n_gaussians - 1)
+        anywhere = _log_ratio_density(mass[:, -1] / least)
+        return np.asarray(np.logaddexp(math.log(1.0 - _NEAR) + anywhere, math.log(_NEAR) + near) - np.log(least))
+
+    def split(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Take the last Gaussian out of the first, (n, 6 N - 4) -> (n, 6 N + 2); nan where no Gaussian is left."""
+        n = len(rest)
+        u = rng.random((n, len(self.prior.names)))
+        centre, width = self._places(rest)
+        u[:, _SHAPE] = _drawn_near(centre[:, 0], width[:, 0], rng)
+        last = self.prior.from_unit_cube(u)[:, :6]
+        last[:, 0] = _drawn_ratio(n, rng) * _most_split(self._masses(rest)) * self._scale(last)
+        first = self._from_moments(self._moments(rest[:, :6]) - self._moments(last))
+        out = np.concatenate([first, rest[:, 6:-2], last, rest[:, -2:]], axis=1)
+        return np.where(np.isfinite(first).all(axis=1, keepdims=True), out, np.nan)
+
+    def merged(self, theta: FloatArray) -> FloatArray:
+        """Join the last Gaussian to the first, keeping light, centre and covariance, (n, 6 N + 2) -> (n, 6 N - 4)."""
+        first = self._from_moments(self._moments(theta[:, :6]) + self._moments(theta[:, -8:-2]))
+        return np.concatenate([first, theta[:, 6:-8], theta[:, -2:]], axis=1)
+
+    def log_split(self, theta: FloatArray) -> FloatArray:
+        """Log of the density of a split over the prior's, but for the likelihood, (n, 6 N + 2) -> (n,)."""
+        whole = self.merged(theta)
+        masses = self._masses(whole)
+        most = _most_split(masses)
+        ratio = self._masses(theta)[:, -1] / np.maximum(most, _TINY)
+        centre, width = self._places(whole)
+        at = self._places(theta)[0][:, -1]
+        # At a fixed last Gaussian the moments of the first are shifted, so volumes in them stay.
+        found = self._log_prior_of_moments(whole[:, :6], whole) - self._log_prior_of_moments(theta[:, :6], whole)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found += _log_near(at, centre[:, 0], width[:, 0]) + _log_ratio_density(ratio) - np.log(most)
+        return np.where((ratio < 1.0) & (ratio > 0.0) & np.isfinite(found), found, -np.inf)
+
+    def _log_prior_of_moments(self, g: FloatArray, levels_of: FloatArray) -> FloatArray:
+        """Log of one Gaussian's prior density over its moments, up to a constant, (n, 6) -> (n,)."""
+        alone = replace(self.prior, n_gaussians=1)
+        log_det = np.log(np.maximum(g[:, 3] * g[:, 4] - g[:, 5] ** 2, _TINY))
+        log_mass = np.log(g[:, 0] / self._scale(g))
+        log_prob = alone.log_prob_by_kind(g.T[:, None].copy(), levels_of[:, -2], levels_of[:, -1])
+        return np.asarray(log_prob - 5.0 * log_mass + 3.5 * log_det)
+
+    def _moments(self, g: FloatArray) -> FloatArray:
+        """Mass, first and second moments about the origin, (n, 6) -> (n, 6)."""
+        det = g[:, 3] * g[:, 4] - g[:, 5] ** 2
+        u, v = g[:, 1], g[:, 2]
+        ones = np.ones(len(g))
+        each = [ones, u, v, 0.5 * g[:, 4] / det + u * u, 0.5 * g[:, 3] / det + v * v, -0.5 * g[:, 5] / det + u * v]
+        return np.stack(each, axis=1) * (g[:, 0] / self._scale(g))[:, None]
+
+    def _from_moments(self, m: FloatArray) -> FloatArray:
+        """Take a Gaussian from its moments, (n, 6) both ways; nan where there is none."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = m[:, 1] / m[:, 0], m[:, 2] / m[:, 0]
+            uu, vv, uv = m[:, 3] / m[:, 0] - u * u, m[:, 4] / m[:, 0] - v * v, m[:, 5] / m[:, 0] - u * v
+            det = uu * vv - uv * uv
+            real = (m[:, 0] > 0) & (uu > 0) & (vv > 0) & (det > 0)
+            g = np.stack([m[:, 0], u, v, 0.5 * vv / det, 0.5 * uu / det, -0.5 * uv / det], axis=1)
+            g[:, 0] *= self._scale(g)
+        return np.where(real[:, None], g, np.nan)
+
+    def _scale(self, g: FloatArray) -> FloatArray:
+        return self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
+
+    def _masses(self, theta: FloatArray) -> FloatArray:
+        """Masses in the prior's unit, (n, 6 N' + 2) -> (n, N')."""
+        g = theta[:, :-2].reshape(len(theta), -1, 6)
+        return np.asarray(g[..., 0] / self._scale(g))
+
+    def _places(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Place of each Gaussian in its five sides of the prior's cube, (n, N', 5), and the kernel's widths there."""
+        prior = self.prior
+        g = theta[:, :-2].reshape(len(theta), -1, 6)
+        a, b = g[..., 3], g[..., 4]
+        correlation = g[..., 5] / np.sqrt(a * b)
+        sides = [
+            prior.offset_mm.to_unit(g[..., 1]),
+            prior.offset_mm.to_unit(g[..., 2]),
+            prior.precision.to_unit(a),
+            prior.precision.to_unit(b),
+            0.5 + 0.5 * correlation / prior.max_correlation,
+        ]
+        centre = np.stack(sides, axis=-1).clip(0.0, 1.0)
+        span_mm = float(np.ptp(prior.offset_mm.from_unit(np.array([0.0, 1.0]))))
+        sd_mm = np.sqrt(0.5 / (1.0 - correlation**2))[..., None] / np.sqrt(g[..., 3:5])
+        width = np.empty_like(centre)
+        width[..., :2] = (sd_mm / span_mm).clip(_LEAST_WIDTH, _MOST_WIDTH)
+        width[..., 2:4] = _NEAR_PRECISION
+        width[..., 4] = _NEAR_CORRELATION
+        return centre, width
+
+
+def _most_split(masses: FloatArray) -> FloatArray:
+    """Most light that a split may take from the first of N - 1, (n, N - 1) -> (n,): the order must not change."""
+    first, others = masses[:, 0], masses[:, 1:]
+    if not others.shape[1]:
+        return np.asarray(0.5 * first)
+    return np.asarray(np.minimum(np.minimum(0.5 * first, first - others.max(axis=1)), others.min(axis=1)))
+
+
+def _drawn_ratio(n: int, rng: np.random.Generator) -> FloatArray:
+    """Draw ratios of a new mass to the greatest that it may have, (n,)."""
+    ratio = 1.0 - rng.random(n)
+    light = rng.random(n) >= _EVEN_MASS
+    ratio[light] = _LEAST_RATIO ** (1.0 - ratio[light])
+    return ratio
+
+
+def _log_ratio_density(ratio: FloatArray) -> FloatArray:
+    light = (1.0 - _EVEN_MASS) / (-math.log(_LEAST_RATIO) * np.maximum(ratio, _TINY))
+    return np.asarray(np.log(_EVEN_MASS + np.where(ratio > _LEAST_RATIO, light, 0.0)))
+
+
+def _drawn_near(centre: FloatArray, width: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Draw from normal kernels cut off at the cube, (n, 5)."""
+    low, high = ndtr(-centre / width), ndtr((1.0 - centre) / width)
+    return np.asarray((centre + width * ndtri(low + rng.random(centre.shape) * (high - low))).clip(1e-9, 1.0 - 1e-9))
+
+
+def _log_near(at: FloatArray, centre: FloatArray, width: FloatArray) -> FloatArray:
+    """Log density of such a kernel, (..., 5) -> (...,)."""
+    kept = ndtr((1.0 - centre) / width) - ndtr(-centre / width)
+    return np.asarray(
+        (-0.5 * ((at - centre) / width) ** 2 - np.log(width * math.sqrt(2.0 * math.pi) * kept)).sum(axis=-1)
+    )

@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from probewise._arrays import FloatArray
+from probewise.calibration import Climb, Rung, calibrate, default_prior
+from probewise.calibration.climb import climb
+from probewise.calibration.ladder import climb_orders
+from probewise.calibration.posing import Posing
+from probewise.calibration.reference import Reference
+from probewise.errors import ParameterError
+from probewise.inference import SensorProblem
+from probewise.nested import NestedResult, RoundSummary
+from probewise.priors import Uniform
+from probewise.recordings import Recording
+
+
+class _Levels:
+    """Readings that fix the levels alone, as well with any Gaussians: the evidence is that of the levels."""
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * (((theta[:, -2] - 11.0) / 2.0) ** 2 + ((theta[:, -1] - 58.0) / 2.0) ** 2))
+
+
+def _climbed(recording: Recording, seed: int) -> tuple[Climb, list[Rung]]:
+    rng = np.random.default_rng(seed)
+    below, prior = default_prior(recording, 1), default_prior(recording, 2)
+    rest = below.from_unit_cube(rng.random((400, 8)))
+    rest[:, -2:] = np.array([11.0, 58.0]) + 2.0 * rng.standard_normal((400, 2))
+    problem = cast("SensorProblem", _Levels())
+    rungs: list[Rung] = []
+    found = climb(
+        problem,
+        Reference(prior, problem),
+        rest,
+        log_z_below=np.full(8, -3.0),
+        error_below=0.0,
+        rng=rng,
+        n_steps=5,
+        told=rungs.append,
+    )
+    return found, rungs
+
+
+def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording) -> None:
+    """The likelihood does not ask for the Gaussians: both orders' evidence is that of the levels. Four errors."""
+    found, rungs = _climbed(recording, 41)
+    assert abs(found.log_z + 3.0) < 4 * found.log_z_error < 1.0
+    assert not found.warnings
+    assert found.weight.sum() == pytest.approx(1.0)
+    assert [rung.temperature for rung in rungs] == list(found.temperatures[1:])
+    assert rungs[-1] == Rung(1.0, found.log_z, found.n_calls)
+    assert "no doubt" not in found.summary()
+    assert found.samples(500, rng=np.random.default_rng(1)).shape == (500, 14)
+
+
+def test_moves_leave_the_posterior_as_it_is(recording: Recording) -> None:
+    """The levels stay normal, the Gaussians as in the prior: means within five errors of independent clouds."""
+    found, _ = _climbed(recording, 42)
+    prior = default_prior(recording, 2)
+    u = prior.to_unit_cube(found.theta)
+    # Centres of all Gaussians are uniform, whichever is the heavier.
+    values = np.column_stack([found.theta[:, -2] - 11.0, found.theta[:, -1] - 58.0, u[:, [1, 2, 7, 8]] - 0.5])
+    clouds = values.reshape(8, -1, values.shape[1]).mean(axis=1)
+    assert (np.abs(clouds.mean(axis=0)) < 5 * clouds.std(axis=0, ddof=1) / np.sqrt(8)).all()
+
+
+def test_a_climb_that_clouds_disagree_on_is_doubtful(recording: Recording) -> None:
+    found, _ = _climbed(recording, 43)
+    apart = replace(found, log_z_of_clouds=np.array([5.0, *np.zeros(7)]))
+    assert any("clouds are worth" in note for note in apart.warnings)
+    assert "doubtful" in apart.summary()
+    assert any("not reached" in note for note in replace(found, temperatures=np.array([0.0, 0.5])).warnings)
+    assert any("accepted" in note for note in replace(found, accepted=0.001).warnings)
+
+
+def test_other_priors_of_light_are_searched_in_full(recording: Recording) -> None:
+    def paper(given: Recording, n: int) -> object:
+        return replace(default_prior(given, n), unit_mass_mm2=None)
+
+    def growing(given: Recording, n: int) -> object:
+        return replace(default_prior(given, n), i_min=Uniform(-1.0 * n, 40.0))
+
+    for prior, why in ((paper, "not uniform"), (growing, "differs from order to order")):
+        found, notes = climb_orders(Posing(recording, prior), (1, 2), n_live=50, rng=np.random.default_rng(0))
+        assert not found
+        assert why in notes[0]
+
+
+def test_quick_is_yes_or_no(recording: Recording) -> None:
+    with pytest.raises(ParameterError, match="quick"):
+        calibrate(recording, quick="yes", rng=np.random.default_rng(0))  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_climbing_and_searching_find_the_same_evidences(recording: Recording) -> None:
+    """Within four of both errors."""
+    told: list[tuple[int, RoundSummary | Rung]] = []
+    quick = calibrate(
+        recording,
+        orders=(1, 2, 3),
+        quick=True,
+        rng=np.random.default_rng(44),
+        progress=lambda n, state: told.append((n, state)),
+    )
+    full = calibrate(recording, orders=(1, 2, 3), n_live=200, rng=np.random.default_rng(45))
+    assert isinstance(quick.fits[1].result, Climb)
+    assert isinstance(full.fits[1].result, NestedResult)
+    for one, other in zip(quick.orders, full.orders, strict=True):
+        assert abs(one.log_z - other.log_z) < 4 * np.hypot(one.log_z_error, other.log_z_error)
+    assert quick.chosen.n_gaussians == full.chosen.n_gaussians == 1
+    assert {n for n, state in told if isinstance(state, Rung)} == {2, 3}

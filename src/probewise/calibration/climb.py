@@ -92,9 +92,10 @@ class Climb(ShowsItself):
 
     @property
     def log_z_error(self) -> float:
-        """Standard error of log Z, from the scatter of the clouds."""
+        """Standard error of log Z, from the scatter of the clouds: the sd of Student's t, since they are few."""
         relative = np.exp(self.log_z_of_clouds - self.log_z)
-        return math.hypot(float(relative.std(ddof=1)) / math.sqrt(len(relative)), self.start_error)
+        n = len(relative)
+        return math.hypot(float(relative.std(ddof=1)) * math.sqrt((n - 1) / (n - 3) / n), self.start_error)
 
     @property
     def weight(self) -> FloatArray:

@@ -64,7 +64,7 @@ def climb_orders(
     for n in range(2, highest + 1):
         found[n] = next_order(posing, n, found[n - 1], climbing, n_live=n_live, progress=progress)
     if highest > 1:
-        seen = vouch() if vouched is None else vouched.result()
+        seen = vouch(progress) if vouched is None else vouched.result()
         missed = _missed(found[highest], seen, highest)
         if missed:
             return {1: found[1]}, (missed,)
@@ -110,11 +110,12 @@ def _thinned(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(np.take_along_axis(clouds, chosen[..., None], axis=1).reshape(-1, theta.shape[1]))
 
 
-def _vouch(posing: Posing, n: int, rng: np.random.Generator) -> NestedResult:
+def _vouch(posing: Posing, n: int, rng: np.random.Generator, progress: Progress | None = None) -> NestedResult:
     """Search an order's prior with few live points."""
+    report = None if progress is None else partial(progress, n)
     problem = posing.problem(n)
     n_live = max(_VOUCHING_LIVE, least_live(len(problem.prior.names)))
-    return search(problem, rng=rng, n_live=n_live, return_interrupted=False)
+    return search(problem, rng=rng, n_live=n_live, progress=report, return_interrupted=False)
 
 
 def _missed(found: Found, seen: NestedResult, n: int) -> str:

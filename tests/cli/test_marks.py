@@ -171,7 +171,7 @@ def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet
     monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))
     plan = paper_plan()
     with arm:
-        hands = Hands(arm, plan, (524.0, 260.0), SheetWatch(plan, white_is_bright=True), typed=True)
+        hands = Hands(arm, plan, (524.0, 260.0), SheetWatch(plan, white_is_bright=True), looks=True, typed=True)
         hands(Request("lay sheet 'quadrant_c'", pattern="quadrant_c"))
         hands(Request("turn the sensor", turned_rad=math.pi / 2))
     said = capsys.readouterr().err

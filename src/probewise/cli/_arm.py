@@ -285,6 +285,14 @@ def asker(arm: Instrument) -> Callable[[str], None]:
     return ask
 
 
+def _line() -> str:
+    """Read a line of standard input; "" where it has ended or cannot be read."""
+    try:
+        return "" if sys.stdin is None else sys.stdin.readline()
+    except (OSError, ValueError):
+        return ""
+
+
 def questioner(arm: Instrument) -> Callable[[str], str]:
     """Make what asks a person for a line, while an arm that may fall asleep is kept awake."""
     keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
@@ -294,7 +302,7 @@ def questioner(arm: Instrument) -> Callable[[str], str]:
         sys.stderr.flush()
         answers: queue.Queue[str] = queue.Queue()
         # Reading a line cannot be cut short, so that it waits in a thread that the program need not wait for.
-        threading.Thread(target=lambda: answers.put(sys.stdin.readline()), daemon=True).start()
+        threading.Thread(target=lambda: answers.put(_line()), daemon=True).start()
         while True:
             try:
                 answer = answers.get(timeout=WAIT_S)

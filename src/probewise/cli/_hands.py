@@ -35,6 +35,8 @@ class Hands:
         What is carried out, and where its origin lies.
     watch
         What judges readings.
+    looks
+        Whether a sheet is looked at before it is scanned. An instrument of one's own takes the plan's readings alone.
     typed
         Whether the bench is an emulator's, so that what is to be done is typed in its terminal.
     """
@@ -46,16 +48,18 @@ class Hands:
         origin_mm: tuple[float, float],
         watch: SheetWatch,
         *,
+        looks: bool,
         typed: bool,
     ) -> None:
         self._arm, self._plan, self._origin, self._watch, self._typed = arm, plan, origin_mm, watch, typed
+        self._looks = looks
         self._answer = questioner(arm)
 
     def __call__(self, request: Request) -> None:
         """Ask, and look at what was laid until it is right or the person goes on all the same."""
         text = f"{request[0].upper()}{request[1:]}{self._to_type(request)}"
         self._answer(f"{text}, then press Enter: ")
-        if request.pattern is None:
+        if request.pattern is None or not self._looks:
             return
         while (wrong := self._look(request.pattern)) is not None:
             if sys.stdin is None or not sys.stdin.isatty():  # whoever answers from a file lays nothing right

@@ -442,7 +442,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
             _asker(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
         )
         if by_person:
-            ask = Hands(arm, plan, origin, watch, typed=not own and is_pty(_port(arguments.arm)))
+            ask = Hands(arm, plan, origin, watch, looks=not own, typed=not own and is_pty(_port(arguments.arm)))
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             say(
                 f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; {BY_HAND_S:g} s of it each time "

@@ -1,11 +1,13 @@
 """A sensor model made by hand, and recordings small enough for a test."""
 
 import io
+import signal
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from probewise._signals import ENDING
 from probewise.calibration import FittedSensor, write_sensor
 from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
 from probewise.report import exploration
@@ -14,6 +16,15 @@ from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footpri
 
 NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
 TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
+
+
+@pytest.fixture(autouse=True)
+def signals_are_heard():
+    """A test runner in the background ignores Ctrl-C, one under nohup a closed terminal."""
+    before = {number: signal.signal(number, signal.default_int_handler) for number in ENDING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def hand_made_sensor() -> FittedSensor:

@@ -25,15 +25,6 @@ from probewise.world.shipped import truth
 GEOMETRY = read_geometry(shipped_geometry())
 
 
-@pytest.fixture(autouse=True)
-def signals_are_heard():
-    """A test runner in the background ignores Ctrl-C, one under nohup a closed terminal."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in ENDING}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
 @pytest.mark.parametrize("number", ENDING, ids=lambda number: number.name)
 def test_a_signal_raises_and_gives_the_status_that_shells_expect(number):
     before = [signal.getsignal(k) for k in ENDING]

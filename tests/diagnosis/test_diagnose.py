@@ -63,7 +63,10 @@ def strict(diagnosis) -> dict:
     for effect in document["effects"]:
         assert effect["name"] in VOCABULARY
         holding = sum(h["probability"] for h in document["hypotheses"] if effect["name"] in h["effects"])
-        assert effect["probability"] == pytest.approx(holding)
+        if document["verdict"] == "unknown":  # beside which an effect may stand that no other hypothesis names
+            assert holding - 1e-9 <= effect["probability"] <= 1.0
+        else:
+            assert effect["probability"] == pytest.approx(holding)
     return document
 
 

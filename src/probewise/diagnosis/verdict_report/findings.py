@@ -25,6 +25,7 @@ from probewise.recordings.plan import Plan
 __all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
 
 _LEAST_PROBABILITY = 1e-3
+_IS_UNKNOWN = 0.5  # probability that something is unknown, from which effects beside it are listed
 _STANDS_BESIDE = 0.5  # share of what is unknown, from which an effect stands beside it
 _N_DRAWS = 999
 
@@ -85,8 +86,8 @@ def effects_found(
     """
     prepared = searched.prepared
     out, plan = [], prepared.recording.plan
-    beside = searched.named_beside_unknown()
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
+    beside = searched.named_beside_unknown() if unknown >= _IS_UNKNOWN else {}
     unit = plan.instrumentation.unit
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)

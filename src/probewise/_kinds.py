@@ -27,6 +27,7 @@ __all__ = [
     "require_one_or_several",
     "require_pair",
     "require_path",
+    "require_progress",
     "require_rng",
     "require_takes",
     "require_takes_places",
@@ -144,25 +145,29 @@ def require_callable(name: str, value: object, allowed: str) -> None:
 
 def require_takes(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
     """Raise ParameterError unless `value` can be called with these arguments, by their names."""
-    listed = f"{allowed} {name}({', '.join(arguments)})"
-    require_callable(name, value, listed)
-    try:
-        inspect.signature(value).bind(**dict.fromkeys(arguments))  # type: ignore[arg-type]
-    except TypeError:
-        raise ParameterError(name, value, listed) from None
-    except ValueError:  # a function written in C may not tell what it takes
-        return
+    _require_binds(name, value, f"{allowed} {name}({', '.join(arguments)})", (), dict.fromkeys(arguments))
 
 
 def require_takes_places(name: str, value: object, n_arguments: int, allowed: str) -> None:
     """Raise ParameterError unless `value` can be called with so many arguments."""
+    _require_binds(name, value, allowed, (None,) * n_arguments, {})
+
+
+def _require_binds(
+    name: str, value: object, allowed: str, arguments: tuple[None, ...], named: Mapping[str, None]
+) -> None:
     require_callable(name, value, allowed)
     try:
-        inspect.signature(value).bind(*[None] * n_arguments)  # type: ignore[arg-type]
+        inspect.signature(value).bind(*arguments, **named)  # type: ignore[arg-type]
     except TypeError:
         raise ParameterError(name, value, allowed) from None
     except ValueError:  # a function written in C may not tell what it takes
         return
+
+
+def require_progress(value: object, allowed: str = "a function") -> None:
+    """Raise ParameterError unless `value` takes what a `Progress` is called with."""
+    require_takes("progress", value, ("stage", "done", "total", "note"), allowed)
 
 
 def require_text(name: str, value: object, allowed: str = "a text") -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, Never
 
 from tqdm import tqdm
 
-from probewise._kinds import require_takes
+from probewise._kinds import require_progress
 from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
 
@@ -79,7 +79,7 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         with progress_shown(quiet=not progress, lines=False) as shown:
             yield shown
     else:
-        require_takes("progress", progress, ("stage", "done", "total", "note"), "True, False, or a function")
+        require_progress(progress, "True, False, or a function")
         yield progress
 
 

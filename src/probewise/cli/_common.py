@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import os
 import shlex
 import subprocess
@@ -28,6 +29,7 @@ __all__ = [
     "caution",
     "keeps",
     "positive_int",
+    "positive_number",
     "say",
     "seed_number",
 ]
@@ -121,6 +123,21 @@ def positive_int(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number above 0")
     return value
+
+
+def positive_number(unit: str) -> Callable[[str], float]:
+    """Make what reads a number above 0 of some unit, for argparse."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0 < value < math.inf:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number of {unit} above 0")
+        return value
+
+    return read
 
 
 def seed_number(text: str) -> int:

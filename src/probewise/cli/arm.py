@@ -33,6 +33,7 @@ from probewise.cli._common import (
     caution,
     keeps,
     positive_int,
+    positive_number,
     say,
     seed_number,
 )
@@ -91,14 +92,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fit.add_argument(
         "--block-mm",
-        type=_positive,
+        type=positive_number("mm"),
         default=BLOCK_MM,
         metavar="MM",
         help=f"height of the block on a mark (default {BLOCK_MM:g}: three LEGO bricks and a smooth tile)",
     )
     fit.add_argument(
         "--touch-mm",
-        type=_positive,
+        type=positive_number("mm"),
         default=TOUCH_MM,
         metavar="MM",
         help=f"how well a mark is met, sd of place and height (default {TOUCH_MM:g})",
@@ -172,17 +173,6 @@ def _add_arm(parser: argparse.ArgumentParser, *, own: bool = False) -> None:
         parser.add_argument("--arm", metavar="ARM", help=f"where the readings come from: {ARMS}")
     else:
         parser.add_argument("--arm", metavar="nxt:PORT", help=brick)
-
-
-def _positive(text: str) -> float:
-    """Read a number above zero, for argparse."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of mm above 0")
-    return value
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -10,7 +10,17 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import ARMS, ArmName, add_geometry, asker, geometry_of, parse_arm, parse_place
-from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
+from probewise.cli._common import (
+    CommandError,
+    Verb,
+    a_path,
+    add_common,
+    add_out_directory,
+    keeps,
+    positive_int,
+    positive_number,
+    say,
+)
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._plans import plan_named, read_by_lego, read_by_own
 from probewise.cli._stopping import saying_what_is_kept
@@ -69,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--minutes",
-        type=_minutes,
+        type=positive_number("minutes"),
         default=math.inf,
         metavar="M",
         help="at most so many minutes more (default: no limit)",
@@ -168,17 +178,6 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
-
-
-def _minutes(text: str) -> float:
-    """Read a number of minutes, for argparse."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of minutes above 0")
-    return value
 
 
 def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from probewise._kinds import require_like, require_rng, require_takes
+from probewise._kinds import require_like, require_progress, require_rng
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.advice.rivals import next_readings
 from probewise.diagnosis.fitting.earlier import SensorPrior
@@ -97,7 +97,7 @@ def diagnose(
         If the fit of the null did not arrive anywhere.
     """
     require_rng(rng)
-    require_takes("progress", progress, ("stage", "done", "total", "note"), "a function")
+    require_progress(progress)
     require_effects(effects)
     if null is not None:
         allowed = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -22,9 +23,9 @@ from probewise.experiment.kinds import Kind
 from probewise.experiment.particles import Particles
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.setting import Experiment, OneScan
-from probewise.experiment.simulation import Model, calibrated_height, chain_of, levels_of, scale_of
+from probewise.experiment.simulation import Model, chain_of, levels_of, posing, scale_of
 from probewise.inference import Naive
-from probewise.inquiry import Grid, ReadingEntropy
+from probewise.inquiry import ReadingEntropy
 from probewise.nested import (
     NESTED_STOP,
     EvidenceChange,
@@ -186,42 +187,27 @@ def paper_experiment(
     scale, scene = scale_of(sensor.instrumentation), HypothesisScene(shape)
     if naive is not None and model != "naive":
         raise ParameterError("naive", naive, 'None, but with the model "naive"')
-    levels, noise_sd = levels_of(sensor), float(sensor.noise_sd.mean())
-    seen: Chain | NaiveSensor
-    likelihood: Naive | OneScan
-    if model == "naive":
-        if naive is None:
-            raise ParameterError(
-                "naive", None, 'levels and sds with the model "naive", from repeated readings over black and white'
-            )
-        # The naive model knows no edge, where a reading never fits two levels: its fit is not doubted.
-        seen, likelihood, doubt_p = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), scene), naive, 0.0
-    else:
-        seen, likelihood, doubt_p = chain_of(sensor, scene), student_t_bounds(levels, scale.step), None
-    posed = Experiment(
-        shape,
-        seen,
-        likelihood,
-        noise_sd=noise_sd,
-        grid=Grid(field.width_mm, field.height_mm),
-        utility=ReadingEntropy(scale.step or noise_sd),
-        step=scale.step,
-        reading_range=(scale.low, scale.high),
-        orientations_rad=orientations_rad,
-        repeats=repeats,
-        heights_mm=heights_mm,
-        calibrated_height_mm=calibrated_height(sensor, model, heights_mm) if heights_mm else None,
+    pose = partial(
+        posing(sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm),
+        utility=ReadingEntropy(scale.step or float(sensor.noise_sd.mean())),
         n_samples=_N_SAMPLES,
         n_live=N_LIVE,
         method=NestedSampling(stop=NESTED_STOP[nested_stop]),
     )
-    return posed if doubt_p is None else replace(posed, doubt_p=doubt_p)
+    if model != "naive":
+        return pose(chain_of(sensor, scene), student_t_bounds(levels_of(sensor), scale.step))
+    if naive is None:
+        raise ParameterError(
+            "naive", None, 'levels and sds with the model "naive", from repeated readings over black and white'
+        )
+    # The naive model knows no edge, where a reading never fits two levels: its fit is not doubted.
+    return pose(NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), scene), naive, doubt_p=0.0)
 
 
 def student_t_bounds(levels: FixedLevels, step: float | None) -> OneScan:
     """Bound the Student-t's sd: from rounding, or a thousandth of the levels' difference, up to that difference."""
     span = abs(levels.i_max - levels.i_min)
-    floor = max((step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span)
+    floor = _least_sd(span, step)
     return OneScan(floor, max(span, 10.0 * floor))
 
 
@@ -251,16 +237,28 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
             f"{black.size} readings over black and {white.size} over white",
             "two or more of each, far from any edge: repeated readings over a black and over a white sheet",
         )
-    step = scale_of(sensor.instrumentation).step or 0.0
-    floor = max(step / math.sqrt(12.0), _LEAST_SHARE * abs(float(white.mean() - black.mean())))
-    return Naive.estimated(black, white, sd_floor=floor)
+    return _naive_of(black, white, scale_of(sensor.instrumentation).step)
 
 
 def levels_in(world: World, scale: LegoScale, *, rng: np.random.Generator, n_each: int = _N_EACH) -> Naive:
     """Let a simulated sensor read a black and a white sheet `n_each` times, for the naive model's levels and sds."""
     black, white = (
-        [scale.convert(world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng)) for k in range(n_each)]
+        np.array(
+            [
+                scale.convert(world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng))
+                for k in range(n_each)
+            ]
+        )
         for albedo in (0.0, 1.0)
     )
-    span = abs(float(np.mean(white) - np.mean(black)))
-    return Naive.estimated(black, white, sd_floor=max((scale.step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span))
+    return _naive_of(black, white, scale.step)
+
+
+def _naive_of(black: FloatArray, white: FloatArray, step: float | None) -> Naive:
+    """Estimate the naive model from readings over black and over white."""
+    return Naive.estimated(black, white, sd_floor=_least_sd(abs(float(white.mean() - black.mean())), step))
+
+
+def _least_sd(span: float, step: float | None) -> float:
+    """Give the least sd that is believed: of rounding, or a thousandth of the difference of the levels."""
+    return max((step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span)

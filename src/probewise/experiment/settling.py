@@ -19,7 +19,6 @@ from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.setting import MOST_OFF, Experiment
 from probewise.inquiry import Prospect, UtilityMap, entropy_bits
-from probewise.inquiry.forecast import spread_levels
 from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
@@ -35,8 +34,6 @@ _COUNTS = 1e-5  # probability of a kind that is asked
 _BEST = 60  # places, by the information about everything
 _AT_EDGES = 40
 _ANYWHERE = 20
-_PER_SD = 2.0  # levels of the predicted reading
-_LEAST = 1e-12
 _LEAST_CHANCE = 0.25  # of ending the run, from which on that is all that counts
 _ENDING = 60  # places, by the bits, that may end it
 _LABEL = "expected information about the shape and what the sensor leaves out (bits)"
@@ -155,13 +152,10 @@ def _ends(
 ) -> FloatArray:
     """Probability of a reading after which every length is known and hardly any far off, (n_designs,)."""
     away = lengths - weight @ lengths
-    levels = spread_levels(float(answers.min()), float(answers.max()), prospect.readout.noise_sd / _PER_SD)
-    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-    chance = prospect.readout.probability(levels, fine=1.0)
+    given = GivenReading(answers, weight, prospect.readout)
     out = np.empty(answers.shape[1])
-    for design, own in enumerate(index.T):
-        joint = weight[:, None] * chance[own]  # (n, n_cells)
-        mass = np.maximum(joint.sum(axis=0), _LEAST)
+    for design, mass in enumerate(given.mass):
+        joint = given.joint(design)
         ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
         for length in away.T:
             mean = length @ joint / mass

@@ -49,6 +49,7 @@ __all__ = [
     "chain_of",
     "experiment_for",
     "levels_of",
+    "posing",
     "scale_of",
     "sensor_named",
     "shape_named",
@@ -178,22 +179,11 @@ def experiment_for(
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
     sensor = sensor.leading()  # a mean over rivals is true of none of them
-    levels = levels_of(sensor)
+    levels, noise_sd, scale = levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
-    noise_sd = float(sensor.noise_sd.mean())
-    scale = scale_of(sensor.instrumentation)
     pose = partial(
-        Experiment,
-        shape,
-        noise_sd=noise_sd,
-        grid=Grid(field.width_mm, field.height_mm),
+        posing(sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm),
         utility=Finishing() if utility is None else utility,
-        step=scale.step,
-        reading_range=(scale.low, scale.high),
-        orientations_rad=orientations_rad,
-        repeats=repeats,
-        heights_mm=heights_mm,
-        calibrated_height_mm=calibrated_height(sensor, model, heights_mm) if heights_mm else None,
         batch=batch,
         n_live=n_live,
         trust=trust,
@@ -213,6 +203,32 @@ def experiment_for(
         free = replace(chain, ssf=AdjustedMixture(sensor.mixture()), levels=FreeLevels())
         return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
     return pose(chain, likelihood)
+
+
+def posing(
+    sensor: FittedSensor,
+    shape: Shape,
+    field: Field,
+    model: Model,
+    *,
+    orientations_rad: tuple[float, ...],
+    repeats: tuple[int, ...],
+    heights_mm: tuple[float, ...],
+) -> partial[Experiment]:
+    """Pose what every method of inference shares: the shape on the field, the sensor's scale, what can be chosen."""
+    scale = scale_of(sensor.instrumentation)
+    return partial(
+        Experiment,
+        shape,
+        noise_sd=float(sensor.noise_sd.mean()),
+        grid=Grid(field.width_mm, field.height_mm),
+        step=scale.step,
+        reading_range=(scale.low, scale.high),
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+        heights_mm=heights_mm,
+        calibrated_height_mm=calibrated_height(sensor, model, heights_mm) if heights_mm else None,
+    )
 
 
 def levels_of(sensor: FittedSensor) -> FixedLevels:

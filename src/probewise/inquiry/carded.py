@@ -9,9 +9,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import Forecast, Outlook, thinned
+from probewise.inquiry.forecast import Forecast, Outlook, by_level, thinned
 from probewise.recordings.plan import Plan
-from probewise.scene.cards import Card, CardedScene
+from probewise.scene.cards import Card, CardedScene, laid_over
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import Layout, response
 from probewise.sensor.stages import Poses, SensorModel
@@ -51,7 +51,7 @@ class CardedModel:
         covered = self.covered(Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan)
         dark, bright = self.ends
         seen = (self.plain.predict(theta, plan) - dark) / (bright - dark)
-        return np.asarray(dark + (bright - dark) * self.over(seen, covered))
+        return np.asarray(dark + (bright - dark) * laid_over(seen, self.cards, covered))
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -59,12 +59,6 @@ class CardedModel:
         levels = self.chain.levels
         assert isinstance(levels, FixedLevels)
         return levels.i_min, levels.i_max
-
-    def over(self, seen: FloatArray, covered: list[FloatArray]) -> FloatArray:
-        """Lay the cards over what is seen of the shape."""
-        for card, share in zip(self.cards, covered, strict=True):
-            seen = seen * (1.0 - share) + card.albedo * share
-        return seen
 
     def covered(self, poses: Poses, plan: Plan) -> list[FloatArray]:
         """Tell which share of each view is on each card, (n_samples or 1, n_points) each."""
@@ -154,8 +148,7 @@ class _CardedOutlook:
         own, n = weight[self.asked] * self.stands_for, len(self.near)
         levels = self.levels
         index = np.rint((self.answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-        key = np.clip(index, 0, len(levels) - 1) + np.arange(n) * len(levels)
-        mass_there = np.bincount(key.ravel(), np.repeat(own, n), minlength=n * len(levels)).reshape(n, -1)
+        mass_there = by_level(np.clip(index, 0, len(levels) - 1), own, len(levels))
         number = np.full(self.n_rows, -1)
         number[self.near] = np.arange(n)
         for at, mass in self.base.maps(weight):

@@ -20,6 +20,7 @@ __all__ = [
     "Forecast",
     "Outlook",
     "by_combination",
+    "by_level",
     "predicted",
     "spread_levels",
     "thinned",
@@ -122,11 +123,16 @@ class _AskedOutlook:
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
         """See `Outlook.maps`."""
         own, n_levels = weight[self.asked] * self.stands_for, len(self.levels)
-        for _, at, places in by_combination(self.rows, self.n_places):
-            n = len(places)
-            key = self.index[:, at] + np.arange(n) * n_levels
-            counted = np.bincount(key.ravel(), np.repeat(own, n), minlength=n * n_levels)
-            yield at, np.asarray(counted.reshape(n, n_levels), dtype=np.float64)
+        for _, at, _ in by_combination(self.rows, self.n_places):
+            yield at, by_level(self.index[:, at], own, n_levels)
+
+
+def by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
+    """Sum the weights, (n,), of hypotheses that predict each level, index (n, n_designs) -> (n_designs, n_levels)."""
+    n_designs = index.shape[1]
+    key = index + np.arange(n_designs) * n_levels
+    counted = np.bincount(key.ravel(), np.repeat(weight, n_designs), minlength=n_designs * n_levels)
+    return np.asarray(counted.reshape(n_designs, n_levels), dtype=np.float64)
 
 
 def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:

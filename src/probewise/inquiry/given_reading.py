@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.inquiry.forecast import MOST_LEVELS, spread_levels
+from probewise.inquiry.forecast import MOST_LEVELS, by_level, spread_levels
 from probewise.inquiry.readout import Readout
 
 __all__ = ["GivenReading"]
@@ -33,11 +33,9 @@ class GivenReading:
     """
 
     def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout) -> None:
-        self._n = answers.shape[1]
         levels = spread_levels(float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
-        index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-        self._key = (index + np.arange(self._n) * len(levels)).ravel()
-        self._weight, self._n_levels = weight, len(levels)
+        self._index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+        self._weight = weight
         self._chance = readout.probability(levels, fine=1.0, most=MOST_LEVELS)
 
     @cached_property
@@ -47,6 +45,8 @@ class GivenReading:
 
     def sum(self, values: FloatArray) -> FloatArray:
         """Sum weight times value, (n,), over the hypotheses in each cell, (n_designs, n_cells)."""
-        weighted = np.repeat(self._weight * values, self._n)
-        by_level = np.bincount(self._key, weighted, minlength=self._n * self._n_levels)
-        return np.asarray(by_level.reshape(self._n, self._n_levels) @ self._chance)
+        return np.asarray(by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
+
+    def joint(self, design: int) -> FloatArray:
+        """Weight of each hypothesis in each cell of one design, (n, n_cells)."""
+        return np.asarray(self._weight[:, None] * self._chance[self._index[:, design]])

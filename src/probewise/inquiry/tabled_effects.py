@@ -11,6 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.inquiry.carded import CardedModel
 from probewise.inquiry.discs import DiscTable
 from probewise.recordings.plan import Plan
+from probewise.scene.cards import laid_over
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel, Stage, View
 
@@ -47,5 +48,5 @@ class TabledChain:
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
-            seen = self.cards.over(seen, self.cards.covered(poses, plan))
+            seen = laid_over(seen, self.cards.cards, self.cards.covered(poses, plan))
         return self.chain.read(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

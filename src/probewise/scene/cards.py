@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from probewise.scene.albedo import Region
 from probewise.scene.regions import PolygonRegion, edge_distance, outlines
 from probewise.scene.scenes import HypothesisScene, SameForAll
 
-__all__ = ["Card", "CardedRegion", "CardedScene"]
+__all__ = ["Card", "CardedRegion", "CardedScene", "laid_over"]
 
 
 @dataclass(frozen=True)
@@ -74,22 +75,24 @@ class CardedRegion:
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.over(self.region.albedo(points_mm), [card.region.albedo(points_mm) for card in self.cards])
+        covered = [card.region.albedo(points_mm) for card in self.cards]
+        return laid_over(self.region.albedo(points_mm), self.cards, covered)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Mean albedo over turned square pixels, (n_regions, n_points)."""
         covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
-        return self.over(self.region.coverage(centers_mm, pixel_mm, turn_rad), covered)
+        return laid_over(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
 
-    def over(self, seen: FloatArray, covered: list[FloatArray]) -> FloatArray:
-        """Lay the cards over what would be seen without them; `covered` is the share of the view on each card.
 
-        Exact where a view holds no edge but a card's, or none of a card's: a view that holds both takes the shape
-        for as white under the card as beside it.
-        """
-        for card, share in zip(self.cards, covered, strict=True):
-            seen = np.asarray(seen * (1.0 - share) + card.albedo * share)
-        return seen
+def laid_over(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
+    """Lay cards over what would be seen without them; `covered` is the share of the view on each card.
+
+    Exact where a view holds no edge but a card's, or none of a card's: a view that holds both takes the shape
+    for as white under the card as beside it.
+    """
+    for card, share in zip(cards, covered, strict=True):
+        seen = np.asarray(seen * (1.0 - share) + card.albedo * share)
+    return seen
 
 
 @outlines.register

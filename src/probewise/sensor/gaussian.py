@@ -18,7 +18,7 @@ from scipy.special import ndtr, owens_t
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, SlowWarning
 from probewise.scene.albedo import Region
-from probewise.scene.cards import CardedRegion
+from probewise.scene.cards import CardedRegion, laid_over
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -334,7 +334,7 @@ def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
 def _(region: CardedRegion, spot: Spot, n_nodes: int) -> FloatArray:
     """Of the region and of each card by itself, the cards laid over it."""
     covered = [seen_by_one(card.region, spot, n_nodes) for card in region.cards]
-    return region.over(seen_by_one(region.region, spot, n_nodes), covered)
+    return laid_over(seen_by_one(region.region, spot, n_nodes), region.cards, covered)
 
 
 def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:

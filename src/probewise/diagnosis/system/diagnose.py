@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._kinds import require_rng, require_takes
+from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.engine import Thorough, diagnose_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.noise.law import NoiseLaw, white_of
@@ -68,7 +68,7 @@ def diagnose_system(
     """
     table = table_for(simulator, table)
     require_rng(rng)
-    require_takes("progress", progress, ("stage", "done", "total", "note"), "a function")
+    require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
     told = _counting(progress, cast(PersonsSystem, prepared.apparatus).system)
     return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)

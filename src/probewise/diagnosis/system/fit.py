@@ -13,7 +13,7 @@ from scipy.special import ndtri
 from probewise import nested
 from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
-from probewise._kinds import require_kind, require_rng, require_takes
+from probewise._kinds import require_kind, require_progress, require_rng
 from probewise.diagnosis.evidence.joint import JointProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.evidence.templates import TemplateMemory
@@ -136,7 +136,7 @@ def fit_simulator(
     """
     table = table_for(simulator, table)
     require_rng(rng)
-    require_takes("progress", progress, ("stage", "done", "total", "note"), "a function")
+    require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, bound=False)
     if prepared.too_little:
         found = (

@@ -16,10 +16,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect
 from probewise.effects.spots import ALONG_X, ScanLine, SpotPrior, bell, scanned_lines, spot_bank
 from probewise.effects.vocabulary import NamedEffect, give_or_take
-from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 from probewise.scene.regions import edge_distance
@@ -32,7 +31,7 @@ _STEP = 1e-3  # of a standard deviation, for the central difference: its error i
 
 
 @dataclass(frozen=True)
-class AlbedoGradient(NamedEffect[SceneView]):
+class AlbedoGradient(LinearEffect[SceneView]):
     """Paper or illumination that is uneven across the table: S (1 + per_mm_x X + per_mm_y Y), lab frame."""
 
     typical_per_mm: float = 2e-4
@@ -41,26 +40,16 @@ class AlbedoGradient(NamedEffect[SceneView]):
     stage: ClassVar[Stage] = Stage.SCENE
     units: ClassVar[tuple[str, ...]] = ("1/mm", "1/mm")
     covariates: ClassVar[tuple[str, ...]] = ("place",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
+    parameters: ClassVar[tuple[str, ...]] = ("per_mm_x", "per_mm_y")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical slope to 2 % over the longest scan."""
         return cls(typical_per_mm=0.02 / extent.length_mm)
 
-    @cached_property
-    def prior(self) -> Product:
-        """Relative change of albedo per millimetre, along X and along Y."""
-        slope = HeavyTailed(self.typical_per_mm)
-        return Product({"per_mm_x": slope, "per_mm_y": slope})
-
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Multiply every pattern's albedo by the gradient."""
         return replace(value, regions={name: GradedRegion(r, theta) for name, r in _under(value, plan).items()})
-
-    def bank(self) -> FloatArray:
-        """One entry of two columns: the change is linear in both slopes."""
-        return self.typical_per_mm * np.eye(2)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many percent the white fades over 100 mm."""

@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect
 from probewise.effects.spots import bell
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
@@ -25,7 +26,7 @@ __all__ = ["EdgeBlur", "EdgeShadow", "Halo"]
 
 
 @dataclass(frozen=True)
-class EdgeBlur(NamedEffect[Footprint]):
+class EdgeBlur(LinearEffect[Footprint]):
     """Printed edges are blurred by a Gaussian of sd_mm, which equals a wider footprint over sharp edges.
 
     The footprint's covariance grows by sd_mm^2 along each axis, whatever the sensor's orientation.
@@ -37,17 +38,13 @@ class EdgeBlur(NamedEffect[Footprint]):
     stage: ClassVar[Stage] = Stage.FOOTPRINT
     units: ClassVar[tuple[str, ...]] = ("mm",)
     covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("sd_mm",)
+    positive: ClassVar[bool] = True
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical width to 2 % of the longest scan."""
         return cls(typical_mm=0.02 * extent.length_mm)
-
-    @cached_property
-    def prior(self) -> Product:
-        """Width of the blur."""
-        return Product({"sd_mm": HeavyTailed(self.typical_mm, positive=True)})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         """Widen the footprint."""
@@ -58,10 +55,6 @@ class EdgeBlur(NamedEffect[Footprint]):
         """Return True (it equals a wider SSF) unless the height varies, which scales a footprint but not a blur."""
         ratio = height_ratio(plan)
         return ratio is None or float(np.ptp(ratio)) == 0.0
-
-    def bank(self) -> FloatArray:
-        """One entry: the change is proportional to the square of the width."""
-        return np.full((1, 1, 1), self.typical_mm)
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
         """Scale the square of the width by the fitted amount."""

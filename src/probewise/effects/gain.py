@@ -11,6 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -67,7 +68,7 @@ class GainDrift(NamedEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class BatterySag(NamedEffect[FloatArray]):
+class BatterySag(LinearEffect[FloatArray]):
     """A lamp that dims with its battery: signal x (1 + per_volt (V - V0)), V from `battery_mv`, V0 = 8 V.
 
     Readings without a recorded voltage are taken to be at V0.
@@ -80,7 +81,7 @@ class BatterySag(NamedEffect[FloatArray]):
     units: ClassVar[tuple[str, ...]] = ("1/V",)
     covariates: ClassVar[tuple[str, ...]] = (_BATTERY,)
     reads: ClassVar[tuple[str, ...]] = (_BATTERY,)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("per_volt",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -89,18 +90,9 @@ class BatterySag(NamedEffect[FloatArray]):
         fall = float(np.ptp(above))
         return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
 
-    @cached_property
-    def prior(self) -> Product:
-        """Relative change of the signal per volt, of either sign."""
-        return Product({"per_volt": HeavyTailed(self.typical_per_volt)})
-
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Scale the signal above the dark level, (n_samples, n_points)."""
         return np.asarray(value * (1 + theta[:, :1] * _volts_above_reference(plan)))
-
-    def bank(self) -> FloatArray:
-        """One entry: the change is linear in the parameter."""
-        return np.full((1, 1, 1), self.typical_per_volt)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many percent the signal changes per volt."""

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import ClassVar, Self
-
-import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect, OneScanEffect
 from probewise.effects.motion import in_scans, mountings
-from probewise.effects.vocabulary import NamedEffect, give_or_take
-from probewise.priors import Product
+from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import raised
 from probewise.sensor.stages import Footprint, Stage
@@ -24,7 +20,7 @@ _USUAL_MM = 14.0  # the height assumed where a recording gives none
 
 
 @dataclass(frozen=True)
-class HeightGradient(NamedEffect[Footprint]):
+class HeightGradient(LinearEffect[Footprint]):
     """A table that slopes: height h = h0 + mm_per_mm X; footprint x h/h0, signal x (h0/h)^2.
 
     h0 is the height in the recording's description, or 14 mm where it gives none.
@@ -36,25 +32,16 @@ class HeightGradient(NamedEffect[Footprint]):
     stage: ClassVar[Stage] = Stage.FOOTPRINT
     units: ClassVar[tuple[str, ...]] = ("mm/mm",)
     covariates: ClassVar[tuple[str, ...]] = ("place",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("mm_per_mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical slope to 1 % of the height over the longest scan."""
         return cls(typical=0.01 * _height_mm(extent.plan) / extent.length_mm)
 
-    @cached_property
-    def prior(self) -> Product:
-        """Change of height per millimetre along X, of either sign."""
-        return Product({"mm_per_mm": HeavyTailed(self.typical)})
-
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         """Scale and dim the footprint by the height at each X."""
         return raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
-
-    def bank(self) -> FloatArray:
-        """One entry: the change is linear in the slope."""
-        return np.full((1, 1, 1), self.typical)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far the sensor rises over 100 mm."""
@@ -66,44 +53,26 @@ class HeightGradient(NamedEffect[Footprint]):
 
 
 @dataclass(frozen=True)
-class HeightOffset(NamedEffect[Footprint]):
-    """One mounting or scan at another height: h = h0 + mm there; footprint x h/h0, signal x (h0/h)^2.
-
-    `scans` are the affected scans; `choices` are the candidate groups of scans.
-    """
+class HeightOffset(OneScanEffect[Footprint]):
+    """One mounting or scan at another height: h = h0 + mm there; footprint x h/h0, signal x (h0/h)^2."""
 
     typical_mm: float = 0.15
-    scans: tuple[str, ...] = ()
-    choices: tuple[tuple[str, ...], ...] = ()
 
     name: ClassVar[str] = "height_offset"
     stage: ClassVar[Stage] = Stage.FOOTPRINT
     units: ClassVar[tuple[str, ...]] = ("mm",)
     covariates: ClassVar[tuple[str, ...]] = ("scan",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical offset to 1 % of the height; None for a single scan."""
         choices = mountings(extent.plan)
-        return cls(0.01 * _height_mm(extent.plan), (), choices) if choices else None
-
-    @cached_property
-    def prior(self) -> Product:
-        """Height difference, of either sign."""
-        return Product({"mm": HeavyTailed(self.typical_mm)})
+        return cls(choices=choices, typical_mm=0.01 * _height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         """Widen and dim the footprint in the affected scans."""
         return raised(value, 1 + theta * in_scans(plan, self.scans) / _height_mm(plan))
-
-    def variants(self) -> tuple[Self, ...]:
-        """One variant for each mounting and each scan."""
-        return tuple(replace(self, scans=choice) for choice in self.choices)
-
-    def bank(self) -> FloatArray:
-        """One entry: the change is linear in the height."""
-        return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much higher, and in which scans."""

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect, OneScanEffect
 from probewise.effects.motion import in_scans
-from probewise.effects.vocabulary import NamedEffect, give_or_take
-from probewise.priors import Product
+from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.patterns import HalfPlane, Ramp, Stripes
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SceneView, Stage
@@ -22,7 +20,7 @@ __all__ = ["EdgeMisplacement", "ScanMisplacement"]
 
 
 @dataclass(frozen=True)
-class EdgeMisplacement(NamedEffect[SceneView]):
+class EdgeMisplacement(LinearEffect[SceneView]):
     """Every pattern is shifted by offset_mm along its edge's normal, or along X where it has no single normal."""
 
     typical_mm: float = 0.3
@@ -31,25 +29,16 @@ class EdgeMisplacement(NamedEffect[SceneView]):
     stage: ClassVar[Stage] = Stage.SCENE
     units: ClassVar[tuple[str, ...]] = ("mm",)
     covariates: ClassVar[tuple[str, ...]] = ("slope",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("offset_mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical offset to 0.3 % of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
-    @cached_property
-    def prior(self) -> Product:
-        """Offset, of either sign."""
-        return Product({"offset_mm": HeavyTailed(self.typical_mm)})
-
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Shift the patterns."""
         return _moved(value, theta * np.ones(len(plan)), plan)
-
-    def bank(self) -> FloatArray:
-        """One entry: the change is linear in the offset."""
-        return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies."""
@@ -57,44 +46,28 @@ class EdgeMisplacement(NamedEffect[SceneView]):
 
 
 @dataclass(frozen=True)
-class ScanMisplacement(NamedEffect[SceneView]):
-    """In one scan the pattern is shifted by offset_mm along its edge's normal, or along X where it has none.
-
-    `scans` holds that scan; `choices` are the candidates.
-    """
+class ScanMisplacement(OneScanEffect[SceneView]):
+    """In one scan the pattern is shifted by offset_mm along its edge's normal, or along X where it has none."""
 
     typical_mm: float = 0.3
-    scans: tuple[str, ...] = ()
-    choices: tuple[tuple[str, ...], ...] = ()
 
     name: ClassVar[str] = "scan_misplacement"
     stage: ClassVar[Stage] = Stage.SCENE
     units: ClassVar[tuple[str, ...]] = ("mm",)
     covariates: ClassVar[tuple[str, ...]] = ("scan", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("offset_mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical offset to 0.3 % of the longest scan; None for a single scan."""
         names = tuple(dict.fromkeys(extent.plan.scan_names))
-        return cls(0.003 * extent.length_mm, (), tuple((name,) for name in names)) if len(names) > 1 else None
-
-    @cached_property
-    def prior(self) -> Product:
-        """Offset, of either sign."""
-        return Product({"offset_mm": HeavyTailed(self.typical_mm)})
+        if len(names) < 2:
+            return None
+        return cls(choices=tuple((name,) for name in names), typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Shift the pattern under that scan."""
         return _moved(value, theta * in_scans(plan, self.scans), plan)
-
-    def variants(self) -> tuple[Self, ...]:
-        """One variant for each scan."""
-        return tuple(replace(self, scans=choice) for choice in self.choices)
-
-    def bank(self) -> FloatArray:
-        """One entry: the change is linear in the offset."""
-        return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies, and in which scan."""

@@ -12,7 +12,8 @@ from probewise._arrays import FloatArray
 from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.linear import LinearEffect
+from probewise.effects.vocabulary import give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -21,7 +22,7 @@ __all__ = ["AmbientGradient", "AmbientStep", "OffsetDrift"]
 
 
 @dataclass(frozen=True)
-class AmbientGradient(NamedEffect[FloatArray]):
+class AmbientGradient(LinearEffect[FloatArray]):
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame."""
 
     typical_per_mm: float = 0.005
@@ -30,7 +31,7 @@ class AmbientGradient(NamedEffect[FloatArray]):
     stage: ClassVar[Stage] = Stage.OFFSET
     units: ClassVar[tuple[str, ...]] = ("reading/mm", "reading/mm")
     covariates: ClassVar[tuple[str, ...]] = ("place",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
+    parameters: ClassVar[tuple[str, ...]] = ("per_mm_x", "per_mm_y")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -39,19 +40,9 @@ class AmbientGradient(NamedEffect[FloatArray]):
             return None
         return cls(typical_per_mm=0.01 * extent.span / extent.length_mm)
 
-    @cached_property
-    def prior(self) -> Product:
-        """The slope along X and along Y."""
-        slope = HeavyTailed(self.typical_per_mm)
-        return Product({"per_mm_x": slope, "per_mm_y": slope})
-
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the plane to the readings, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * plan.x_mm + theta[:, 1:2] * plan.y_mm)
-
-    def bank(self) -> FloatArray:
-        """One entry of two columns: linear in both slopes."""
-        return self.typical_per_mm * np.eye(2)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much the reading rises over 100 mm along each axis."""
@@ -62,7 +53,7 @@ class AmbientGradient(NamedEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class OffsetDrift(NamedEffect[FloatArray]):
+class OffsetDrift(LinearEffect[FloatArray]):
     """A slow drift: reading + per_hour t, t as in `time_s`."""
 
     typical_per_hour: float = 1.0
@@ -71,25 +62,16 @@ class OffsetDrift(NamedEffect[FloatArray]):
     stage: ClassVar[Stage] = Stage.OFFSET
     units: ClassVar[tuple[str, ...]] = ("reading/h",)
     covariates: ClassVar[tuple[str, ...]] = ("time",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical drift to 1 % of the readings' range over the recording."""
         return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600))
 
-    @cached_property
-    def prior(self) -> Product:
-        """Change per hour, of either sign."""
-        return Product({"per_hour": HeavyTailed(self.typical_per_hour)})
-
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the drift to the readings, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * (plan.time_s / 3600))
-
-    def bank(self) -> FloatArray:
-        """One entry: linear in the drift."""
-        return np.full((1, 1, 1), self.typical_per_hour)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how much the reading drifts in an hour."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import NamedEffect, give_or_take
-from probewise.priors import Product
+from probewise.effects.linear import LinearEffect
+from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -20,7 +18,7 @@ __all__ = ["Backlash", "PositionScale"]
 
 
 @dataclass(frozen=True)
-class Backlash(NamedEffect[Poses]):
+class Backlash(LinearEffect[Poses]):
     """Play in the gears: place = commanded place - (width_mm / 2) direction, on each axis."""
 
     typical_mm: float = 0.5
@@ -29,17 +27,13 @@ class Backlash(NamedEffect[Poses]):
     stage: ClassVar[Stage] = Stage.POSE
     units: ClassVar[tuple[str, ...]] = ("mm",)
     covariates: ClassVar[tuple[str, ...]] = ("slope", "direction")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("width_mm",)
+    positive: ClassVar[bool] = True
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical width to 0.5 % of the longest scan."""
         return cls(typical_mm=0.005 * extent.length_mm)
-
-    @cached_property
-    def prior(self) -> Product:
-        """Width, positive: the arm lags behind the motion, never ahead."""
-        return Product({"width_mm": HeavyTailed(self.typical_mm, positive=True)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         """Shift the poses against the direction of the last commanded motion."""
@@ -49,10 +43,6 @@ class Backlash(NamedEffect[Poses]):
             x_mm=value.x_mm - half_mm * plan.direction[:, 0],
             y_mm=value.y_mm - half_mm * plan.direction[:, 1],
         )
-
-    def bank(self) -> FloatArray:
-        """One entry: the shift is linear in the width."""
-        return np.full((1, 1, 1), self.typical_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far short of its goal the arm comes to rest."""
@@ -66,7 +56,7 @@ _LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
 
 
 @dataclass(frozen=True)
-class PositionScale(NamedEffect[Poses]):
+class PositionScale(LinearEffect[Poses]):
     """Motor steps of the wrong length: X (1 + x), Y (1 + y)."""
 
     typical: float = 0.01
@@ -75,18 +65,12 @@ class PositionScale(NamedEffect[Poses]):
     stage: ClassVar[Stage] = Stage.POSE
     units: ClassVar[tuple[str, ...]] = ("1", "1")
     covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0, 1)
+    parameters: ClassVar[tuple[str, ...]] = ("x", "y")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Keep the default scale: an error of 1 % is typical; a wrong wheel size makes tens of percent."""
         return cls()
-
-    @cached_property
-    def prior(self) -> Product:
-        """Relative error of the scale, along X and along Y."""
-        share = HeavyTailed(self.typical)
-        return Product({"x": share, "y": share})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         """Stretch the positions about the origin of the lab frame."""

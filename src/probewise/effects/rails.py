@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
@@ -24,7 +25,7 @@ _MOST_PLACES = 160
 
 
 @dataclass(frozen=True)
-class BentRails(NamedEffect[Poses]):
+class BentRails(LinearEffect[Poses]):
     """Quadratic and cubic position error of each axis: X + x2_mm (X / 10 mm)^2 + x3_mm (X / 10 mm)^3, likewise Y."""
 
     typical_mm: float = 0.1
@@ -33,18 +34,12 @@ class BentRails(NamedEffect[Poses]):
     stage: ClassVar[Stage] = Stage.POSE
     units: ClassVar[tuple[str, ...]] = ("mm", "mm", "mm", "mm")
     covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
+    parameters: ClassVar[tuple[str, ...]] = ("x2_mm", "x3_mm", "y2_mm", "y3_mm")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical quadratic error to 0.5 % of the longest scan at half its length."""
         return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
-
-    @cached_property
-    def prior(self) -> Product:
-        """Each term's error at 10 mm from the origin of the lab frame."""
-        error = HeavyTailed(self.typical_mm)
-        return Product({"x2_mm": error, "x3_mm": error, "y2_mm": error, "y3_mm": error})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         """Add the position errors to both axes."""
@@ -54,10 +49,6 @@ class BentRails(NamedEffect[Poses]):
             x_mm=value.x_mm + theta[:, :1] * x**2 + theta[:, 1:2] * x**3,
             y_mm=value.y_mm + theta[:, 2:3] * y**2 + theta[:, 3:4] * y**3,
         )
-
-    def bank(self) -> FloatArray:
-        """One entry of four columns: linear in all."""
-        return self.typical_mm * np.eye(4)[None, :, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how large the position errors are at 10 mm."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.linear import LinearEffect
 from probewise.effects.motion import direction_varies, sign_of_motion
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
@@ -22,7 +22,7 @@ __all__ = ["Hysteresis", "Lag"]
 
 
 @dataclass(frozen=True)
-class Hysteresis(NamedEffect[FloatArray]):
+class Hysteresis(LinearEffect[FloatArray]):
     """A reading that depends on the direction of motion: reading + amp d, d the sign of motion along X, or along Y."""
 
     typical: float = 0.5
@@ -31,25 +31,16 @@ class Hysteresis(NamedEffect[FloatArray]):
     stage: ClassVar[Stage] = Stage.OFFSET
     units: ClassVar[tuple[str, ...]] = ("reading",)
     covariates: ClassVar[tuple[str, ...]] = ("direction",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("amp",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical amplitude to 1 % of the readings' range; None where the direction never changes."""
         return cls(typical=0.01 * extent.span) if direction_varies(extent.plan) else None
 
-    @cached_property
-    def prior(self) -> Product:
-        """Half the difference between the two directions, of either sign."""
-        return Product({"amp": HeavyTailed(self.typical)})
-
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the hysteresis to the readings, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * sign_of_motion(plan))
-
-    def bank(self) -> FloatArray:
-        """One entry: linear in the amplitude."""
-        return np.full((1, 1, 1), self.typical)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how much the two directions differ."""

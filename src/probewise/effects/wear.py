@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import NamedEffect, give_or_take
-from probewise.priors import Product
+from probewise.effects.linear import LinearEffect
+from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import raised
 from probewise.sensor.stages import Footprint, Poses, Stage
@@ -21,7 +19,7 @@ __all__ = ["SlowSinking", "SlowTurn"]
 
 
 @dataclass(frozen=True)
-class SlowTurn(NamedEffect[Poses]):
+class SlowTurn(LinearEffect[Poses]):
     """The sensor turns in its holder: orientation + deg_per_hour t."""
 
     typical_deg_per_hour: float = 2.0
@@ -30,26 +28,17 @@ class SlowTurn(NamedEffect[Poses]):
     stage: ClassVar[Stage] = Stage.POSE
     units: ClassVar[tuple[str, ...]] = ("deg/h",)
     covariates: ClassVar[tuple[str, ...]] = ("time", "orientation")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("deg_per_hour",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical rate to two degrees over the recording."""
         return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600))
 
-    @cached_property
-    def prior(self) -> Product:
-        """Degrees per hour, of either sign."""
-        return Product({"deg_per_hour": HeavyTailed(self.typical_deg_per_hour)})
-
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         """Turn the sensor with time."""
         turn = np.deg2rad(theta[:, :1]) * (plan.time_s / 3600)
         return replace(value, orientation_rad=value.orientation_rad + turn)
-
-    def bank(self) -> FloatArray:
-        """One entry: linear while the turn is small."""
-        return np.full((1, 1, 1), self.typical_deg_per_hour)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how fast it turns."""
@@ -57,7 +46,7 @@ class SlowTurn(NamedEffect[Poses]):
 
 
 @dataclass(frozen=True)
-class SlowSinking(NamedEffect[Footprint]):
+class SlowSinking(LinearEffect[Footprint]):
     """The height changes: h/h0 = 1 + per_hour t; footprint x h/h0, signal x (h0/h)^2."""
 
     typical_per_hour: float = 0.1
@@ -66,25 +55,16 @@ class SlowSinking(NamedEffect[Footprint]):
     stage: ClassVar[Stage] = Stage.FOOTPRINT
     units: ClassVar[tuple[str, ...]] = ("1/h",)
     covariates: ClassVar[tuple[str, ...]] = ("time", "level")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical rate to 1 % of the height over the recording."""
         return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
 
-    @cached_property
-    def prior(self) -> Product:
-        """Relative change of height per hour, of either sign."""
-        return Product({"per_hour": HeavyTailed(self.typical_per_hour)})
-
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         """Widen and dim the footprint with time."""
         return raised(value, 1 + theta[:, :1] * (plan.time_s / 3600))
-
-    def bank(self) -> FloatArray:
-        """One entry: linear while the change is small."""
-        return np.full((1, 1, 1), self.typical_per_hour)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how fast it sinks or rises."""

@@ -1,0 +1,63 @@
+"""Bases of effects that are linear in all their parameters: the formula is all that is left to write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.vocabulary import NamedEffect, V
+from probewise.priors import Product
+
+__all__ = ["LinearEffect", "OneScanEffect"]
+
+
+class LinearEffect(NamedEffect[V]):
+    """Base of effects whose readings change in proportion to each parameter, to first order.
+
+    A subclass is a frozen dataclass with one field that begins with `typical`: the typical size of every parameter.
+    """
+
+    parameters: ClassVar[tuple[str, ...]]
+    """Names of the parameters."""
+    positive: ClassVar[bool] = False
+    """Whether the parameters are never negative."""
+
+    @cached_property
+    def _typical(self) -> float:
+        (name,) = (each.name for each in fields(self) if each.name.startswith("typical"))  # type: ignore[arg-type]
+        return float(getattr(self, name))
+
+    @property
+    def amplitudes(self) -> tuple[int, ...]:
+        """All parameters."""
+        return tuple(range(len(self.parameters)))
+
+    @cached_property
+    def prior(self) -> Product:
+        """The same heavy-tailed prior for each parameter."""
+        size = HeavyTailed(self._typical, positive=self.positive)
+        return Product(dict.fromkeys(self.parameters, size))
+
+    def bank(self) -> FloatArray:
+        """One entry with a column for each parameter, (1, n_params, n_params)."""
+        return self._typical * np.eye(len(self.parameters))[None, :, :]
+
+
+@dataclass(frozen=True)
+class OneScanEffect(LinearEffect[V]):
+    """Base of linear effects on one scan, or on the scans of one mounting: which of them is a discrete choice.
+
+    `scans` are the affected scans; `choices` are the candidate groups of scans.
+    """
+
+    scans: tuple[str, ...] = ()
+    choices: tuple[tuple[str, ...], ...] = ()
+
+    def variants(self) -> tuple[Self, ...]:
+        """One variant for each candidate group."""
+        return tuple(replace(self, scans=choice) for choice in self.choices)

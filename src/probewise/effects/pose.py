@@ -19,7 +19,10 @@ __all__ = ["Backlash", "PositionScale"]
 
 @dataclass(frozen=True)
 class Backlash(LinearEffect[Poses]):
-    """Play in the gears: place = commanded place - (width_mm / 2) direction, on each axis."""
+    """Play in the gears: place = commanded place - (width_mm / 2) direction, on each axis.
+
+    The width is positive: the arm lags behind the motion, never ahead.
+    """
 
     typical_mm: float = 0.5
 

@@ -43,7 +43,7 @@ def bricks(monkeypatch, make_paper_brick):
         return LegoArm(machine, geometry, clock=clock, start_s=start_s)
 
     monkeypatch.setattr("probewise.cli.arm.open_nxt", open_nxt)
-    monkeypatch.setattr("probewise.cli.explore.open_nxt", open_nxt)
+    monkeypatch.setattr("probewise.cli._explore_arm.open_nxt", open_nxt)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
     deaths["opened"] = opened
     return deaths

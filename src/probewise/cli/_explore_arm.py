@@ -1,0 +1,70 @@
+"""The arm that `probewise explore` reads with, and what a simulated one hides."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from probewise import experiment as posing
+from probewise.cli._arm import open_emulated, open_nxt, open_own
+from probewise.cli._explore_inputs import Inputs
+from probewise.cli._geometry import parse_truth
+from probewise.errors import ParameterError
+
+if TYPE_CHECKING:
+    from probewise._arrays import FloatArray
+    from probewise.arm import Instrument, Reading
+
+__all__ = ["Site", "open_site"]
+
+
+@dataclass(frozen=True)
+class Site:
+    """An arm over a field; what lies there, where it is simulated.
+
+    `outline_mm` is the true outline, (n_points, 2), `known` the true values of the shape's parameters, by name, and
+    `about` what the journal keeps of them; None and empty with a real arm.
+    """
+
+    arm: Instrument
+    outline_mm: FloatArray | None = None
+    known: Mapping[str, float] | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+
+def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> Site:
+    """Open the arm that was asked for, to go on after the readings `taken`.
+
+    Raises
+    ------
+    ParameterError, FileError, ArmError
+        If a truth was given with a real arm, or the arm cannot be opened.
+    """
+    chosen, geometry, start_s = inputs.arm, inputs.geometry, taken[-1].time_s if taken else 0.0
+    if chosen.kind in ("nxt", "file"):
+        if arguments.truth is not None:
+            raise ParameterError("--truth", arguments.truth, "none with a real arm: what lies there is for it to find")
+        if chosen.kind == "file":
+            return Site(open_own(chosen.where, start_s=start_s))
+        assert geometry is not None
+        return Site(open_nxt(chosen.where, geometry, start_s=start_s))
+    hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)
+    world, surface = posing.world_like(inputs.sensor), posing.with_cards(hidden.surface, inputs.cards)
+    arm: Instrument
+    if chosen.is_lego and geometry is not None:
+        built, seed = chosen.built_as(arguments.geometry), inputs.streams.noise
+        arm, _ = open_emulated(geometry, built, world, surface, seed=seed, start_s=start_s)
+    else:
+        arm = posing.arm_over(
+            world,
+            surface,
+            inputs.field,
+            seed=inputs.streams.noise,
+            taken=taken,
+            workspace=geometry,
+            scale=posing.scale_of(inputs.sensor.instrumentation),
+        )
+    known = hidden.named_as(inputs.experiment.names)
+    return Site(arm, hidden.outline_mm, known, {"hidden": hidden.document})

@@ -1,0 +1,163 @@
+"""What `probewise explore` is asked for, read and checked: the sensor, the field, what may lie there, the models."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probewise import experiment as posing
+from probewise.calibration import FittedSensor, read_sensor
+from probewise.cli._arm import ArmName, geometry_of, parse_arm
+from probewise.cli._geometry import parse_cards, parse_field
+from probewise.errors import ParameterError
+from probewise.recordings import read_recording
+from probewise.scene import Field
+
+if TYPE_CHECKING:
+    from probewise.arm import Geometry
+    from probewise.experiment import Experiment, Model, Streams
+    from probewise.inference import Naive
+    from probewise.scene import Card
+
+__all__ = ["Inputs", "inputs_of"]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a run starts from.
+
+    `other` is the experiment under the sensor model `other_model`, which --both-models shows beside the robot's; None
+    without it. `geometry` is None for an arm that is no LEGO arm.
+    """
+
+    arm: ArmName
+    geometry: Geometry | None
+    sensor: FittedSensor
+    field: Field
+    cards: tuple[Card, ...]
+    experiment: Experiment
+    model: Model
+    other: Experiment | None
+    other_model: Model
+    streams: Streams
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """The readings over black and over white that the sensor model gives."""
+        means = self.sensor.mean()
+        return means["I_min"], means["I_max"]
+
+
+def inputs_of(arguments: argparse.Namespace) -> Inputs:
+    """Read and check what was asked for.
+
+    Raises
+    ------
+    ParameterError, FileError
+        If an option contradicts another, or a file cannot be read.
+    """
+    chosen = parse_arm(arguments.arm)
+    if chosen.kind == "file" and arguments.geometry is not None:
+        raise ParameterError(
+            "--geometry", str(arguments.geometry), "none with FILE.py, which says itself what it reaches"
+        )
+    geometry = geometry_of(arguments) if chosen.is_lego or arguments.geometry is not None else None
+    field = _field(arguments.field, geometry)
+    sensor = read_sensor(arguments.sensor)
+    if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
+        raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
+    streams = posing.Streams.of(np.random.default_rng(arguments.seed))
+    shape = posing.shape_named(arguments.shape, field)
+    orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
+    cards = parse_cards(arguments.reference, field)
+    if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
+        allowed = "none with --both-models, --model naive or --method paper"
+        raise ParameterError("--reference", arguments.reference[0], allowed)
+    levels = _levels(arguments, chosen, sensor, rng=streams.levels)
+    pose = partial(
+        posing.pose_experiment,
+        sensor,
+        shape,
+        field,
+        method=arguments.method,
+        utility=arguments.utility,
+        nested_stop=arguments.nested_stop,
+        orientations_rad=orientations_rad,
+        repeats=repeats,
+        cards=cards,
+    )
+    experiment = pose(
+        model=arguments.model,
+        naive=levels if arguments.model == "naive" else None,
+        learn_sensor=arguments.learn_sensor,
+        batch=arguments.batch,
+        heights_mm=heights_mm,
+        trust=arguments.trust,
+    )
+    other, other_model = None, _other(arguments.model)
+    if arguments.both_models:
+        other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
+    return Inputs(
+        chosen, geometry, sensor, field, cards, experiment, arguments.model, other, other_model, streams=streams
+    )
+
+
+def _other(model: Model) -> Model:
+    return "naive" if model == "ssf" else "ssf"
+
+
+def _choices(
+    arguments: argparse.Namespace, geometry: Geometry | None
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
+    """Take orientations in radians, heights and repeats that may be chosen, of an arm that can."""
+    turns, heights_mm = arguments.orientations, arguments.heights
+    asked = {"--orientations": turns, "--heights": heights_mm}
+    refused = {}
+    if geometry is not None:
+        refused = {
+            "--orientations": "none with the LEGO arm, no joint of which turns its sensor",
+            "--heights": f"none with the LEGO arm, which reads {geometry.read_height_mm:g} mm above the surface",
+        }
+    elif arguments.both_models:
+        refused = {"--heights": "none with --both-models, for the naive model knows no height"}
+    for option, allowed in refused.items():
+        if asked[option] is not None:
+            raise ParameterError(option, ",".join(f"{value:g}" for value in asked[option]), allowed)
+    return tuple(math.radians(turn) for turn in turns or (0.0,)), heights_mm or (), arguments.repeats or (1,)
+
+
+def _field(text: str | None, geometry: Geometry | None) -> Field:
+    """Take the field that was asked for, which must be the geometry's where there is one."""
+    if geometry is None:
+        return parse_field("1048,520" if text is None else text)
+    own = Field(*geometry.field_mm)
+    if text is not None and parse_field(text) != own:
+        raise ParameterError("--field", text, f"{own.width_mm:g},{own.height_mm:g}, the geometry's; or none")
+    return own
+
+
+def _levels(
+    arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
+) -> Naive | None:
+    """Take the paper's naive levels from the recording that is given; a simulated sensor reads them now."""
+    if arguments.nested_stop is not None and arguments.method != "paper":
+        raise ParameterError("--nested-stop", arguments.nested_stop, "none but with --method paper")
+    wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
+    if arguments.levels is not None:
+        if not wanted:
+            raise ParameterError("--levels", str(arguments.levels), "none but with --method paper and a naive model")
+        return posing.levels_from(read_recording(arguments.levels), sensor)
+    if not wanted:
+        return None
+    if chosen.kind in ("nxt", "file"):
+        raise ParameterError(
+            "--levels",
+            "none",
+            "a recording of readings over a black and a white sheet, for the naive model of the paper",
+        )
+    return posing.levels_in(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)

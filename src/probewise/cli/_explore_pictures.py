@@ -1,0 +1,87 @@
+"""The pictures of `probewise explore`: one a step, the live page, and what is written at the end."""
+
+from __future__ import annotations
+
+import webbrowser
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probewise import experiment as posing
+from probewise.cli._explore_inputs import Inputs
+from probewise.cli._output import Stage
+from probewise.cli._stopping import require_going_on
+from probewise.recordings import write_bytes_atomically, write_text_atomically
+from probewise.report import exploration as report
+from probewise.report.animation import gif
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from probewise._arrays import FloatArray
+    from probewise.experiment import Exploration, Step
+
+__all__ = ["Pictures"]
+
+
+@dataclass
+class Pictures:
+    """Draw each step as it comes; steps and pictures are kept for the report."""
+
+    out: Path
+    inputs: Inputs
+    live: bool
+    truth_mm: FloatArray | None
+    steps: list[Step] = field(default_factory=list)
+    shadows: list[Step] = field(default_factory=list)
+    """Steps of the other sensor model on the same readings."""
+    frames: list[bytes] = field(default_factory=list)
+
+    def add(self, step: Step, shadow: Step | None) -> None:
+        """Draw a step, with what the other sensor model makes of it, and write its picture."""
+        self.steps.append(step)
+        if shadow is not None:
+            self.shadows.append(shadow)
+        self.frames.append(self._frame(step, shadow))
+        require_going_on()  # a signal may have spoilt the picture
+        if step.number == 1 and not step.replayed:
+            _remove_pictures(self.out)
+        folder = self.out / "frames"
+        folder.mkdir(exist_ok=True)
+        write_bytes_atomically(folder / f"{step.number:03d}.png", self.frames[-1])
+        if self.live:
+            trust = self.inputs.experiment.trust
+            page = report.live_page(step, self.frames[-1], earlier=self.steps[:-1], trust=trust)
+            write_text_atomically(self.out / "live.html", page)
+            if len(self.frames) == 1:
+                webbrowser.open((self.out / "live.html").absolute().as_uri())
+
+    def _frame(self, step: Step, shadow: Step | None) -> bytes:
+        inputs = self.inputs
+        poses = [(each.reading.pose, each.reading.value) for each in self.steps]
+        readings = [(pose.x_mm, pose.y_mm, value) for pose, value in poses]
+        if shadow is None or inputs.other is None:
+            return report.frame(step, inputs.experiment, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+        views = {inputs.model: (step, inputs.experiment), inputs.other_model: (shadow, inputs.other)}
+        titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
+        return report.frame_of_both(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+
+    def write_results(self, stage: Stage, result: Exploration, *, seed: int, known: Mapping[str, float] | None) -> None:
+        """Write the report, the animation, the result, its samples and the sensor as the run leaves it."""
+        beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
+        page = report.write_page(result, self.frames, seed=seed, model=self.inputs.model, truth=known, beside=beside)
+        write_text_atomically(stage / "report.html", page)
+        write_bytes_atomically(stage / "run.gif", gif(self.frames))
+        write_text_atomically(stage / "result.json", posing.result_json(result))
+        write_text_atomically(stage / "samples.csv", posing.samples_csv(result))
+        learnt = posing.repaired(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
+        write_text_atomically(stage / "sensor.json", learnt.to_json())
+
+
+def _remove_pictures(out: Path) -> None:
+    """Remove what an earlier run has left in `out`, whose journal is gone, lest the pictures of two runs mix."""
+    for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png"):
+        for path in out.glob(pattern):
+            path.unlink()

@@ -12,16 +12,17 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
+from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_path
+from probewise._posterior_samples import MIN_SAMPLES, require_absent, require_samples
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 from probewise.effects import EFFECTS, EdgeShadow
-from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError, shown
+from probewise.errors import FileError, ParameterError, ProbewiseError, shown
 from probewise.recordings import Instrumentation, json_of, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
@@ -53,7 +54,6 @@ __all__ = [
 T = TypeVar("T")
 
 FORMAT = "sensor/1"
-MIN_SAMPLES = 500
 _ALLOWED = "a sensor.json as `probewise calibrate` writes"
 # Effects of single scans or mountings: they explain the recording but do not apply to new scans.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
@@ -138,26 +138,14 @@ class FittedSensor(ShowsItself):
     version: str = __version__
 
     def __post_init__(self) -> None:
-        samples, noise_sd = frozen(self.samples), frozen(self.noise_sd)
-        if samples.ndim != 2 or samples.shape[1] != len(self.names):
-            raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(self.names)})")
-        if len(samples) < MIN_SAMPLES:
-            raise ParameterError("n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
-        if noise_sd.shape != (len(samples),):
-            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one per sample")
-        require_finite("samples", samples)
-        require_finite("noise_sd", noise_sd)
-        if not (noise_sd > 0).all():
-            raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
+        samples, noise_sd = require_samples(self.samples, self.noise_sd, self.names)
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
-        for name, without in self.absent.items():
-            if name not in self.effects or without.shape != (len(samples),):
-                raise ParameterError("absent", name, f"effects of the model, each with {len(samples)} truth values")
+        require_absent(self.absent, self.effects, len(samples))
         if not 1 <= self.n_gaussians <= len(self.names) // 6:
             allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
             raise ParameterError("n_gaussians", self.n_gaussians, allowed)

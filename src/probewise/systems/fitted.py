@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
+from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
+from probewise._posterior_samples import MIN_SAMPLES, require_absent, require_samples
 from probewise._version import __version__
 from probewise.effects import EFFECTS
-from probewise.errors import FileError, ParameterError, ProbewiseError, ShapeError
+from probewise.errors import FileError, ParameterError, ProbewiseError
 from probewise.recordings import strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
@@ -29,7 +30,6 @@ from probewise.systems.table import RunTable
 __all__ = ["FORMAT", "MIN_SAMPLES", "FittedSystem", "read_fitted_system", "samples_csv", "write_fitted_system"]
 
 FORMAT = "system/1"
-MIN_SAMPLES = 500
 _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"
 
 
@@ -83,26 +83,14 @@ class FittedSystem(ShowsItself):
     version: str = __version__
 
     def __post_init__(self) -> None:
-        samples, noise_sd = frozen(self.samples), frozen(self.noise_sd)
-        if samples.ndim != 2 or samples.shape[1] != len(self.names):
-            raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(self.names)})")
-        if len(samples) < MIN_SAMPLES:
-            raise ParameterError("n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
-        if noise_sd.shape != (len(samples),):
-            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one a sample")
-        require_finite("samples", samples)
-        require_finite("noise_sd", noise_sd)
-        if not (noise_sd > 0).all():
-            raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
+        samples, noise_sd = require_samples(self.samples, self.noise_sd, self.names)
         own = {name.partition("[")[0] for name in self.names if name.partition("[")[0] in self.simulator.parameters}
         lacking = [name for name in self.simulator.parameters if name not in own]
         if lacking:
             raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
         if self.known is None and not set(self.effects) <= set(EFFECTS):
             raise ParameterError("effects", list(self.effects), "none without the recording that they were bound about")
-        for name, without in self.absent.items():
-            if name not in self.effects or without.shape != (len(samples),):
-                raise ParameterError("absent", name, f"effects of the model, each with {len(samples)} truth values")
+        require_absent(self.absent, self.effects, len(samples))
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "noise_sd", noise_sd)
 

@@ -6,6 +6,8 @@ The second estimate uses chains twice as long and has few nats of compression: i
 posterior that the first run found (`repartition`). Where the posterior fills so much of the prior that this saves
 nothing, a small run of the same problem is used. The jump distance of the chains, in units of the live points' spread,
 is no substitute: it is smallest for many modes or a thin shell, where the evidence is right.
+
+Neither estimate sees a narrow peak that begins above where both end; `beyond` looks for one.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
+from probewise.nested.beyond import NOTHING, Beyond, look_beyond
 from probewise.nested.evaluate import Samplable
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned
@@ -114,12 +117,14 @@ def checked(
         spent += found.n_calls
         return found if found.complete else None
 
-    now, estimates = first, list[NestedResult]()
+    now, above, estimates = first, NOTHING, list[NestedResult]()
     try:
+        above = _above(first, problem, int(budget - spent), rng)
+        spent += above.n_calls
         route = _second_route(now, problem, move, least_live, rng)
         estimates = [] if (found := estimated(route)) is None else [found]
         if not estimates:
-            return replace(first, n_calls=spent)
+            return _with_peak(replace(first, n_calls=spent), above)
         sharper = replace(route, n_live=max(route.n_live, now.n_live))
         if _suspicious(now, estimates, _APART) and (found := estimated(sharper)) is not None:
             estimates = [found] if _doubtful(estimates[0]) else [*estimates, found]
@@ -129,8 +134,31 @@ def checked(
                 now = again
     except _FailedError as error:
         note = f"the second pass, which checks the evidence, failed: {error}"
-        return replace(now, n_calls=spent, warnings=(*now.warnings, note))
-    return _with_check(now, route.name, estimates, spent)
+        return _with_peak(replace(now, n_calls=spent, warnings=(*now.warnings, note)), above)
+    n_check = sum(each.n_calls for each in estimates) + above.n_calls
+    return _with_peak(_with_check(now, route.name, estimates, n_check, spent), above)
+
+
+def _above(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Beyond:
+    """Look for a higher peak, where the prior's coordinates allow it."""
+    if not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
+        return NOTHING
+    try:
+        return look_beyond(first, problem, max_calls=max_calls, rng=rng)
+    except NotConvergedError as error:
+        raise _FailedError(str(error)) from error
+
+
+def _with_peak(run: NestedResult, above: Beyond) -> NestedResult:
+    """Add a warning where a higher peak raises log Z by more errors than two right estimates would differ."""
+    raised = float(np.logaddexp(run.log_z, above.log_z)) - run.log_z
+    if raised <= DISAGREE * run.log_z_error:
+        return run
+    note = (
+        f"a narrow peak that no live point met lies above the run's end: its log Z is about {above.log_z:.1f}, this "
+        f"run's {run.log_z:.2f} ± {run.log_z_error:.2f}; use more n_live or a prior about the peak"
+    )
+    return replace(run, warnings=(*run.warnings, note))
 
 
 class _FailedError(Exception):
@@ -197,11 +225,11 @@ def _suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -
     return abs(_distance(run, estimates)) > most or _doubtful(estimates[-1])
 
 
-def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], spent: int) -> NestedResult:
+def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_check: int, spent: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
     log_z, error = _combined(estimates)
     distance = _distance(now, estimates)
-    check = Check(name, log_z, error, distance, sum(estimate.n_calls for estimate in estimates))
+    check = Check(name, log_z, error, distance, n_check)
     warnings = now.warnings
     if abs(distance) > DISAGREE:
         warnings = (

@@ -1,0 +1,64 @@
+"""A narrow peak above the end of a run is found; where there is none, little is spent and nothing is said."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from nested_sampling import hard, problems
+
+from probewise.nested import check
+from probewise.nested.beyond import NOTHING, Beyond, look_beyond
+from probewise.nested.moves import SliceMove
+from probewise.nested.sampler import least_live, search
+
+
+@pytest.mark.slow
+def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
+    """Nine of ten such spikes are found, so that all three seeds miss theirs once in a thousand."""
+    known = hard.spike_on_slab()
+    found = []
+    for seed in range(3):
+        rng = np.random.default_rng([seed, 20])
+        run = search(known, rng=rng, n_live=300)
+        assert run.log_z < known.log_z - 3  # not met by the run
+        found.append(look_beyond(run, known, max_calls=run.n_calls, rng=rng).log_z)
+    assert any(abs(log_z - known.log_z) < 1.5 for log_z in found)
+
+
+@pytest.mark.parametrize("name", ["Gaussian 4-D", "circle", "shells 2-D"])
+def test_where_there_is_no_higher_peak_nothing_is_found_for_a_fifth_of_the_cost(name: str) -> None:
+    known = problems.problem(name)
+    run = search(known, rng=np.random.default_rng(1), n_live=100)
+    above = look_beyond(run, known, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
+    assert above.log_z == -math.inf
+    assert above.n_calls <= run.n_calls / 5
+
+
+def test_without_evaluations_left_nothing_is_evaluated() -> None:
+    known = problems.problem("Gaussian 4-D")
+    run = search(known, rng=np.random.default_rng(1), n_live=100)
+    assert look_beyond(run, known, max_calls=10, rng=np.random.default_rng(2)) == NOTHING
+
+
+@pytest.mark.parametrize(("above_it", "doubted"), [(3.0, True), (-6.0, False)])
+def test_a_peak_that_holds_much_of_the_evidence_is_a_doubt(
+    monkeypatch: pytest.MonkeyPatch, above_it: float, doubted: bool
+) -> None:
+    known = problems.problem("Gaussian 4-D")
+    run = search(known, rng=np.random.default_rng(1), n_live=100)
+    monkeypatch.setattr(check, "look_beyond", lambda *_, **__: Beyond(run.log_z + above_it, 77))
+    result = check.checked(
+        run,
+        known,
+        SliceMove(),
+        search,
+        max_cost=5.0,
+        max_calls=None,
+        least_live=least_live(4),
+        rng=np.random.default_rng(2),
+    )
+    assert any("narrow peak" in note for note in result.warnings) == doubted
+    assert result.check is not None
+    assert result.n_calls == run.n_calls + result.check.n_calls

@@ -53,6 +53,7 @@ def test_the_matrix_writes_every_count(results):
     assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)
 
 
+@pytest.mark.slow
 def test_the_diagram_says_of_how_many(results):
     ax = plots.reliability_diagram(reliability(results[:-1]))
     assert [t.get_text() for t in ax.texts] == ["1", "4"]

@@ -76,6 +76,7 @@ def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
     assert "correlated_noise" not in found
 
 
+@pytest.mark.slow
 def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, clean):
     """And a change of the light is not: it is not even asked."""
     skirt = replace(world, concealed=(Halo(0.08, 12.0),)).simulate(plan, rng=None)

@@ -38,16 +38,13 @@ def test_the_sensor_may_be_learnt_along(explore, capsys):
     assert "(sensor)" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "utility"),
     [
         ((), "Finishing(of=InformationGain(), least=0.25)"),
         (("--utility", "entropy"), "ReadingEntropy(bin_width=1.0)"),
-        pytest.param(
-            ("--utility", "about:radius_mm"),
-            "InformationAbout(of=ParameterValue(name='radius_mm', n_bins=16))",
-            marks=pytest.mark.slow,
-        ),
+        (("--utility", "about:radius_mm"), "InformationAbout(of=ParameterValue(name='radius_mm', n_bins=16))"),
     ],
 )
 def test_the_journal_names_the_utility(explore, options, utility):
@@ -204,6 +201,7 @@ def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, mo
     assert "; widest sd" in moves[1]
 
 
+@pytest.mark.slow
 def test_a_known_card_lies_on_the_field_of_the_robot_and_of_the_world(explore, tmp_path, capsys):
     """What it may leave out then holds a tilt; a run goes on only over the same cards."""
     status, lines = explore("--max-readings", 1, "--reference", "120,100,80,60,1")
@@ -237,6 +235,7 @@ def test_the_naive_model_knows_no_card(sensor_file, tmp_path, capsys):
 PAPER = ("--method", "paper", "--nested-stop", "remaining")
 
 
+@pytest.mark.slow
 def test_the_papers_robot_leaves_what_the_other_leaves_and_its_journal_names_it(explore, tmp_path, capsys):
     status, lines = explore(*PAPER, "--max-readings", 1)
     assert status == 0

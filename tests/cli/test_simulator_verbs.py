@@ -43,6 +43,7 @@ def test_a_fit_finds_what_the_readings_were_made_with(fit):
     assert (fit / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_samples_of_a_fit_are_a_column_a_parameter(fit):
     with (fit / "samples.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -74,6 +75,7 @@ def test_a_changed_simulator_does_not_predict_by_the_old_file(folder, fit, capsy
     assert not (folder / "q.csv").exists()
 
 
+@pytest.mark.slow
 def test_an_audit_needs_no_readings(folder):
     lines = (folder / "data.csv").read_text().splitlines()
     (folder / "plan.csv").write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n")

@@ -149,7 +149,8 @@ def struck_session(n):
     return bench.radio.brick, len(sent)
 
 
-@pytest.mark.parametrize("step", [31, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [31, 4])
 def test_wherever_a_signal_strikes_a_measurement_motors_and_led_are_off(step):
     """At every so manyth telegram of a session and the last ten, which end it; the emulator says how it is left."""
     before = signal.signal(signal.SIGTERM, strike)
@@ -232,6 +233,7 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
     assert names == {"journal.jsonl", "frames/001.png", "notes.txt"} | results
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows cannot bound the size of a file")
 def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
     import resource

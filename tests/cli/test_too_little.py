@@ -51,6 +51,7 @@ def test_too_little_to_say_anything_is_a_verdict_of_its_own(harm, said, recordin
     assert said in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_fit_that_does_not_arrive_gives_no_verdict(recording_file, tmp_path, monkeypatch, capsys):
     def never(*_, **__):
         raise NotConvergedError("the fit of the model did not converge")

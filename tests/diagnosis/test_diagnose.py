@@ -191,6 +191,7 @@ def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     assert len(found.next_measurement.plan) <= 102
 
 
+@pytest.mark.slow
 def test_too_few_readings_are_said_to_be_too_few():
     few = recording("paper").take(np.arange(40, 60))
     found = diagnose(few, rng=np.random.default_rng(0))
@@ -281,6 +282,7 @@ def test_false_alarms_stay_within_the_binomial():
     assert sum(alarms) <= 8
 
 
+@pytest.mark.slow
 def test_one_reading_or_equal_readings_are_no_error():
     paper = recording("paper")
     found = diagnose(paper.take(np.arange(50, 51)), rng=np.random.default_rng(0))

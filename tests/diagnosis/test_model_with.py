@@ -16,6 +16,7 @@ SPOT = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)])
 RECORDING = World(SPOT, concealed=(OffsetDrift(6.0),)).simulate(PLAN, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_the_effect_chosen_is_fitted():
     found = model_with(RECORDING, ["offset_drift"], rng=np.random.default_rng(1))
     assert found.effects == ("offset_drift",)

@@ -55,6 +55,7 @@ def test_clients_come_and_go_and_ctrl_c_ends_it(emulator: Emulator, tmp_path: Pa
     assert len(lines) == 8
 
 
+@pytest.mark.slow
 def test_all_byte_values_pass_unchanged(emulator: Emulator) -> None:
     """A cooked terminal would eat 0x03, 0x11 and 0x13, and turn 0x0D into 0x0A."""
     text = bytes(range(0x01, 0x1F))
@@ -70,6 +71,7 @@ def test_all_byte_values_pass_unchanged(emulator: Emulator) -> None:
         assert read[8:] == text
 
 
+@pytest.mark.slow
 def test_a_person_changes_the_scene_by_typing(emulator: Emulator) -> None:
     with emulator() as running:
         running.process.stdin.write(b"uniform:0.5\ngremlins\n")
@@ -79,6 +81,7 @@ def test_a_person_changes_the_scene_by_typing(emulator: Emulator) -> None:
         assert exchanged(running.device, BATTERY, len(ANSWER)) == ANSWER
 
 
+@pytest.mark.slow
 def test_a_disconnection_takes_the_device_away_and_a_link_leads_to_the_new_one(
     emulator: Emulator, tmp_path: Path
 ) -> None:

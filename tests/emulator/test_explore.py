@@ -43,7 +43,7 @@ def asked() -> Experiment:
     return experiment()
 
 
-QUICK = ("corrupt", "half", "error", "all")
+QUICK = ("corrupt", "all")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FAULTS])

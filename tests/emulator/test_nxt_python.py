@@ -115,6 +115,7 @@ brick.stop_program()
 """) == ["echo.rxe", "(2, b'ok\\x00')"]
 
 
+@pytest.mark.slow
 def test_it_finds_the_errors_that_it_knows(client: Callable[[str], list[str]]) -> None:
     assert client("""
 def raised(call, *arguments):

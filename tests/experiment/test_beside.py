@@ -18,6 +18,7 @@ def watched(small, other):
     return list(beside(steps_of(small), other, field, rng=np.random.default_rng(2)))
 
 
+@pytest.mark.slow
 def test_the_same_model_comes_to_believe_the_same(small):
     """Two routes to one posterior: along the run's own choices, and by looking on; 600 samples each."""
     own, other = watched(small, small.experiment(grid=COARSE))[-1]
@@ -27,6 +28,7 @@ def test_the_same_model_comes_to_believe_the_same(small):
     )
 
 
+@pytest.mark.slow
 def test_the_run_goes_its_way_whoever_looks_on(small):
     alone = list(steps_of(small))
     pairs = watched(small, small.experiment(grid=COARSE, blur_mm=0.0, doubt_p=0.0))

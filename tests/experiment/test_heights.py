@@ -73,6 +73,7 @@ def test_every_height_is_a_design_and_the_lowest_signal_is_strongest(small):
     assert first.reading.covariates["height_mm"] == first.reading.pose.height_mm
 
 
+@pytest.mark.slow
 def test_a_run_with_heights_finds_the_circle_and_is_resumed(small, tmp_path):
     path = tmp_path / "journal.jsonl"
 

@@ -198,6 +198,7 @@ def test_a_run_that_ended_is_replayed_without_asking_the_arm(small, tmp_path):
     assert all(same(a, b) for a, b in zip(first.steps, second.steps, strict=True))
 
 
+@pytest.mark.slow
 def test_a_run_that_ended_at_max_readings_can_be_extended(small, found, tmp_path):
     journal = tmp_path / "journal.jsonl"
     short = run(small.arm(), small.experiment(), rng=rng(), max_readings=2, journal=journal)
@@ -412,6 +413,7 @@ def test_of_a_set_of_shapes_the_robot_finds_which_and_where(small):
     assert (np.abs(error) < 5 * result.last.sd[columns][:2]).all()
 
 
+@pytest.mark.slow
 def test_a_set_of_shapes_stops_on_the_lengths_of_the_most_probable(small):
     field = Field(400.0, 300.0)
     shape = AnyOf({"circle": Circle(field, (40.0, 100.0)), "rectangle": Rectangle(field, (80.0, 180.0))})
@@ -439,6 +441,7 @@ def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
     assert Pose(result.readings[0].pose.x_mm, result.readings[0].pose.y_mm) == result.readings[0].pose
 
 
+@pytest.mark.slow
 def test_a_run_that_nothing_explains_does_not_call_itself_known(small):
     """A sensor whose edges are four times as soft as the model believes, asked for half a millimetre."""
     blurred = small.arm(sensor=small.sensor(32.0))
@@ -451,6 +454,7 @@ def test_a_run_that_nothing_explains_does_not_call_itself_known(small):
     assert f"p = {result.last.p_value:.1g}" in result.stop_reason
 
 
+@pytest.mark.slow
 def test_a_coarse_model_may_be_told_not_to_doubt_itself(small):
     """The naive model never fits a reading on the edge; with doubt_p = 0 it goes by its posterior all the same."""
     naive = small.experiment(blur_mm=0.0, doubt_p=0.0)
@@ -481,6 +485,7 @@ def test_a_sensor_that_sees_no_shape_is_refused_before_the_first_reading(small):
     assert arm.poses == []
 
 
+@pytest.mark.slow
 def test_several_readings_are_chosen_at_a_time(small):
     """Poses of a batch are those planned after its first reading, whatever they return."""
     arm = small.arm()
@@ -505,6 +510,7 @@ def test_repeats_are_taken_on_the_spot(small):
     assert places[3] == places[4] == places[5]
 
 
+@pytest.mark.slow
 def test_a_batch_that_was_interrupted_goes_on_bit_for_bit(small, tmp_path):
     whole = run(small.arm(), small.experiment(batch=3, grid=COARSE), rng=rng(), max_readings=6)
     journal = tmp_path / "journal.jsonl"
@@ -517,6 +523,7 @@ def test_a_batch_that_was_interrupted_goes_on_bit_for_bit(small, tmp_path):
     assert all(same(a, b) for a, b in zip(whole.steps, resumed.steps, strict=True))
 
 
+@pytest.mark.slow
 def test_worth_a_second_saves_travel(small):
     """The same circle: shorter ways from reading to reading than without regard to them."""
 

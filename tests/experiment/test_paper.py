@@ -61,7 +61,11 @@ def lattice(experiment, readings, n=(80, 60, 52)):
     return log_z, mean, np.sqrt(weight @ (theta - mean) ** 2)
 
 
-@pytest.mark.parametrize("stop", [EvidenceChange(1e-8), RemainingEvidence(0.05)], ids=["change", "remaining"])
+@pytest.mark.parametrize(
+    "stop",
+    [EvidenceChange(1e-8), pytest.param(RemainingEvidence(0.05), marks=pytest.mark.slow)],
+    ids=["change", "remaining"],
+)
 @pytest.mark.parametrize(
     ("likelihood", "blur_mm", "n"), [(WIDE, 25.0, 6), (WIDE, 25.0, 2), (LEVELS, 0.0, 4)], ids=["ssf", "few", "naive"]
 )
@@ -122,6 +126,7 @@ def same(a, b):
     ).all()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_cut_goes_on_bit_for_bit(small, tmp_path):
     experiment = small.experiment(likelihood=STUDENT, utility=ReadingEntropy(), method=QUICK)
     whole = run(small.arm(), experiment, rng=rng(), max_readings=4)
@@ -144,6 +149,7 @@ def test_a_journal_of_one_method_is_not_gone_on_with_by_another(small, tmp_path)
             run(small.arm(), small.experiment(likelihood=STUDENT, method=other), rng=rng(), journal=journal)
 
 
+@pytest.mark.slow
 def test_of_two_shapes_each_has_a_run_of_its_own_and_the_right_one_wins():
     field = Field(400.0, 300.0)
     shape = AnyOf({"circle": Circle(field, (40.0, 80.0)), "rectangle": Rectangle(field)})

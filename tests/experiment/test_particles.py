@@ -66,7 +66,7 @@ def by_lattice(small, lattice, n):
     return float(logsumexp(log_likelihood)) - math.log(len(lattice)), mean, np.sqrt(weight @ (lattice - mean) ** 2)
 
 
-@pytest.mark.parametrize("n", [2, 4, 5])
+@pytest.mark.parametrize("n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 5))])
 def test_evidence_and_moments_are_those_of_adding_up_all_hypotheses(small, lattice, n):
     """log Z within five of its stated errors (0.05 besides, for the lattice); means within 15 % of the sds."""
     posterior = carried(small, steps=n)
@@ -160,7 +160,8 @@ def test_a_missing_reading_changes_nothing(small):
     assert after.log_z == pytest.approx(before.log_z)
 
 
-@pytest.mark.parametrize("n", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [2, 5])
 def test_a_bridge_finds_the_evidence_anew(small, lattice, n):
     """Whatever evidence was carried: within five stated errors, and 0.05 for the lattice."""
     posterior = replace(carried(small, steps=n, fall_back=None), log_z=123.0)

@@ -113,6 +113,7 @@ def test_laws_of_the_noise_are_densities(law):
     assert total == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_rounded_laws_of_the_noise_are_probabilities_of_cells():
     cells = np.arange(-200.0, 271.0)
     shares, sizes = np.array([0.1]), np.array([3.0])

@@ -13,6 +13,7 @@ def test_two_levels_far_apart_carry_at_least_a_bit_and_noise_free_steps_their_lo
     assert capacity_bits(10.0, 17.0, Readout(0.05, 1.0)) == pytest.approx(3.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_wide_range_carries_its_log_over_the_noise():
     """High-power limit of a Gaussian channel of limited amplitude: log2(range / (sd sqrt(2 pi e))) from above."""
     capacity = capacity_bits(10.0, 60.0, Readout(0.25))

@@ -66,7 +66,7 @@ def prospect_of(forecast, theta, designs, *, instrumentation=None, noise_sd=1.0,
     return Prospect(forecast, Readout(noise_sd, 1.0), theta, weight, theta[:50], designs, plan, rows, cost, goal)
 
 
-@pytest.mark.parametrize("mixture", [ONE, TWO], ids=["one", "two"])
+@pytest.mark.parametrize("mixture", [ONE, pytest.param(TWO, marks=pytest.mark.slow)], ids=["one", "two"])
 @pytest.mark.parametrize("name", SHAPES)
 def test_predictions_near_the_edges_are_those_of_the_closed_form(name, mixture):
     """Places of a fine grid about one edge at a time: where nothing is seen nothing can be wrong."""
@@ -104,7 +104,9 @@ def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(name):
         assert (side * (bound - below) > -1e-9).all()
 
 
-@pytest.mark.parametrize("name", ["rectangle", "triangle", "ellipse", "any of two"])
+@pytest.mark.parametrize(
+    "name", ["rectangle", *(pytest.param(n, marks=pytest.mark.slow) for n in ("triangle", "ellipse", "any of two"))]
+)
 def test_the_map_is_that_of_asking_within_what_the_tables_and_the_levels_hide(name):
     """An error of variance v (in noise variances), were it noise, could hide 1/2 log2(1 + v) bits; here the same 400.
 
@@ -126,6 +128,7 @@ def test_the_map_is_that_of_asking_within_what_the_tables_and_the_levels_hide(na
         assert exact[bits.argmax()] > exact.max() - tolerance
 
 
+@pytest.mark.slow
 def test_heights_orientations_and_repeats_have_maps_of_their_own():
     shape = SHAPES["rectangle"]
     theta = hypotheses(shape, 150)
@@ -185,6 +188,7 @@ def test_an_arm_that_turns_its_sensor_is_asked():
     np.testing.assert_array_equal(InformationGain()(turned), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rectangle", "ellipse"])
 def test_the_whole_map_of_3000_hypotheses_is_quick(name):
     """Aim: 0.1 s of one core; three times that leaves room for a busy machine."""

@@ -220,6 +220,7 @@ def by_importance(made, prospect, goal, design, n=4000):
     return (spread < goal.sd**2).all(axis=1).mean()
 
 
+@pytest.mark.slow
 def test_far_from_the_end_or_without_a_goal_information_decides(made):
     far = narrow(made, Goal((0, 1, 2), 0.2))
     np.testing.assert_array_equal(Finishing()(far), InformationGain()(far))

@@ -32,6 +32,7 @@ def cut_after(n):
     return take
 
 
+@pytest.mark.slow
 def test_a_round_that_was_cut_is_the_round_that_was_not(tmp_path, monkeypatch):
     monkeypatch.setattr("probewise.investigation.folder._KEPT_AGAIN_S", 0.0)
     whole = RoundsFolder(tmp_path / "whole", {"seed": 1}, resume=False).record(1, few_rows(), "", take=TAKE)

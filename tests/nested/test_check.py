@@ -28,7 +28,9 @@ def quiet(problem: object, **options: object) -> NestedResult:
         return run(problem, **{"rng": rng(), "n_live": 100, **options})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", [*hard.IN_TWO])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if k % 3 == 0 else pytest.mark.slow) for k, n in enumerate(hard.IN_TWO)]
+)
 def test_a_hard_evidence_agrees_with_a_fine_grid(name: str) -> None:
     """Midpoint rule on 700 x 700 cells of the unit square, for each family in two dimensions."""
     known = hard.IN_TWO[name]()
@@ -39,6 +41,7 @@ def test_a_hard_evidence_agrees_with_a_fine_grid(name: str) -> None:
     assert float(logsumexp(height)) - math.log(len(u)) == pytest.approx(known.log_z, abs=0.012)
 
 
+@pytest.mark.slow
 def test_the_hierarchical_evidence_is_that_of_draws_from_the_population() -> None:
     """Averaging the likelihood of readings over group means drawn from their population, for fixed mu and tau."""
     known = hard.hierarchical(3)
@@ -55,6 +58,7 @@ def test_the_hierarchical_evidence_is_that_of_draws_from_the_population() -> Non
     assert log_z == pytest.approx(known.log_z, abs=3.9 / math.sqrt(n_eff) + 1e-3)
 
 
+@pytest.mark.slow
 def test_a_right_run_is_confirmed_for_a_fraction_of_its_cost() -> None:
     known = problems.problem("Gaussian 4-D")
     alone = quiet(known, n_live=200, max_cost=1.0)
@@ -98,6 +102,7 @@ def test_a_wrong_evidence_is_doubted_where_nothing_is_left_to_spend() -> None:
     assert result.n_calls <= 1.6 * sound.n_calls
 
 
+@pytest.mark.slow
 def test_a_wrong_evidence_is_cured_by_longer_chains() -> None:
     sound, result = misled(5.0)
     assert not result.warnings
@@ -174,6 +179,7 @@ def test_a_bias_that_all_runs_share_is_found_when_they_are_merged() -> None:
     assert not without.warnings
 
 
+@pytest.mark.slow
 def test_a_refinement_inherits_what_speaks_against_its_run() -> None:
     known = problems.problem("Gaussian 2-D")
     sound = quiet(known)

@@ -713,7 +713,8 @@ def _points(n: int, n_params: int) -> Points:
     return Points(u, u.copy(), np.zeros(n), rng.random(n), rng.random(n))
 
 
-@pytest.mark.parametrize("n_rounds", [24, pytest.param(120, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_rounds", [24, 120])
 def test_memory_beside_the_samples_is_the_same_in_long_runs(n_rounds: int) -> None:
     """What a round takes while it lasts does not grow; what it leaves is its samples.
 

@@ -70,6 +70,7 @@ def test_anesthetic_finds_the_same_evidence(result: NestedResult) -> None:
     assert samples.D_KL() - result.log_start == pytest.approx(result.information, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::FutureWarning")  # ArviZ warns of its own successor on import
 @pytest.mark.parametrize("module", ["arviz", "arviz_base"])
 def test_arviz_gets_equally_weighted_samples_with_their_levels(

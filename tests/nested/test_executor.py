@@ -183,6 +183,7 @@ def test_a_run_with_an_executor_is_taken_up_again_without_and_the_other_way_roun
     assert_same(run(slopes.Slope(), rng=rng(), n_live=50, executor=executor, checkpoint=path), whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "message"),
     [
@@ -244,6 +245,7 @@ def test_n_workers_is_checked() -> None:
         run(problems.plateau(), rng=rng(), n_live=50, executor=AtOnce(), n_workers=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error",
     [

@@ -63,11 +63,13 @@ def test_chains_that_remember_have_an_error_that_knows_it() -> None:
     assert z_sd(found, with_memory=False) > high
 
 
-@pytest.mark.parametrize("options", [pytest.param({}, marks=pytest.mark.slow), {"n_replaced": 7}])
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"n_replaced": 7}])
 def test_independent_points_have_no_memory(options: dict[str, int]) -> None:
     assert np.mean([r.memory for r in runs(0.0, 8, **options)]) < 1.1
 
 
+@pytest.mark.slow
 def test_a_merged_run_remembers_as_its_parts_do() -> None:
     parts = runs(0.8, 4)
     whole = merge(parts, rng=np.random.default_rng(0))

@@ -72,6 +72,7 @@ def test_the_move_leaves_the_uniform_distribution_above_a_bound(move):
         assert kstest(of(found), of(exact.u)).pvalue > 1e-6
 
 
+@pytest.mark.slow
 def test_nested_sampling_by_kernels_finds_the_evidence_of_two_unequal_modes():
     """Three against one, in three parameters; ln Z in closed form, within four of the run's own errors."""
 

@@ -53,6 +53,7 @@ def test_the_count_of_two_runs_by_hand() -> None:
     assert alive_at_death(level, label, birth, birth_label).tolist() == [4, 4, 3, 4, 2, 1]
 
 
+@pytest.mark.slow
 def test_the_order_of_the_points_does_not_matter(terraces: list[NestedResult], rng: np.random.Generator) -> None:
     one = terraces[0]
     rows = rng.permutation(one.n_dead)

@@ -266,6 +266,7 @@ def test_progress_is_told_every_round(rng: np.random.Generator) -> None:
     assert states[-1].log_z == pytest.approx(float(logsumexp(result.log_weight[:-40])) + result.log_z, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_papers_stop_rule_goes_on_for_longer(rng: np.random.Generator) -> None:
     problem = problems.gaussian(2)
     short = run(problem, rng=rng, n_live=50)

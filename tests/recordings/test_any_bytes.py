@@ -3,6 +3,7 @@
 import contextlib
 import json
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,6 +54,7 @@ def test_any_cells_are_survived(rows, tmp_path_factory):
     answered(tmp_path_factory.getbasetemp(), CSV + "\n".join(",".join(r) for r in rows).encode(), JSON)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(value=values, where=st.integers(0, 8))
 def test_any_value_in_any_field_is_survived(value, where, tmp_path_factory):

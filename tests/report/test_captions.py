@@ -93,6 +93,7 @@ def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_pictu
         assert has_green(still) == has_green(moving) == (number < len(frames) - 1)
 
 
+@pytest.mark.slow
 def test_the_page_of_a_search_names_no_colour_that_is_not_there(run, frames):
     page = exploration.write_page(run, frames, seed=4, model="ssf")
     assert named_but_not_there(page) == []

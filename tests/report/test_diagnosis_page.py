@@ -135,6 +135,7 @@ def test_readings_that_share_a_few_values_still_make_steps():
     assert means.size.sum() == 69
 
 
+@pytest.mark.slow
 def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
     """A straight line fitted to noise: what it absorbs, by its posterior samples, makes the band narrower."""
     rng = np.random.default_rng(2)

@@ -201,6 +201,7 @@ def test_drawing_on_given_axes_opens_no_figure(result):
     assert plt.get_fignums() == [sheet.number]
 
 
+@pytest.mark.slow
 def test_the_arms_reach_is_the_same_grey_in_both_drawings():
     view = plots.playing_field(**field())
     check = plots.reach_map(field()["utility"], X, Y, axis_mm=(524.0, 580.0))

@@ -127,6 +127,7 @@ def test_chosen_parameters_are_drawn_in_their_order(result):
         plots.trace_plot(run(Fixed(), rng=np.random.default_rng(0)))
 
 
+@pytest.mark.slow
 def test_a_parameter_that_does_not_vary_is_drawn_too(result):
     theta = np.array(result.theta)
     theta[:, 0] = 3.0

@@ -75,6 +75,7 @@ def test_an_ssf_is_drawn_about_its_place_in_the_sensor_frame():
     assert plots.ssf_by_order({1: blob(), 2: blob()}, {1: -5.0, 2: -7.0}, {1: 0.1, 2: 0.1}).shape == (1, 2)
 
 
+@pytest.mark.slow
 def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     ax = plots.hypothesis_probabilities([str(k) for k in range(20)], np.full(20, 0.05), most=8)
     widths = [bar.get_width() for bar in ax.patches]

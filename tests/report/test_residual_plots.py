@@ -56,6 +56,7 @@ def test_every_axis_says_what_it_carries(figures):
         assert np.atleast_1d(drawing)[-1].get_xlabel(), name
 
 
+@pytest.mark.slow
 def test_no_legend_lies_over_data(figures, images):
     for name, drawing in figures.items():
         assert images[name]

@@ -93,6 +93,7 @@ def test_each_quadrant_has_its_corner_and_its_side():
         assert inner - origin == pytest.approx(corner, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_fields_pages_join_without_gap_or_step():
     sheet = field_sheet((700.0, 340.0), CIRCLE)
     tiles = tiles_of(sheet, "a4")
@@ -145,6 +146,7 @@ def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
     assert b"/Subtype /Image" in sheets_pdf(sheets, paper="a4", title="t")
 
 
+@pytest.mark.slow
 def test_marks_and_targets_are_at_their_places_of_the_field():
     geometry = read_geometry(shipped_geometry())
     sheet = marks_sheet(geometry)

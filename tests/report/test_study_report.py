@@ -90,6 +90,7 @@ def test_what_rows_need_is_drawn_with_its_bounds(study):
     assert len(axes[0, 1].containers) == 1
 
 
+@pytest.mark.slow
 def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
     one = Study({ROWS[1]: study.trials[ROWS[1]]}, 40)
     page = report.write_page(one, command="probewise study --model naive")

@@ -183,7 +183,9 @@ def test_the_field_route_agrees_with_the_closed_forms():
     assert np.abs(summed - closed).max() < 0.04
 
 
-@pytest.mark.parametrize("shape", [Circle(), Ellipse()], ids=["circle", "ellipse"])
+@pytest.mark.parametrize(
+    "shape", [Circle(), pytest.param(Ellipse(), marks=pytest.mark.slow)], ids=["circle", "ellipse"]
+)
 def test_few_nodes_are_enough_for_the_robot(shape):
     """Stated error of FAST_NODES: 1e-4 of the span; of the default: 1e-8. Footprint sd 3 and 10 mm."""
     ssf = FixedMixture([1.0], [[1.0, 2.0]], [[[100.0, 0.0], [0.0, 9.0]]])

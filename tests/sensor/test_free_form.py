@@ -72,6 +72,7 @@ def test_bends_are_found_again_and_free_forms_are_known():
     assert not is_free_form(ONE)
 
 
+@pytest.mark.slow
 def test_a_bent_form_sees_what_the_sum_over_its_pixels_sees():
     """Route one: closed forms of each Gaussian; route two: the field, pixel by pixel (paper, eq. discreteR)."""
     bent = free_form(ONE, BENDS[:1])

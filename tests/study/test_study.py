@@ -27,6 +27,7 @@ def timeless(study):
     }
 
 
+@pytest.mark.slow
 def test_the_robot_knows_the_circle_when_it_stops():
     trial = run_trial(Trial(REFERENCE, 2))
     assert trial["reached"]
@@ -37,6 +38,7 @@ def test_the_robot_knows_the_circle_when_it_stops():
     assert trial["bits_at_white"] < trial["bits"]
 
 
+@pytest.mark.slow
 def test_a_run_that_may_not_go_on_is_a_miss(study):
     table = study[0].table()
     for row in ROWS:
@@ -46,6 +48,7 @@ def test_a_run_that_may_not_go_on_is_a_miss(study):
         assert table[row].reached.value == 0
 
 
+@pytest.mark.slow
 def test_the_papers_method_stands_beside_ours_on_the_same_circle():
     """The first place is drawn by the same rule from other samples; levels come from readings before the run."""
     ours, paper, _, naive = rows = paper_rows(nested_stop="remaining")

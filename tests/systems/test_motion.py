@@ -90,6 +90,7 @@ def test_time_that_falls_within_a_run_is_refused_with_the_row():
         _ = RowsInRuns(_table([0.0, 1.0, 0.5])).rows
 
 
+@pytest.mark.slow
 def test_the_step_is_halved_until_readings_stand_still():
     simulator = Simulator(
         "y",

@@ -119,6 +119,7 @@ def test_a_single_case_conceals_its_effect_at_its_size():
     assert abs(noise.std() - 1) < 4 / np.sqrt(2 * len(noise))
 
 
+@pytest.mark.slow
 def test_the_name_of_the_noise_is_part_of_the_truth():
     clean = number_of("clean", other_noise=True)
     named = [k for k in range(clean, clean + 120) if stratum_of(k)[0] == stratum_of(clean)[0]]
@@ -143,6 +144,7 @@ def test_a_pair_is_two_effects_that_can_be_told_apart():
     assert abs(truth.cosine) < 0.5
 
 
+@pytest.mark.slow
 def test_an_alias_is_what_three_nats_cannot_tell_apart():
     made = case(number_of("alias", skip=3))
     assert made.truth.plan == "paper"
@@ -151,6 +153,7 @@ def test_an_alias_is_what_three_nats_cannot_tell_apart():
     assert made.truth.alias.effect.name not in made.truth.combination
 
 
+@pytest.mark.slow
 def test_an_effect_outside_the_vocabulary_is_unknown_and_one_gaussian_more_is_clean():
     assert case(number_of("outside")).truth.combination == ("unknown",)
     trap = case(number_of("ssf_order")).truth
@@ -180,6 +183,7 @@ def test_the_truth_is_strict_json_and_the_recording_does_not_tell(tmp_path):
     assert not any(name in text for name in (*INSIDE, *OUTSIDE, *SSFS))
 
 
+@pytest.mark.slow
 def test_what_belongs_to_a_scan_is_not_in_the_readings_kept_back():
     made = case(number_of("single", size=8.0, skip=SINGLES.index("scan_misplacement")))
     assert made.truth.combination == ("scan_misplacement",)

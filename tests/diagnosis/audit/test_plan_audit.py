@@ -122,6 +122,7 @@ def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
     assert {name for name, _ in plan.rows_by_pattern()} <= plan.patterns.keys()
 
 
+@pytest.mark.slow
 def test_a_flat_surface_shows_no_edge():
     plan = thinned(paper_plan())
     flat = replace(plan, patterns=dict.fromkeys(plan.patterns, Uniform(1.0)))

@@ -60,6 +60,7 @@ def test_the_folded_density_sums_to_one():
     assert abs(ratio.mean() - 1.0) < 4.4 * 1.0 / 200
 
 
+@pytest.mark.slow
 def test_where_orders_differ_in_density_what_is_drawn_has_the_folded_one():
     """Three Gaussians: shares of folded draws in two halves of the domain, against the folded density by importance."""
     prior = prior_of(3)

@@ -79,6 +79,7 @@ def diagnosed(truth):
     )
 
 
+@pytest.mark.slow
 def test_a_users_own_effect_is_named_with_its_size():
     found = diagnosed({"start": 60.0, "tau_s": 120.0, "around": 8.0})
     assert found.verdict == "named"

@@ -21,6 +21,7 @@ def drawn(center, factor, log_p, seed, n_walkers=400, n_wanted=800):
     return anneal(first, log_q, log_p, n_moves=6, n_wanted=n_wanted, rng=rng)
 
 
+@pytest.mark.slow
 def test_a_wrong_approximation_is_put_right():
     """Ten parameters, correlated by 0.8 in pairs; the approximation is off by an sd, too wide and uncorrelated."""
     n = 10

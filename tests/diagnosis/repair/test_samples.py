@@ -40,6 +40,7 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     assert total_variation(mixture, sensor.field) < 0.1
 
 
+@pytest.mark.slow
 def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
     """An earlier sensor whose white level is twenty of its sds off: the fit rests at six of them."""
     rng = np.random.default_rng(0)

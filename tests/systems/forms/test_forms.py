@@ -129,6 +129,7 @@ def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
     assert form.sentence(np.array([0.25]), np.array([0.01])) == "the amplifier bends by 0.250 ± 0.010 per V"
 
 
+@pytest.mark.slow
 def test_forms_of_a_rate_add_to_the_law():
     """Closed form: x' = b - a x from x = 0 goes as (b / a) (1 - exp(-a t))."""
     simulator = Simulator(

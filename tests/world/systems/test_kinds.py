@@ -20,7 +20,11 @@ def _case(kind, said='noise = {"sd": 0.5}', seed=5):
     return SystemCase(1, 0, Stratum("clean"), drawn, (), noise, said, labels, noise_free, np.round(noise_free, 9))
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize(
+    "kind",
+    [*KINDS[:4], *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS[4:])],
+    ids=lambda kind: kind.name,
+)
 def test_the_owners_file_predicts_what_the_world_does(kind, tmp_path):
     case = _case(kind)
     file, path, *_ = write_system_case(case, tmp_path)

@@ -78,7 +78,7 @@ def test_a_case_follows_from_the_seed_and_its_number(number, quick):
     assert one != truth_of(draw_system_case(13, number))
 
 
-@pytest.mark.parametrize("number", range(20))
+@pytest.mark.parametrize("number", [*range(4), *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 20))])
 def test_a_case_of_every_stratum_holds_what_it_says(number, quick):
     case = draw_system_case(12, number)
     assert len(case.effects) == {"clean": 0, "pair": 2}.get(case.stratum.kind, 1)

@@ -85,6 +85,7 @@ def test_it_reads_the_ultrasonic_sensor(client: Callable[[str], list[str]]) -> N
     assert client("print(brick.get_sensor(nxt.sensor.Port.S4, nxt.sensor.generic.Ultrasonic).get_sample())") == ["42"]
 
 
+@pytest.mark.slow  # on the wall clock: a busy machine polls too late
 def test_it_turns_a_motor(client: Callable[[str], list[str]]) -> None:
     """Its own tolerance for turns over Bluetooth is 70 degrees."""
     there, back = client("""

@@ -6,16 +6,19 @@ import difflib
 import inspect
 import math
 import os
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, UnitWarning
 
 __all__ = [
     "did_you_mean",
+    "radians_meant",
     "require_callable",
     "require_finite_number",
     "require_flag",
@@ -36,6 +39,7 @@ __all__ = [
     "require_whole",
 ]
 
+_FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not cut off
 
 
@@ -98,6 +102,14 @@ def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
     if len(listed) > _MOST_LISTED:
         listed = f"{listed[:_MOST_LISTED]} ... ({len(known)} names)"
     raise ParameterError(name, value, listed + did_you_mean(value, known))
+
+
+def radians_meant(name: str, values: float | NDArray[np.float64]) -> None:
+    """Warn of angles beyond a full turn either way, which somebody may have given in degrees."""
+    widest = abs(values) if isinstance(values, float) else float(np.abs(values).max(initial=0.0))
+    if _FULL_TURN_RAD < widest < math.inf:
+        said = f"{name} reaches {widest:.6g} rad, beyond a full turn (6.283 rad): convert degrees with numpy.radians"
+        warnings.warn(said, UnitWarning, stacklevel=3)
 
 
 def did_you_mean(value: object, known: Iterable[str]) -> str:

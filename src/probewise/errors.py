@@ -108,5 +108,13 @@ class NotSavedWarning(UserWarning):
     """Warn that intermediate results could not be saved; the computation goes on."""
 
 
+class PipeWarning(UserWarning):
+    """Warn that reading waits for a pipe, which whoever writes to it ends."""
+
+
+class UnitWarning(UserWarning):
+    """Warn of a value that looks as if it were in another unit, such as degrees for radians."""
+
+
 class LowBatteryWarning(UserWarning):
     """Warn of a battery too low to drive the instrument reliably or for much longer."""

@@ -269,6 +269,7 @@ def test_a_wrong_command_line_is_refused_in_one_line(arguments, tmp_path, capsys
         (["explore", "--sensor", "s.json", "--out", "o", "--max-raedings=5"], "did you mean --max-readings?"),
         (["explore", "--sensor", "s.json", "--out", "o", "--shape", "circel"], "did you mean circle?"),
         (["arm", "raed"], "did you mean read?"),
+        (["calibrate", "a.csv", "b.csv", "--out", "o"], "arguments: b.csv (see probewise calibrate --help)"),
         (["arm", "jog", "base", "-5", "--dryrun"], "did you mean --dry-run?"),
         (["arm", "read", "--zzz"], "no option --zzz (see"),
     ],
@@ -276,6 +277,27 @@ def test_a_wrong_command_line_is_refused_in_one_line(arguments, tmp_path, capsys
 )
 def test_what_was_perhaps_meant_is_said(arguments, says, tmp_path, capsys):
     assert says in refused(capsys, tmp_path / "out", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "meant"),
+    [
+        ("--arm", "emulatr", "emulator"),
+        ("--arm", "ntx:/dev/rfcomm0", "nxt"),
+        ("--utility", "entorpy", "entropy"),
+        ("--truth", "cirle:600,260,90", "circle"),
+    ],
+)
+def test_a_misspelt_value_is_told_with_what_was_perhaps_meant(option, value, meant, sensor_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    said = refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, option, value, "--quiet")
+    assert f"did you mean {meant}?" in said
+
+
+def test_more_live_points_than_any_run_needs_are_refused(recording_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    said = refused(capsys, out, "calibrate", recording_file, "--out", out, "--live", 10**7, "--quiet")
+    assert "--live is 10000000; allowed: up to 100,000" in said
 
 
 def test_a_package_that_is_missing_is_named_and_not_the_address(tmp_path, monkeypatch, capsys):

@@ -5,7 +5,7 @@ import datetime
 import numpy as np
 import pytest
 
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, UnitWarning
 from probewise.recordings import (
     Disc,
     HalfPlane,
@@ -216,3 +216,9 @@ def test_rows_are_taken_by_number_by_truth_and_by_slice():
         assert whole.plan.take(rows).x_mm.tolist() == whole.plan.x_mm[:3].tolist()
     assert len(whole.take([])) == 0
     assert whole.take([-1]).readings[0] == whole.readings[-1]
+
+
+def test_degrees_given_where_radians_are_meant_are_warned_of():
+    with pytest.warns(UnitWarning, match="orientation_rad reaches 90 rad, .* convert degrees"):
+        Recording.from_arrays(**THREE, orientation_rad=[0, 45, -90])
+    Recording.from_arrays(**THREE, orientation_rad=[0, np.pi, -2 * np.pi])

@@ -1,12 +1,14 @@
 """The recording format, rule by rule, and what a file that breaks one is answered."""
 
 import json
+import os
 import sys
+import threading
 
 import numpy as np
 import pytest
 
-from probewise.errors import FileError
+from probewise.errors import FileError, PipeWarning
 from probewise.recordings import (
     Disc,
     HalfPlane,
@@ -261,3 +263,16 @@ def test_a_prediction_with_a_spread_of_nothing_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("mean,sd,log_density\n1,1,\n1,0,2\n")
     with pytest.raises(FileError, match="row 3, column sd"):
         read_prediction(tmp_path / "p.csv")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")
+def test_who_waits_for_a_pipe_is_told(tmp_path):
+    put(tmp_path, "x_mm,y_mm,reading,pattern\n0,0,1,white\n")
+    content = (tmp_path / "rec.csv").read_bytes()
+    (tmp_path / "rec.csv").unlink()
+    os.mkfifo(tmp_path / "rec.csv")
+    writer = threading.Thread(target=lambda: (tmp_path / "rec.csv").write_bytes(content))
+    writer.start()
+    with pytest.warns(PipeWarning, match="rec.csv is a pipe"):
+        assert len(read_recording(tmp_path / "rec.csv")) == 1
+    writer.join()

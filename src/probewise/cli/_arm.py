@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
+from probewise._kinds import did_you_mean
 from probewise.cli._common import CommandError, a_path, caution
 from probewise.errors import ParameterError
 
@@ -114,7 +115,7 @@ def parse_arm(text: str) -> ArmName:
         return ArmName("nxt", port)
     if text.endswith(".py"):
         return ArmName("file", text)
-    raise ParameterError("--arm", text, ARMS)
+    raise ParameterError("--arm", text, ARMS + did_you_mean(kind, ("simulated", "emulator", "nxt")))
 
 
 def open_own(path: str, *, start_s: float = 0.0) -> OwnInstrument:

@@ -64,7 +64,10 @@ class OneLineParser(argparse.ArgumentParser):
         if self._subparsers is None:  # else words may be options of a verb
             for word in itertools.takewhile(lambda word: word != "--", words):
                 self._require_known(word.partition("=")[0])
-        return super().parse_known_args(words, namespace)
+        parsed, surplus = super().parse_known_args(words, namespace)
+        if surplus and self._subparsers is None:
+            self.error(f"unrecognized arguments: {' '.join(surplus)}")
+        return parsed, surplus
 
     def _require_known(self, name: str) -> None:
         options = self._option_string_actions

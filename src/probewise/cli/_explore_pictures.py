@@ -71,7 +71,15 @@ class Pictures:
     def write_results(self, stage: Stage, result: Exploration, *, seed: int, known: Mapping[str, float] | None) -> None:
         """Write the report, the animation, the result, its samples and the sensor as the run leaves it."""
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
-        page = report.write_page(result, self.frames, seed=seed, model=self.inputs.model, truth=known, beside=beside)
+        page = report.write_page(
+            result,
+            self.frames,
+            seed=seed,
+            model=self.inputs.model,
+            truth=known,
+            beside=beside,
+            unit=self.inputs.sensor.instrumentation.unit,
+        )
         write_text_atomically(stage / "report.html", page)
         write_bytes_atomically(stage / "run.gif", gif(self.frames))
         write_text_atomically(stage / "result.json", posing.result_json(result))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from probewise._kinds import did_you_mean
 from probewise.errors import ParameterError
 from probewise.experiment import Hidden
 from probewise.scene import SHAPES, Card, Field
@@ -54,7 +55,9 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
     name, _, listed = text.rpartition(":")
     name = name or names[0]
     if name not in SHAPES:
-        raise ParameterError("--truth", text, f"a shape of {', '.join(SHAPES)} before the colon")
+        raise ParameterError(
+            "--truth", text, f"a shape of {', '.join(SHAPES)} before the colon{did_you_mean(name, SHAPES)}"
+        )
     shape = SHAPES[name](field)
     allowed = f"{len(shape.prior.names)} numbers, {','.join(shape.prior.names)}"
     try:

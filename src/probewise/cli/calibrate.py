@@ -13,6 +13,9 @@ from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
 __all__ = ["VERB"]
 
+MOST_LIVE = 100_000
+"""More live points than this take days and all memory."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Fill the verb's parser."""
@@ -97,6 +100,8 @@ def _enough_live(n_live: int, orders: Sequence[int]) -> int:
     """Refuse, before any work, live points too few for the parameters of so many Gaussians."""
     from probewise.nested import LIVE_PER_PARAM, least_live
 
+    if n_live > MOST_LIVE:
+        raise ParameterError("--live", n_live, f"up to {MOST_LIVE:,}; time and memory grow with it")
     n_params = 6 * max(orders) + 2
     least, most = least_live(n_params), (n_live // LIVE_PER_PARAM - 2) // 6
     if n_live >= least:

@@ -23,7 +23,7 @@ from probewise.experiment.kinds import Kind
 from probewise.experiment.particles import Particles
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.setting import Experiment, OneScan
-from probewise.experiment.simulation import Model, chain_of, levels_of, posing, scale_of
+from probewise.experiment.simulation import Model, bin_width_of, chain_of, levels_of, posing, scale_of
 from probewise.inference import Naive
 from probewise.inquiry import ReadingEntropy
 from probewise.nested import (
@@ -189,7 +189,7 @@ def paper_experiment(
         raise ParameterError("naive", naive, 'None, but with the model "naive"')
     pose = partial(
         posing(sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm),
-        utility=ReadingEntropy(scale.step or float(sensor.noise_sd.mean())),
+        utility=ReadingEntropy(bin_width_of(sensor)),
         n_samples=_N_SAMPLES,
         n_live=N_LIVE,
         method=NestedSampling(stop=NESTED_STOP[nested_stop]),

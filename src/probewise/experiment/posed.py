@@ -8,7 +8,7 @@ from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
 from probewise.experiment.paper import paper_experiment
 from probewise.experiment.setting import Experiment
-from probewise.experiment.simulation import Model, experiment_for, usual_trust
+from probewise.experiment.simulation import Model, bin_width_of, experiment_for, usual_trust
 from probewise.inference import Naive
 from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
 from probewise.nested import NestedStop
@@ -56,7 +56,8 @@ def pose_experiment(
     ParameterError
         If an option does not go with the method.
     """
-    worth = utility_named(utility) if isinstance(utility, str) else utility
+    bin_width = bin_width_of(sensor)
+    worth = utility_named(utility, bin_width=bin_width) if isinstance(utility, str) else utility
     if method == "paper":
         refused = (
             ("utility", utility, worth is None or isinstance(worth, ReadingEntropy), "entropy, which is the paper's,"),

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._kinds import did_you_mean
 from probewise.arm import LegoScale, Pose, Reach, Reading, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
@@ -45,6 +46,7 @@ __all__ = [
     "Model",
     "Streams",
     "arm_over",
+    "bin_width_of",
     "calibrated_height",
     "chain_of",
     "experiment_for",
@@ -94,6 +96,11 @@ def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = Non
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
 
 
+def bin_width_of(sensor: FittedSensor) -> float:
+    """Give the width of the bins that the paper's entropy sorts readings into: the instrument's step, or its noise."""
+    return scale_of(sensor.instrumentation).step or float(sensor.noise_sd.mean())
+
+
 def shape_named(names: Sequence[str], field: Field) -> Shape:
     """Build the hypothesis: one shape, or a set of shapes.
 
@@ -105,7 +112,9 @@ def shape_named(names: Sequence[str], field: Field) -> Shape:
     for name in names:
         if name not in SHAPES:
             raise ParameterError(
-                "shape", name, f"one of {', '.join(SHAPES)}, or several; or a value of probewise.scene"
+                "shape",
+                name,
+                f"one of {', '.join(SHAPES)}, or several; or a value of probewise.scene{did_you_mean(name, SHAPES)}",
             )
     chosen = {name: SHAPES[name](field) for name in dict.fromkeys(names)}
     return AnyOf(chosen) if len(chosen) > 1 else next(iter(chosen.values()))

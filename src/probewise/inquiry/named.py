@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from probewise._kinds import did_you_mean
 from probewise.errors import ParameterError
 from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.labels import ParameterValue, WhichShape
@@ -12,18 +13,26 @@ __all__ = ["UTILITY_NAMES", "utility_named"]
 UTILITY_NAMES = ("finishing", "information", "entropy", "per-second", "about:PARAMETER", "which-shape")
 
 
-def utility_named(text: str) -> Utility:
-    """Build a utility from its name, such as "entropy" or "about:radius_mm"."""
+def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
+    """Build a utility from its name, such as "entropy" or "about:radius_mm".
+
+    Parameters
+    ----------
+    text
+        The name.
+    bin_width
+        Width of the bins of "entropy", in the unit of readings: the step of the instrument.
+    """
     name, _, parameter = text.partition(":")
     if name == "about" and parameter:
         return InformationAbout(ParameterValue(parameter))
     plain: dict[str, Utility] = {
         "finishing": Finishing(),
         "information": InformationGain(),
-        "entropy": ReadingEntropy(),
+        "entropy": ReadingEntropy(bin_width),
         "per-second": PerSecond(),
         "which-shape": InformationAbout(WhichShape()),
     }
     if text not in plain:
-        raise ParameterError("utility", text, ", ".join(UTILITY_NAMES))
+        raise ParameterError("utility", text, ", ".join(UTILITY_NAMES) + did_you_mean(name, UTILITY_NAMES))
     return plain[text]

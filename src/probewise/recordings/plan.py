@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen, frozen_int, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import require_finite_number, require_kind
+from probewise._kinds import radians_meant, require_finite_number, require_kind
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     Table,
@@ -189,12 +189,14 @@ class Plan:
         sizes = [np.size(values) for values in (x_mm, y_mm) if np.ndim(values) > 0]
         x = column("x_mm", x_mm, sizes[0] if sizes else 1)
         n_points = len(x)
+        turns = column("orientation_rad", orientation_rad, n_points)
+        radians_meant("orientation_rad", turns)
         described = named_patterns(patterns)
         code, scan_names = scan_codes(scan, n_points)
         return cls(
             x_mm=x,
             y_mm=column("y_mm", y_mm, n_points),
-            orientation_rad=column("orientation_rad", orientation_rad, n_points),
+            orientation_rad=turns,
             time_s=np.arange(n_points, dtype=np.float64)
             if time_s is None
             else column("time_s", seconds(time_s), n_points),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
-from probewise.errors import FileError
+from probewise.errors import FileError, PipeWarning
 
 __all__ = ["read_bytes", "read_text"]
 
@@ -19,6 +20,8 @@ def read_bytes(path: Path, what: str) -> bytes:
     """
     try:
         device = path.is_char_device() or path.is_block_device()  # /dev/zero never ends
+        if path.is_fifo():
+            warnings.warn(f"{path} is a pipe: reading it waits for its writer to end", PipeWarning, stacklevel=2)
         content = b"" if device else path.read_bytes()
     except FileNotFoundError as error:
         raise FileError(path, "there is no such file", what) from error

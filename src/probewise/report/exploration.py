@@ -20,7 +20,7 @@ from probewise.report.plots import (
     png,
     posterior_widths,
 )
-from probewise.report.words import count, interval, number, probability, unit_of, with_error, without_unit
+from probewise.report.words import count, interval, number, probability, unit_name, unit_of, with_error, without_unit
 from probewise.scene import outlines
 
 __all__ = [
@@ -196,10 +196,11 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
     )
 
 
-def steps_table(run: Exploration) -> Markup:
-    """Build the table of steps: where, what, what was then known."""
+def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
+    """Build the table of steps: where, what (in the unit of readings), what was then known."""
+    reading = f"reading ({unit_name(unit)})" if unit else "reading"
     return table(
-        ("number", "at (mm)", "reading (LEGO units)", "widest sd (mm)", "information so far (bits)"),
+        ("number", "at (mm)", reading, "widest sd (mm)", "information so far (bits)"),
         (
             (
                 str(s.number),
@@ -221,6 +222,7 @@ def write_page(
     model: str,
     truth: Mapping[str, float] | None = None,
     beside: Mapping[str, Sequence[Step]] | None = None,
+    unit: str = "LEGO",
 ) -> str:
     """Write the whole page.
 
@@ -236,6 +238,8 @@ def write_page(
         Parameters of what lay there, by name, where it is known.
     beside
         What other sensor models made of the same readings, step by step, by name of the model.
+    unit
+        Of readings.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
@@ -289,7 +293,7 @@ def write_page(
                     png(information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()})),
                     "Information about the shape: prior minus posterior differential entropy.",
                 ),
-                steps_table(run),
+                steps_table(run, unit),
             ),
         ),
         Section(

@@ -209,12 +209,12 @@ def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, n
         ax.set_aspect("equal")
         return
     ax.annotate("base turns about this axis", (0, knee[1] + 40), xytext=(10, 12), **_LABEL)
-    ax.annotate("shoulder", (float(joint[0]), float(joint[1])), xytext=(-30, 44), ha="right", **_LABEL)
+    ax.annotate("shoulder", (float(joint[0]), float(joint[1])), xytext=(30, -22), **_LABEL)
     ax.annotate("elbow", (float(knee[0]), float(knee[1]) + _ROD_MM), xytext=(30, -2), **_LABEL)
     said = f"sensor, {geometry.read_height_mm:g} mm above\nthe surface when it reads"
-    ax.annotate(said, (float(eye[0]), float(eye[1])), xytext=(-16, -40), **_LABEL)
+    ax.annotate(said, (float(eye[0]), float(eye[1])), xytext=(-90, -36), **_LABEL)
     far = float(eye[0])
-    ax.set(xlim=(-120, far + 130), ylim=(-110, float(knee[1]) + 110), aspect="equal")
+    ax.set(xlim=(-120, far + 130), ylim=(-140, float(knee[1]) + 110), aspect="equal")
     ax.set_yticks([tick for tick in ax.get_yticks() if 0 <= tick <= knee[1] + 60])
     tidy(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,6 +67,27 @@ def test_readings_are_those_of_the_simulated_arm_with_the_same_seed(clock: Virtu
     found = np.array([reading.value for reading in readings])
     assert (abs(found - same) <= 1 + 0.05 * same).all()
     assert np.mean(found == same) > 0.4
+
+
+@pytest.mark.parametrize("play", [True, False])
+def test_joints_stand_where_their_counters_say_but_for_half_a_count(
+    clock: VirtualClock, tmp_path: Path, play: bool
+) -> None:
+    """Neither more on one side than on the other: a bias of half a count is an edge that lies 0.15 mm elsewhere."""
+    text = arm.shipped_geometry().read_text(encoding="utf-8")
+    file = tmp_path / "arm.toml"
+    file.write_text(text if play else re.sub(r"play_deg = [\d.]+", "play_deg = 0", text), encoding="utf-8")
+    bench = set_up(read_geometry(file), WORLD, CIRCLE, clock, seed=SEED)
+    geometry = arm.read_geometry(file)
+    machine = BrickMachine(Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock), geometry)
+    off = []
+    with arm.LegoArm(machine, geometry, clock=clock) as lego:
+        for x_mm, y_mm in some_places(8).tolist():
+            lego.go_down(x_mm, y_mm)
+            true_rad = np.array([joint.angle_rad for joint in bench.arm.joints])
+            off.append((lego.angles_rad - true_rad) * [abs(joint.counts_per_rad) for joint in geometry.joints])
+    assert np.abs(off).max() < 0.5 + 1e-6
+    assert np.min(off) < 0 < np.max(off)
 
 
 class Cut:

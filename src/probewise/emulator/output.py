@@ -10,6 +10,7 @@ It reproduces the behaviour of LEGO's firmware 1.28 to 1.31. Important for a hos
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -156,8 +157,12 @@ class Output:
 
     @property
     def _shown_deg(self) -> int:
-        """Reading of the motor's encoder, in whole degrees."""
-        return int(self.motor.angle_deg // 1)
+        """Reading of the motor's encoder: the nearest whole degree, so that home lies in the middle of count 0.
+
+        Where the edges of an encoder's counts lie is chance. With home at an edge every count would stand for half a
+        degree more than it says, on the average, and every place for the same fraction of a millimetre beside it.
+        """
+        return math.floor(self.motor.angle_deg + 0.5)
 
     def _order(self, run_state: int, power: int) -> None:
         if run_state == self.run_state != RunState.IDLE and power == self.set_power:

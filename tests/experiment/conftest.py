@@ -111,7 +111,12 @@ def small_experiment(**changes):
 
 
 @pytest.fixture
-def small():
+def small(small_for_all):
+    return small_for_all
+
+
+@pytest.fixture(scope="session")
+def small_for_all():
     return SimpleNamespace(
         circle=SmallCircle, sensor=EdgeSensor, gaussian=Gaussian, arm=QuickArm, experiment=small_experiment
     )

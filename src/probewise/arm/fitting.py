@@ -15,20 +15,12 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from probewise._arrays import FloatArray, floats
-from probewise.arm.geometry import Accuracy, Geometry, placed_mm
+from probewise.arm.geometry import Accuracy, Geometry
 from probewise.arm.marks import LEAST_MARKS
+from probewise.arm.uncertainty import FITTED, RULER_SDS, places_of, slopes_mm, values_of
 from probewise.errors import ParameterError, ProbewiseError, ShapeError
 
-__all__ = ["FITTED", "RULER_SDS", "FittedGeometry", "MarksDisagreeError", "fit_geometry"]
-
-FITTED = (
-    *("base home", "shoulder home", "elbow home", "upper link", "lower link"),
-    *("base x", "base y", "shoulder forward", "shoulder height"),
-)
-"""What is fitted, angles in radians, lengths in mm; the sensor's own lengths go with those of the shoulder."""
-
-RULER_SDS = np.array([*np.radians([5.0, 5.0, 5.0]), 5.0, 5.0, 10.0, 10.0, 10.0, 10.0])
-"""So well is each known before, from a ruler and by eye."""
+__all__ = ["FittedGeometry", "MarksDisagreeError", "fit_geometry"]
 
 LEAST_P = 1e-3  # marks that fit by chance no better than this disagree
 MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # of a geometry that the marks determine
@@ -116,16 +108,16 @@ def fit_geometry(
         raise ParameterError("touch_mm", touch_mm, "greater than 0")
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
-    before = _values_of(geometry)
+    before = values_of(geometry)
     values, total, jacobian = _solve(geometry, before, turned, marks, touch_mm)
     n = int(np.isfinite(marks).sum())
     p_value = float(chi2.sf(total, n))
-    residuals = marks - _places_mm(geometry, values, turned)
+    residuals = marks - places_of(geometry, values, turned)
     if p_value < LEAST_P:
         raise MarksDisagreeError(_disagreement(geometry, before, turned, marks, touch_mm, residuals))
     covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
     fitted = _with_values(geometry, values)
-    accuracy = _accuracy(fitted, values, covariance, len(marks))
+    accuracy = _accuracy(fitted, covariance, len(marks))
     if accuracy.height_sd_mm > MOST_HEIGHT_SD_MM or accuracy.place_sd_mm > MOST_PLACE_SD_MM:
         raise ParameterError(
             "marks",
@@ -146,7 +138,7 @@ def _solve(
     known = np.isfinite(marks)
 
     def misses(scaled: FloatArray) -> FloatArray:
-        off = (_places_mm(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
+        off = (places_of(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
         return np.concatenate([off, scaled])
 
     found = least_squares(misses, np.zeros(len(before)), method="lm", xtol=1e-12, ftol=1e-12)
@@ -168,7 +160,7 @@ def _disagreement(
         others = np.arange(len(marks)) != k
         values, total, _ = _solve(geometry, before, turned[others], marks[others], touch_mm)
         if chi2.sf(total, int(np.isfinite(marks[others]).sum())) >= LEAST_P:
-            away = float(np.sqrt(np.nansum((marks[k] - _places_mm(geometry, values, turned[[k]])[0]) ** 2)))
+            away = float(np.sqrt(np.nansum((marks[k] - places_of(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
     return (
         f"{off}; allowed: a sheet at true scale, gears that do not slip, gear_ratio as built, no joint that is loose; "
@@ -176,18 +168,11 @@ def _disagreement(
     )
 
 
-def _accuracy(geometry: Geometry, values: FloatArray, covariance: FloatArray, n_marks: int) -> Accuracy:
+def _accuracy(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
     places = geometry.spread_mm
     if not len(places):
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
-    home = np.array([joint.home_rad for joint in geometry.joints])
-    turned = geometry.angles_rad(places, geometry.read_height_mm) - home
-    slopes = np.empty((len(places), 3, len(values)))
-    for k, step in enumerate(RULER_SDS * 1e-4):
-        up, down = values.copy(), values.copy()
-        up[k] += step
-        down[k] -= step
-        slopes[:, :, k] = (_places_mm(geometry, up, turned) - _places_mm(geometry, down, turned)) / (2 * step)
+    slopes = slopes_mm(geometry, places)
     variances = np.einsum("nik,kl,nil->ni", slopes, covariance, slopes)
     # How the whole field is stretched: the mean of what displaces places away from their middle.
     arms = places - places.mean(axis=0)
@@ -197,23 +182,7 @@ def _accuracy(geometry: Geometry, values: FloatArray, covariance: FloatArray, n_
         float(np.sqrt(variances[:, :2].mean())),
         float(np.sqrt(variances[:, 2].max())),
         float(np.sqrt(stretch @ covariance @ stretch)),
-    )
-
-
-def _values_of(geometry: Geometry) -> FloatArray:
-    homes = [joint.home_rad for joint in geometry.joints]
-    return np.array([*homes, *geometry.links_mm, *geometry.axis_mm, *geometry.shoulder_mm])
-
-
-def _places_mm(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
-    """Place the sensor, (n, 3), of an arm of other numbers."""
-    return placed_mm(
-        values[:3] + turned_rad,
-        values[3:5],
-        values[5:7],
-        values[7:9],
-        geometry.sensor_mm,
-        elbow_is_relative=geometry.elbow_is_relative,
+        tuple(tuple(row) for row in covariance.tolist()),
     )
 
 

@@ -118,6 +118,8 @@ class Joint:
 UNMEASURED_RAD = math.radians(2.0)
 """So far off may the home angles of links be that were set by eye."""
 
+N_FITTED = 9  # numbers of a geometry that marks determine
+
 FIELD_STEPS = 12  # places along each side of the field at which errors are worked out
 
 
@@ -135,12 +137,15 @@ class Accuracy:
         Sd of its height where that is known least.
     scale_sd
         Sd of the ratio of lengths on the field to lengths as the arm measures them.
+    covariance
+        Of the errors of the nine numbers that were fitted (`arm.uncertainty.FITTED`), nine rows of nine; radians, mm.
     """
 
     marks: int
     place_sd_mm: float
     height_sd_mm: float
     scale_sd: float
+    covariance: tuple[tuple[float, ...], ...]
 
     def __post_init__(self) -> None:
         if self.marks < 1:
@@ -148,6 +153,15 @@ class Accuracy:
         for name in ("place_sd_mm", "height_sd_mm", "scale_sd"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ParameterError(name, getattr(self, name), "0 or more")
+        shape = [len(row) for row in self.covariance]
+        if shape != [N_FITTED] * N_FITTED:
+            raise ParameterError("covariance", f"rows of {shape}", f"{N_FITTED} rows of {N_FITTED} numbers")
+        matrix = np.array(self.covariance)
+        if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12):
+            raise ParameterError("covariance", "a matrix that differs from its transpose", "a symmetric matrix")
+        sds = np.sqrt(np.maximum(np.diagonal(matrix), np.finfo(np.float64).tiny))
+        if np.linalg.eigvalsh(matrix / np.outer(sds, sds)).min() < -1e-6:
+            raise ParameterError("covariance", "a matrix with negative eigenvalues", "a covariance: none is negative")
 
 
 @dataclass(frozen=True)

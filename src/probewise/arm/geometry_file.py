@@ -11,6 +11,7 @@ from typing import Any
 
 from probewise._kinds import require_path
 from probewise.arm.geometry import JOINTS, Accuracy, Geometry, Joint
+from probewise.arm.uncertainty import FITTED
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.text import read_text
 
@@ -129,6 +130,10 @@ def with_fitted(text: str, geometry: Geometry) -> str:
             f"place_sd_mm = {known.place_sd_mm:.4f}",
             f"height_sd_mm = {known.height_sd_mm:.4f}",
             f"scale_sd = {known.scale_sd:.6f}",
+            f"# of the errors of {', '.join(FITTED)}: radians and mm",
+            "covariance = [",
+            *(f"  [{', '.join(f'{number:.9e}' for number in row)}]," for row in known.covariance),
+            "]",
         ]
     return "\n".join(lines) + "\n"
 
@@ -161,6 +166,15 @@ class _Table:
             raise self.fail(name, f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
+    def matrix(self, name: str) -> tuple[tuple[float, ...], ...]:
+        rows = self.take(name)
+        if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+            raise self.fail(name, "rows of numbers, [[...], [...], ...]")
+        numbers = [number for row in rows for number in row]
+        if any(isinstance(n, bool) or not isinstance(n, int | float) or not abs(n) <= LARGEST for n in numbers):
+            raise self.fail(name, f"rows of numbers of magnitude up to {LARGEST:g}")
+        return tuple(tuple(float(number) for number in row) for row in rows)
+
     def finish(self) -> None:
         if self._left:
             name = min(self._left)
@@ -186,7 +200,11 @@ def _accuracy(table: _Table) -> Accuracy:
     if not isinstance(marks, int) or isinstance(marks, bool):
         raise table.fail("marks", "a whole number, 1 or more")
     place, height, scale = (table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd"))
+    if "covariance" not in table.content:
+        again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"
+        raise FileError(table.path, "accuracy.covariance is missing", again)
+    covariance = table.matrix("covariance")
     try:
-        return Accuracy(marks, place, height, scale)
+        return Accuracy(marks, place, height, scale, covariance)
     except ParameterError as error:
         raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error

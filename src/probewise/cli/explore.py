@@ -195,6 +195,8 @@ def run(arguments: argparse.Namespace) -> int:
         for step, shadow in pairs:
             pictures.add(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
+    if inputs.arm.is_apart and inputs.geometry is not None and inputs.geometry.accuracy is not None:
+        result = posing.with_arm_error(result, inputs.geometry, dark=inputs.levels[0], rng=inputs.streams.arm)
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
@@ -211,12 +213,8 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Pat
     from probewise.report import exploration as report
 
     yield result.summary()
-    if inputs.geometry is not None and inputs.arm.is_apart and inputs.geometry.accuracy is not None:
-        accuracy = inputs.geometry.accuracy
-        yield (
-            f"arm          not in these sds: its place is known to {accuracy.place_sd_mm:.2f} mm, lengths to "
-            f"{accuracy.scale_sd:.2%}, the same for all readings"
-        )
+    if inputs.geometry is not None and inputs.arm.is_apart and inputs.geometry.accuracy is None:
+        yield "arm          nobody has fitted its geometry: its own error is not in these sds"
     trust = inputs.experiment.trust
     missing = posing.left_out_of(result.last, trust)
     if trust < 1:
@@ -224,7 +222,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Pat
     if missing.leading != posing.CLEAN:
         yield f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS"
     if site.known is not None:
-        yield f"error        {report.errors_text(result.last, site.known)}"
+        yield f"error        {report.errors_text(result, site.known)}"
 
 
 def _seen_from(folder: Path, path: Path) -> str:

@@ -1,5 +1,6 @@
 """The autonomous experiment: measure, infer, inquire, and write down each measurement (paper, section 2.2 and 2.3)."""
 
+from probewise.experiment.arm_error import with_arm_error
 from probewise.experiment.asking import Field
 from probewise.experiment.beside import beside
 from probewise.experiment.digest import value_digest
@@ -45,7 +46,7 @@ from probewise.experiment.simulation import (
     world_like,
 )
 from probewise.experiment.start import run_from
-from probewise.experiment.values import PAPER_BITS, Exploration, State, Step
+from probewise.experiment.values import PAPER_BITS, ArmError, Exploration, State, Step
 
 __all__ = [
     "CLEAN",
@@ -53,6 +54,7 @@ __all__ = [
     "PAPER_BITS",
     "TRUST",
     "AdjustedMixture",
+    "ArmError",
     "Belief",
     "Change",
     "Entry",
@@ -107,6 +109,7 @@ __all__ = [
     "surface_of",
     "usual_trust",
     "value_digest",
+    "with_arm_error",
     "with_cards",
     "world_like",
 ]

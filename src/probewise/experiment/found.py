@@ -28,12 +28,16 @@ _POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octago
 
 @dataclass(frozen=True)
 class FoundParameter:
-    """A parameter of the shape: its name, which ends in its unit, and its posterior."""
+    """A parameter of the shape: its name, which ends in its unit, and its posterior.
+
+    `arm_sd` is that part of the sd which comes from the arm's own error; None: it is not known, and no part of it.
+    """
 
     name: str
     mean: float
     sd: float
     interval95: tuple[float, float]
+    arm_sd: float | None = None
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,9 @@ def found_shape(run: Exploration) -> FoundShape:
         FoundParameter(
             last.names[k].removeprefix(f"{name}."),
             float(last.mean[k]),
-            float(last.sd[k]),
+            float(run.sd[k]),
             (float(low[k]), float(high[k])),
+            None if run.arm is None else float(run.arm.sd[k]),
         )
         for k in np.flatnonzero(np.isfinite(last.mean)).tolist()
         if last.names[k] != "shape"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Instrumentation, Recording
 
-__all__ = ["PAPER_BITS", "Exploration", "State", "Step"]
+__all__ = ["PAPER_BITS", "ArmError", "Exploration", "State", "Step"]
 
 PAPER_BITS = 25.0
 """Bits that the paper counts for a circle known to 4 mm: one for each reading of the naive model."""
@@ -146,12 +146,44 @@ class Step(ShowsItself):
 
 
 @dataclass(frozen=True, eq=False)
+class ArmError:
+    """What an error of the arm's geometry, one for all readings, does to the shape that was found.
+
+    Attributes
+    ----------
+    slopes
+        By how much each independent error of one sd moves the posterior mean, (n_params, n_errors).
+    moved
+        Such errors, drawn for each sample of the posterior, (n_samples, n_params).
+    """
+
+    slopes: FloatArray
+    moved: FloatArray
+
+    @property
+    def sd(self) -> FloatArray:
+        """Sd of the shape's parameters that comes from the arm, (n_params,)."""
+        return np.asarray(np.sqrt((self.slopes**2).sum(axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
 class Exploration(ShowsItself):
-    """A whole run: its steps, why it ended, what it found; `hidden` is what lay there, where that is known."""
+    """A whole run: its steps, why it ended, what it found.
+
+    Attributes
+    ----------
+    experiment, steps
+        What was asked, and what each reading taught.
+    hidden
+        What lay there, where that is known.
+    arm
+        What the arm's own error adds, where that is known (`with_arm_error`); the steps leave it out.
+    """
 
     experiment: Experiment
     steps: tuple[Step, ...]
     hidden: Hidden | None = None
+    arm: ArmError | None = None
 
     @property
     def last(self) -> Step:
@@ -165,8 +197,18 @@ class Exploration(ShowsItself):
 
     @property
     def posterior(self) -> Weighted:
-        """The weighted posterior after the last reading."""
-        return self.last.posterior
+        """The weighted posterior after the last reading; with the arm's own error, where that is known."""
+        found = self.last.posterior
+        if self.arm is None:
+            return found
+        theta = found.theta.copy()
+        theta[:, self.experiment.shape_columns] += self.arm.moved
+        return replace(found, theta=theta)
+
+    @property
+    def sd(self) -> FloatArray:
+        """Posterior sds of the shape's parameters, (n_params,); with the arm's own error, where that is known."""
+        return self.last.sd if self.arm is None else np.hypot(self.last.sd, self.arm.sd)
 
     @property
     def stop_reason(self) -> str:
@@ -221,9 +263,16 @@ class Exploration(ShowsItself):
         width = max(9, *(len(name) for name in (*last.names, *last.sensor)))
         lines += [
             f"{name:<{width}}  {mean:.{1 + _decimals(name)}f} ± {sd:.{1 + _decimals(name)}f}"
-            for name, mean, sd in zip(last.names, last.mean, last.sd, strict=True)
+            for name, mean, sd in zip(last.names, last.mean, self.sd, strict=True)
             if np.isfinite(mean)
         ]
+        if self.arm is not None:
+            own = ", ".join(
+                f"{name} {sd:.{1 + _decimals(name)}f}"
+                for name, mean, sd in zip(last.names, last.mean, self.arm.sd, strict=True)
+                if np.isfinite(mean) and name != "shape"
+            )
+            lines.append(f"arm          of these sds its own error makes up {own}: the same for all readings")
         lines += [f"{name:<{width}}  {mean:.3g} ± {sd:.2g} (sensor)" for name, (mean, sd) in last.sensor.items()]
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.notes)])
 

@@ -156,7 +156,7 @@ def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
             number(s.run.bits_per_reading, 2),
             number(s.run.paper_bits_per_reading, 2),
             f"{number(s.largest_error_mm, 1)} mm",
-            exploration_report.errors_text(s.run.last, s.truth),
+            exploration_report.errors_text(s.run, s.truth),
         )
         for s in searches
     ]

@@ -155,11 +155,12 @@ def _doubt(steps: Sequence[Step], trust: float) -> Section:
     )
 
 
-def errors_text(step: Step, truth: Mapping[str, float]) -> str:
+def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Say how far from the truth the estimates are, each beside its posterior sd."""
+    step = run.last
     return ", ".join(
         f"{without_unit(_own(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
-        for name, mean, sd in zip(step.names, step.mean, step.sd, strict=True)
+        for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
 
@@ -179,7 +180,8 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
     """Build the table of the shape's parameters with their errors, and beside them the truth where it is known."""
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
-    header = ("parameter", "unit", "mean", "sd", "95 % interval", *(("truth",) if truth else ()))
+    arm = ("of it the arm's",) if run.arm is not None else ()
+    header = ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ()))
     return table(
         header,
         (
@@ -187,6 +189,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
                 without_unit(p.name),
                 unit_of(p.name),
                 *with_error(p.mean, p.sd).partition(" ± ")[::2],
+                *(() if p.arm_sd is None else (f"{p.arm_sd:.2g}",)),
                 interval(*p.interval95),
                 *((f"{short[p.name]:.6g}" if p.name in short else "–",) if truth else ()),
             )
@@ -258,7 +261,7 @@ def write_page(
         ("seed", str(seed)),
     ]
     if truth:
-        facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run.last, truth)))
+        facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run, truth)))
     sensor = [
         (without_unit(name), unit_of(name), *with_error(mean, sd).partition(" ± ")[::2])
         for name, (mean, sd) in run.last.sensor.items()

@@ -1,0 +1,177 @@
+"""What an error of the arm's geometry does to a shape that was found.
+
+A geometry that was fitted to marks is off by one error that all readings of a run share: where the sensor truly stood
+when it was told to stand there. No reading of the run shows that error, it moves the whole shape. The shape's posterior
+mean moves by the covariance, over the posterior, of the parameters with the slope of the log likelihood by the error
+(exact to first order, for any likelihood); so the samples that the run ends with tell it, without another inference.
+
+Where the log likelihood is quadratic, its slope by the error is a linear function of its slopes by the shape's
+parameters, and the coefficients are the answer, however few the samples. So these slopes serve as control variates:
+their covariance with the parameters is known, minus one each (Stein's identity), and the samples tell the rest alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.arm.geometry import Accuracy, Geometry
+from probewise.arm.uncertainty import FITTED, slopes_mm
+from probewise.errors import ParameterError
+from probewise.experiment.kinds import Kind
+from probewise.experiment.values import ArmError, Exploration
+from probewise.inference.problem import scores
+from probewise.recordings.plan import Recording
+from probewise.scene.shapes import AnyOf
+
+__all__ = ["with_arm_error"]
+
+_STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
+_STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
+_LEAST = 1e-3  # probability of a kind of hypotheses that is asked
+
+
+def with_arm_error(
+    run: Exploration,
+    geometry: Geometry,
+    *,
+    dark: float,
+    calibrated_mm: tuple[float, float] | None = None,
+    rng: np.random.Generator,
+) -> Exploration:
+    """Add the error of the arm's geometry to what a run claims of its shape.
+
+    Parameters
+    ----------
+    run
+        The run, whose readings tell the places that the arm knows of.
+    geometry
+        The arm's, fitted to marks.
+    dark
+        What the sensor reads over black: light above it falls with the square of the height.
+    calibrated_mm
+        Where on the field this arm took the readings that the sensor was calibrated by: an error of the height there is
+        in the sensor's levels already. By default in the field's middle, as `arm record` does.
+    rng
+        Draws the errors by which posterior samples are moved.
+
+    Returns
+    -------
+    The run, its `posterior` and `sd` as wide as readings and arm together leave the shape.
+
+    Raises
+    ------
+    ParameterError
+        If the geometry has no accuracy, or does not reach a place of a reading.
+    """
+    if geometry.accuracy is None:
+        raise ParameterError("geometry", "one without [accuracy]", "one that was fitted to marks")
+    recording = run.experiment.problem(run.readings).recording
+    width_mm, height_mm = geometry.field_mm
+    middle = (width_mm / 2, height_mm / 2) if calibrated_mm is None else calibrated_mm
+    places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
+    off = _off(geometry, np.concatenate([places, [middle]]), geometry.accuracy)
+    off[:, 2] -= off[-1, 2]
+    off = off[:-1]
+    slopes = _moved_by(run, recording, off, geometry.read_height_mm, dark)
+    theta = run.last.posterior.theta[:, run.experiment.shape_columns]
+    moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
+    shape = run.experiment.shape
+    if isinstance(shape, AnyOf):
+        moved[shape.which(theta) != shape.labels.index(run.last.likely_shape)] = 0.0
+    return replace(run, arm=ArmError(slopes, moved))
+
+
+def _off(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
+    """Tell what independent errors of one sd do to x, y, height and orientation at places: (n_points, 4, n_errors)."""
+    root = _root(np.array(accuracy.covariance))
+    place = slopes_mm(geometry, places_mm) @ root
+    if not np.isfinite(place).all():
+        raise ParameterError("readings", "a place out of the arm's reach", "readings of this arm")
+    turned = np.broadcast_to(root[FITTED.index("base home")], place[:, :1].shape)
+    return np.concatenate([place, turned], axis=1)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Write a covariance as a product of a matrix (n, n_errors) with its transpose."""
+    scale = np.sqrt(np.diagonal(covariance))
+    scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _moved_by(run: Exploration, recording: Recording, off: FloatArray, height_mm: float, dark: float) -> FloatArray:
+    """Tell by how much each independent error of one sd moves the posterior mean of the shape, (n_params, n_errors)."""
+    last, experiment = run.last, run.experiment
+    shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
+    columns = np.arange(len(last.mean))
+    if isinstance(shape, AnyOf):
+        columns = shape.prior.columns[shape.labels.index(last.likely_shape)]
+    own = np.arange(n_sensor, n_sensor + len(columns))
+    thetas, weights, by_error, by_shape = [], [], [], []
+    kinds = zip(last.kinds.kinds, last.kinds.particles, last.kinds.probability.tolist(), strict=True)
+    for kind, particles, probability in kinds:
+        if probability < _LEAST or kind.shape not in ("", last.likely_shape):
+            continue
+        some = particles.weighted.weight > 0
+        theta = particles.weighted.theta[some]
+        thetas.append(theta[:, own])
+        weights.append(probability * particles.weighted.weight[some])
+        by_error.append(_by_error(kind, theta, recording, off, height_mm, dark))
+        by_shape.append(_by_shape(kind, theta, recording, own, _STEP_SD * last.sd[columns]))
+    weight = np.concatenate(weights)
+    weight /= weight.sum()
+    theta, slope, known = (_centred(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
+    root = np.sqrt(weight)[:, None]
+    coefficients = np.linalg.lstsq(root * known, root * slope, rcond=None)[0]
+    out = np.zeros((len(last.mean), off.shape[2]))
+    out[columns] = (theta * weight[:, None]).T @ (slope - known @ coefficients) - coefficients
+    return out
+
+
+def _centred(columns: FloatArray, weight: FloatArray) -> FloatArray:
+    return columns - weight @ columns
+
+
+def _by_shape(kind: Kind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray) -> FloatArray:
+    """Give the slope of each hypothesis's log likelihood by each parameter of the shape, (n_samples, n_columns)."""
+    problem, slopes = kind.problem(recording), []
+    for column, step in zip(columns.tolist(), steps.tolist(), strict=True):
+        up, down = theta.copy(), theta.copy()
+        up[:, column] += step
+        down[:, column] -= step
+        slopes.append((problem.log_likelihood(up) - problem.log_likelihood(down)) / (2 * step))
+    return np.stack(slopes, axis=-1)
+
+
+def _by_error(
+    kind: Kind, theta: FloatArray, recording: Recording, off: FloatArray, height_mm: float, dark: float
+) -> FloatArray:
+    """Give the slope of each hypothesis's log likelihood by each independent error, (n_samples, n_errors)."""
+    plan, usable = recording.plan, recording.usable
+    predicted = kind.model.predict(theta, plan)
+
+    def slope_by(name: str, step: float) -> FloatArray:
+        ends = [kind.model.predict(theta, replace(plan, **{name: getattr(plan, name) + way * step})) for way in (1, -1)]
+        return np.asarray((ends[0] - ends[1]) / (2 * step))
+
+    by_pose = np.stack(
+        [
+            slope_by("x_mm", _STEP_MM),
+            slope_by("y_mm", _STEP_MM),
+            -2.0 * (predicted - dark) / height_mm,
+            slope_by("orientation_rad", _STEP_RAD),
+        ],
+        axis=-1,
+    )
+    out = np.empty((len(theta), off.shape[2]))
+    for error in range(off.shape[2]):
+        change = _STEP_SD * np.einsum("skp,kp->sk", by_pose, off[:, :, error])
+        up, down = (
+            scores(kind.likelihood, recording.readings[usable], predicted[:, usable] + way * change[:, usable])
+            for way in (1, -1)
+        )
+        out[:, error] = (up - down) / (2 * _STEP_SD)
+    return out

@@ -1,0 +1,103 @@
+"""The arm's own error, one for all readings, in what a run claims of its shape."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm.geometry import Accuracy
+from probewise.arm.uncertainty import FITTED, RULER_SDS, slopes_mm
+from probewise.errors import ParameterError
+from probewise.experiment import found_shape, result_json, run, samples_csv, with_arm_error
+
+ARM = dataclasses.replace(read_geometry(shipped_geometry()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0))
+DARK = 10.0
+
+
+def known_to(sds):
+    """Make the geometry of an arm whose errors are independent, one sd a number that is fitted."""
+    covariance = np.diag(np.asarray(sds, dtype=float) ** 2)
+    return dataclasses.replace(ARM, accuracy=Accuracy(8, 1.0, 1.0, 0.001, tuple(map(tuple, covariance.tolist()))))
+
+
+def only(name, sd):
+    return known_to([sd if each == name else 0.0 for each in FITTED])
+
+
+@pytest.fixture(scope="module")
+def found(request):
+    small = request.getfixturevalue("small_for_all")
+    experiment = small.experiment(n_particles=3000, stop_sd_mm=1.0)
+    return run(small.arm(), experiment, rng=np.random.default_rng(4), max_readings=25)
+
+
+def mean_on_a_grid(exploration, off_mm, height_off_mm):
+    """Infer the circle anew with every reading elsewhere and at another height, on a grid about what was found."""
+    last = exploration.last
+    axes = [np.linspace(m - 6 * s - 2, m + 6 * s + 2, 61) for m, s in zip(last.mean, last.sd, strict=True)]
+    theta = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = np.array([(r.pose.x_mm, r.pose.y_mm) for r in exploration.readings]) + off_mm
+    inside = theta[:, 2:] - np.hypot(places[:, 0] - theta[:, :1], places[:, 1] - theta[:, 1:2])
+    bright = 50.0 * (1 - 2 * height_off_mm / ARM.read_height_mm)
+    values = np.array([r.value for r in exploration.readings])
+    log = -0.5 * ((values - DARK - bright * ndtr(inside / 8.0)) ** 2).sum(axis=1)
+    weight = np.exp(log - log.max())
+    return weight @ theta / weight.sum()
+
+
+@pytest.mark.parametrize("name", ["base home", "elbow home", "upper link", "base y", "shoulder height"])
+def test_the_shape_moves_with_the_arm_as_an_inference_anew_says(found, name):
+    sd = {"shoulder height": 0.3}.get(name, float(RULER_SDS[FITTED.index(name)]) / 20)
+    claimed = with_arm_error(found, only(name, sd), dark=DARK, rng=np.random.default_rng(1))
+    places = np.array([(r.pose.x_mm, r.pose.y_mm) for r in found.readings])
+    middle = np.array([ARM.field_mm]) / 2
+    off = sd * slopes_mm(ARM, np.concatenate([places, middle]))[:, :, FITTED.index(name)]
+    share = 0.3  # of one sd: there all is linear
+    ends = [
+        mean_on_a_grid(found, way * share * off[:-1, :2], way * share * (off[:-1, 2] - off[-1, 2])) for way in (1, -1)
+    ]
+    moved = np.abs(ends[0] - ends[1]) / (2 * share)
+
+    np.testing.assert_allclose(claimed.arm.sd, moved, atol=0.02 + 0.05 * moved.max())
+
+
+def test_a_base_that_stands_elsewhere_moves_the_shape_and_does_not_stretch_it(found):
+    claimed = with_arm_error(found, only("base x", 3.0), dark=DARK, rng=np.random.default_rng(1))
+    np.testing.assert_allclose(claimed.arm.sd, [3.0, 0.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(claimed.sd, np.hypot(found.last.sd, claimed.arm.sd))
+
+
+def test_a_height_that_the_calibration_shared_moves_nothing(found):
+    """A shoulder that is higher by one amount everywhere dims the sensor as much when it is calibrated."""
+    claimed = with_arm_error(found, only("shoulder height", 2.0), dark=DARK, rng=np.random.default_rng(1))
+    np.testing.assert_allclose(claimed.arm.sd, 0.0, atol=1e-6)
+
+
+def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found):
+    sds = [0.001, 0.002, 0.002, 1.0, 1.0, 0.7, 0.7, 1.0, 1.0]
+    claimed = with_arm_error(found, known_to(sds), dark=DARK, rng=np.random.default_rng(1))
+    np.testing.assert_allclose(claimed.posterior.sd(), claimed.sd, rtol=0.05)
+    np.testing.assert_allclose(claimed.posterior.mean(), found.last.mean, atol=0.1)
+    of_file = {p["name"]: p for p in json.loads(result_json(claimed))["shape"]["parameters"]}
+    for k, parameter in enumerate(found_shape(claimed).parameters):
+        assert parameter.sd == of_file[parameter.name]["sd"] == pytest.approx(claimed.sd[k])
+        assert parameter.arm_sd == of_file[parameter.name]["arm_sd"] == pytest.approx(claimed.arm.sd[k])
+        low, high = parameter.interval95
+        assert high - low == pytest.approx(2 * 1.96 * claimed.sd[k], rel=0.1)
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in samples_csv(claimed).splitlines()[1:]])
+    weight, x_mm = rows[:, 0], rows[:, 1]
+    assert np.sqrt(weight @ (x_mm - weight @ x_mm) ** 2) == pytest.approx(claimed.sd[0], rel=0.06)
+    assert "its own error makes up x_mm" in claimed.summary()
+    assert [p.arm_sd for p in found_shape(found).parameters] == [None] * 3
+    assert found.last.sd.max() < claimed.sd.max()
+
+
+def test_a_geometry_that_nobody_fitted_says_nothing_of_the_shape(found):
+    with pytest.raises(ParameterError, match=r"\[accuracy\]"):
+        with_arm_error(found, ARM, dark=DARK, rng=np.random.default_rng(1))
+    far = dataclasses.replace(known_to(RULER_SDS / 10), axis_mm=(200.0, 2000.0))
+    with pytest.raises(ParameterError, match="reach"):
+        with_arm_error(found, far, dark=DARK, rng=np.random.default_rng(1))

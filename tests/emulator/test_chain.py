@@ -63,4 +63,6 @@ def test_an_arm_that_is_built_otherwise_finds_the_circle_and_never_touches_the_t
         assert abs(parameter["mean"] - TRUTH[parameter["name"]]) < 3 * parameter["sd"]
     diagnosis = json.loads((tmp_path / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
     # Counts are whole: heights scatter by a quarter of a millimetre, and what is bright scatters with them.
-    assert diagnosis["verdict"] == "clean" or diagnosis["combination"] == ["signal_dependent_noise"], diagnosis["reason"]
+    assert diagnosis["verdict"] == "clean" or diagnosis["combination"] == ["signal_dependent_noise"], diagnosis[
+        "reason"
+    ]

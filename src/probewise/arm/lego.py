@@ -258,6 +258,10 @@ class LegoArm:
         """Read the sensor where it stands, in LEGO units: what recordings hold."""
         return in_lego_units(self._machine.read_percent(), self.geometry)
 
+    def brightness(self) -> float:
+        """Read the sensor where it stands, 0 to 100, in all the steps that it has."""
+        return self._machine.read_percent()
+
     def battery_mv(self) -> float:
         """Read the battery's voltage."""
         return self._machine.battery_mv()

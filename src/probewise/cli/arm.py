@@ -55,6 +55,9 @@ _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
 _MOST_READINGS = 100_000  # of one scan
 _OFF_PLAN_MM = 5.0  # an instrument of one's own may know better where it read
 BLOCK_MM = 32.0
+WHITE = "uniform:1"
+_HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
+_STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
 TOUCH_MM = 1.0
 UNITS = "LEGO units (1 dark to 100 bright)"
 
@@ -109,6 +112,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     home = _task(tasks, "home", "Bring all joints to where their counters are 0.", moves=True)
     home.add_argument(
         "--here", action="store_true", help="let a person bring the arm home by hand, and set the counters to 0 there"
+    )
+
+    heights = _task(
+        tasks,
+        "heights",
+        "Check by the light, over white, whether the sensor hangs as high as its counters say.",
+        moves=True,
+        own=True,
+    )
+    heights.add_argument(
+        "places", nargs="*", metavar="X,Y", help="places in mm, two or more (default: the field's middle and the marks)"
+    )
+    heights.add_argument(
+        "--readings", type=positive_int, default=16, metavar="N", help="how many at each height (default 16)"
     )
 
     _task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
@@ -358,6 +375,71 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
                 say(f"mark {number} kept: {kept}", quiet=arguments.quiet)
 
 
+def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Let the light say how high the sensor hangs, relative to the first place."""
+    import numpy as np
+
+    from probewise.arm import LegoArm, require_reach
+    from probewise.arm.height_check import Look, check_heights
+    from probewise.arm.marks import marks_of
+
+    if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
+        raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
+    if arguments.readings > _MOST_READINGS:
+        raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
+    width, height = geometry.field_mm
+    places = [parse_place("X,Y", text) for text in arguments.places]
+    places = places or [(width / 2, height / 2), *((x, y) for x, y in marks_of(geometry).tolist())]
+    if len(places) < 2:
+        raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
+    require_reach(geometry, np.array(places), "place")
+    arguments.sensor = arguments.seed = arguments.scene = None
+    instrument, bench = _instrument(arguments, geometry, scene=WHITE)
+    assert isinstance(instrument, LegoArm)
+    _take_care(arguments, instrument, geometry)
+    with instrument as arm:
+        if bench is None:
+            _asker(arguments, arm)("lay white matt paper, the same everywhere, over the field, or under each place")
+
+        def look(place: tuple[float, float], height_mm: float) -> Look:
+            arm.go_down(*place, height_mm)
+            values = np.array([arm.brightness() for _ in range(arguments.readings)])
+            error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
+            return Look(place, float(arm.position_mm[2]), float(values.mean()), error)
+
+        arm.go_over(*places[0])
+        lowest_mm = geometry.read_height_mm
+        curve = [look(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
+        looks = []
+        for place in places[1:]:
+            looks.append(look(place, lowest_mm))
+            if not arguments.dry_run:
+                found = check_heights(curve, looks)
+                say(_hangs(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
+    if arguments.dry_run:
+        return
+    say(
+        f"light        falls by {found.per_mm:.1%} with each mm at {lowest_mm:g} mm; heights are relative to the first "
+        f"place, ({places[0][0]:g}, {places[0][1]:g}) mm",
+        quiet=arguments.quiet,
+    )
+    if found.agrees:
+        say(f"heights      agree with the counters (p = {found.p_value:.2g})", quiet=arguments.quiet)
+    else:
+        worst = int(np.argmax(np.abs(found.off_mm / found.sd_mm)))
+        caution(
+            f"the light contradicts the heights (p = {found.p_value:.1g}), most at "
+            f"{_hangs(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same everywhere? "
+            "Then bring the sensor to marks there and fit the geometry again (probewise arm fit-geometry)"
+        )
+
+
+def _hangs(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
+    side = "higher" if off_mm > 0 else "lower"
+    x_mm, y_mm = place_mm
+    return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"
+
+
 def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with _arm(arguments, geometry) as arm:
         value, battery_mv = arm.read_here(), arm.battery_mv()
@@ -499,7 +581,12 @@ def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 
 
 
 def _instrument(
-    arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0, n_taken: int = 0
+    arguments: argparse.Namespace,
+    geometry: Geometry,
+    *,
+    start_s: float = 0.0,
+    n_taken: int = 0,
+    scene: str = SCENE,
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
     """Open the arm of a task that every arm can do, and the bench below it if that is simulated too."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
@@ -518,7 +605,7 @@ def _instrument(
         geometry,
         arguments.geometry,
         sensor=arguments.sensor,
-        scene=SCENE if arguments.scene is None else arguments.scene,
+        scene=scene if arguments.scene is None else arguments.scene,
         seed=seed,
         start_s=start_s,
         n_taken=n_taken,
@@ -582,6 +669,7 @@ TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
     "jog": _jog,
     "fit-geometry": _fit_geometry,
     "home": _home,
+    "heights": _heights,
     "read": _read,
     "scan": _scan,
     "record": _record,

@@ -1,0 +1,124 @@
+"""Heights checked by the light itself: over white a sensor that hangs lower reads more.
+
+How a reading falls with the height is taken from the arm: at one place it reads at several heights. What it reads
+elsewhere over the same white then tells how high it hangs there, against where its counters say. That light falls with
+the square of the height is a first guess only: a room's light does not, nor does an LED's near the surface, where the
+sensor shades what it lights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from probewise._arrays import FloatArray
+from probewise.errors import ParameterError
+
+__all__ = ["LEAST_HEIGHTS", "HeightCheck", "Look", "check_heights"]
+
+LEAST_HEIGHTS = 3
+_DEGREE = 2
+_TELLS = 5.0  # sds by which readings at the lowest and at the highest height must differ
+_LEAST_P = 1e-3
+ROUNDING_MM = 0.2  # sd of a height that whole counts leave
+
+
+@dataclass(frozen=True)
+class Look:
+    """Readings over white at one place: where, how high by the counters, the mean reading and its standard error."""
+
+    place_mm: tuple[float, float]
+    height_mm: float
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class HeightCheck:
+    """What the light says of heights.
+
+    Parameters
+    ----------
+    per_mm
+        By how much of itself a reading falls with each mm, at the lowest of the heights at the first place.
+    off_mm, sd_mm
+        True height minus that of the counters at each other place, relative to the first, and its sd, (n_places,).
+    p_value
+        How often heights that are as told give readings as odd as these.
+    """
+
+    per_mm: float
+    off_mm: FloatArray
+    sd_mm: FloatArray
+    p_value: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the readings contradict no height."""
+        return self.p_value >= _LEAST_P
+
+
+def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
+    """Compare heights that the light tells with those of the counters.
+
+    Parameters
+    ----------
+    curve
+        Readings at the first place, three heights or more.
+    others
+        Readings elsewhere over the same white, one look a place.
+
+    Raises
+    ------
+    ParameterError
+        If there are too few heights or places, or the readings at the first place do not fall with the height.
+    """
+    if len(curve) < LEAST_HEIGHTS:
+        raise ParameterError("heights", len(curve), f"{LEAST_HEIGHTS} or more at the first place")
+    if not others:
+        raise ParameterError("places", 1, "two or more")
+    height, value, error = (
+        np.array([getattr(look, name) for look in curve]) for name in ("height_mm", "value", "error")
+    )
+    low, high = int(height.argmin()), int(height.argmax())
+    fall, noise = value[low] - value[high], float(np.hypot(error[low], error[high]))
+    if fall < _TELLS * noise or min(look.value for look in (*curve, *others)) <= 0:
+        raise _tells_nothing(curve[low], curve[high], noise)
+    # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it.
+    lowest_mm, y = float(height.min()), np.log(value)
+
+    def fitted(error: FloatArray) -> tuple[FloatArray, FloatArray]:
+        design = np.vander(np.log(height / lowest_mm), _DEGREE + 1)
+        covariance = np.asarray(np.linalg.inv(design.T @ (design / error[:, None] ** 2)), dtype=np.float64)
+        return covariance @ design.T @ (y / error**2), covariance
+
+    def steepness(coefficients: FloatArray, height_mm: FloatArray) -> FloatArray:
+        within = np.clip(height_mm, lowest_mm, height[high])  # beyond the curve it goes on as it ends
+        return np.asarray(np.polyval(np.polyder(coefficients), np.log(within / lowest_mm)) / height_mm)
+
+    # Whole counts leave the heights of the curve open too.
+    own = error / value
+    coefficients, covariance = fitted(np.hypot(own, ROUNDING_MM * steepness(fitted(own)[0], height)))
+    if (steepness(coefficients, height) >= 0).any():
+        raise _tells_nothing(curve[low], curve[high], noise)
+    told, read = (np.array([getattr(look, name) for look in others]) for name in ("height_mm", "value"))
+    steep = steepness(coefficients, told)
+    basis = np.vander(np.log(told / lowest_mm), _DEGREE + 1)
+    off = (np.log(read) - basis @ coefficients) / steep
+    shared = basis / steep[:, None]
+    own = np.array([look.error for look in others]) / read / steep
+    joint = shared @ covariance @ shared.T + np.diag(own**2 + ROUNDING_MM**2)
+    p_value = float(chi2.sf(off @ np.linalg.solve(joint, off), len(off)))
+    return HeightCheck(float(-steepness(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value)
+
+
+def _tells_nothing(low: Look, high: Look, noise: float) -> ParameterError:
+    return ParameterError(
+        "readings over white",
+        f"{low.value:.3g} at {low.height_mm:.0f} mm and {high.value:.3g} at {high.height_mm:.0f} mm",
+        f"readings that fall with the height by {_TELLS:g} sds ({_TELLS * noise:.2g}) or more: is the LED lit, the "
+        "sheet white, the room dark?",
+    )

@@ -1,0 +1,60 @@
+"""Heights by the light: how much lower a sensor hangs shows over white, whatever the law of the light."""
+
+import math
+
+import numpy as np
+import pytest
+
+from probewise.arm.height_check import Look, check_heights
+from probewise.errors import ParameterError
+
+HEIGHTS = np.arange(14.0, 23.0).tolist()
+LAWS = {
+    "square": lambda h: 60.0 * (14.0 / h) ** 2,
+    "beside a room's light": lambda h: 25.0 + 35.0 * (14.0 / h) ** 2,
+    "behind its peak": lambda h: 95.0 * h / 8 * math.exp(1 - h / 8),
+}
+
+
+def looks(law, heights, *, off_mm=0.0, noise=0.0, rng=None):
+    return [
+        Look((100.0 * k, 50.0), h, law(h + off_mm) + (noise * rng.standard_normal() if rng else 0.0), noise or 0.02)
+        for k, h in enumerate(heights)
+    ]
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+@pytest.mark.parametrize("off_mm", [-1.0, 0.4])
+def test_a_sensor_that_hangs_elsewhere_is_told_by_how_much(law, off_mm):
+    curve = looks(law, HEIGHTS)
+    found = check_heights(curve, looks(law, [14.0, 14.3], off_mm=off_mm))
+    np.testing.assert_allclose(found.off_mm, off_mm, atol=0.2 * abs(off_mm))
+    assert np.sign(found.off_mm).tolist() == [math.copysign(1, off_mm)] * 2
+
+
+def test_heights_that_are_as_told_are_contradicted_as_often_as_chance_says():
+    """What whole counts leave is drawn too; a p-value of right heights is spread evenly."""
+    rng = np.random.default_rng(3)
+    law, p_values = LAWS["beside a room's light"], []
+    for _ in range(400):
+        first, *others = (
+            looks(law, [height], off_mm=0.2 * rng.standard_normal(), noise=0.15, rng=rng)[0]
+            for height in (*HEIGHTS, *[14.0] * 6)
+        )
+        p_values.append(check_heights([first, *others[:8]], others[8:]).p_value)
+    assert 0.02 < np.mean(np.array(p_values) < 0.05) < 0.11  # how steep the light falls is learnt too
+    assert np.mean(np.array(p_values) < 1e-3) < 0.01
+    assert np.mean(p_values) == pytest.approx(0.5, abs=0.06)
+
+
+def test_light_that_does_not_fall_with_the_height_tells_nothing():
+    flat = looks(lambda h: 30.0, [14.0, 17.0, 20.0])
+    with pytest.raises(ParameterError, match="is the LED lit"):
+        check_heights(flat, looks(lambda h: 30.0, [14.0]))
+    rising = looks(lambda h: 10.0 * h, [14.0, 17.0, 20.0])
+    with pytest.raises(ParameterError, match="fall with the height"):
+        check_heights(rising, looks(lambda h: 30.0, [14.0]))
+    with pytest.raises(ParameterError, match="3 or more"):
+        check_heights(flat[:2], flat)
+    with pytest.raises(ParameterError, match="two or more"):
+        check_heights(flat, [])

@@ -194,6 +194,9 @@ class Geometry:
         Whether readings are cut to whole percent, as the brick shows them.
     accuracy
         How well all this is known; None: nobody has fitted it to marks.
+    light_per_mm
+        Share of a reading over white by which it falls with each mm that the sensor reads higher, as `arm heights`
+        measures it; None: light falls with the square of the height.
     """
 
     field_mm: tuple[float, float]
@@ -212,6 +215,7 @@ class Geometry:
     elbow: Joint
     whole_percent: bool = True
     accuracy: Accuracy | None = None
+    light_per_mm: float | None = None
 
     def __post_init__(self) -> None:
         finite = (*self.field_mm, *self.axis_mm, *self.shoulder_mm, *self.links_mm, *self.sensor_mm, self.mounting_rad)
@@ -226,6 +230,8 @@ class Geometry:
                 (self.lowest_mm, self.read_height_mm, self.travel_height_mm),
                 "heights above 0, each above the one before",
             )
+        if self.light_per_mm is not None and not 0 <= self.light_per_mm < 1:
+            raise ParameterError("light_per_mm", self.light_per_mm, "0 or more, less than 1")
         if self.sensor_port not in range(4):
             raise ParameterError("sensor port", self.sensor_port, "0 to 3, for 1 to 4")
         if len({joint.port for joint in self.joints}) < len(self.joints):

@@ -80,6 +80,7 @@ def read_geometry(path: str | Path) -> Geometry:
             elbow=_joint(tables["elbow"]),
             whole_percent=whole,
             accuracy=None if known is None else _accuracy(known),
+            light_per_mm=sensor.number("light_per_mm") if "light_per_mm" in sensor.content else None,
         )
     except ParameterError as error:
         raise FileError(path, f"{error.name} is {shown(error.value)}", error.allowed) from error

@@ -419,8 +419,9 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
     if arguments.dry_run:
         return
     say(
-        f"light        falls by {found.per_mm:.1%} with each mm at {lowest_mm:g} mm; heights are relative to the first "
-        f"place, ({places[0][0]:g}, {places[0][1]:g}) mm",
+        f"light        falls by {found.per_mm:.1%} with each mm at {lowest_mm:g} mm (in [sensor] of the geometry: "
+        f"light_per_mm = {found.per_mm:.3f}); heights are relative to the first place, "
+        f"({places[0][0]:g}, {places[0][1]:g}) mm",
         quiet=arguments.quiet,
     )
     if found.agrees:

@@ -196,7 +196,7 @@ def run(arguments: argparse.Namespace) -> int:
             pictures.add(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
     if inputs.arm.is_apart and inputs.geometry is not None and inputs.geometry.accuracy is not None:
-        result = posing.with_arm_error(result, inputs.geometry, dark=inputs.levels[0], rng=inputs.streams.arm)
+        result = posing.with_arm_error(result, inputs.geometry, levels=inputs.levels, rng=inputs.streams.arm)
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")

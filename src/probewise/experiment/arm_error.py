@@ -37,7 +37,7 @@ def with_arm_error(
     run: Exploration,
     geometry: Geometry,
     *,
-    dark: float,
+    levels: tuple[float, float],
     calibrated_mm: tuple[float, float] | None = None,
     rng: np.random.Generator,
 ) -> Exploration:
@@ -49,8 +49,9 @@ def with_arm_error(
         The run, whose readings tell the places that the arm knows of.
     geometry
         The arm's, fitted to marks.
-    dark
-        What the sensor reads over black: light above it falls with the square of the height.
+    levels
+        What the sensor reads over black and over white: light above black falls with the height, as the geometry says
+        or, where it does not, with the square.
     calibrated_mm
         Where on the field this arm took the readings that the sensor was calibrated by: an error of the height there is
         in the sensor's levels already. By default in the field's middle, as `arm record` does.
@@ -75,7 +76,13 @@ def with_arm_error(
     off = _off(geometry, np.concatenate([places, [middle]]), geometry.accuracy)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
-    slopes = _moved_by(run, recording, off, geometry.read_height_mm, dark)
+    dark, white = levels
+    falls = 2.0 / geometry.read_height_mm
+    if geometry.light_per_mm is not None:
+        falls = geometry.light_per_mm * white / (white - dark)
+    # From here on what the light does stands for the height: the share by which light above black rises.
+    off[:, 2] *= -falls
+    slopes = _moved_by(run, recording, off, dark)
     theta = run.last.posterior.theta[:, run.experiment.shape_columns]
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     shape = run.experiment.shape
@@ -102,7 +109,7 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _moved_by(run: Exploration, recording: Recording, off: FloatArray, height_mm: float, dark: float) -> FloatArray:
+def _moved_by(run: Exploration, recording: Recording, off: FloatArray, dark: float) -> FloatArray:
     """Tell by how much each independent error of one sd moves the posterior mean of the shape, (n_params, n_errors)."""
     last, experiment = run.last, run.experiment
     shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
@@ -119,7 +126,7 @@ def _moved_by(run: Exploration, recording: Recording, off: FloatArray, height_mm
         theta = particles.weighted.theta[some]
         thetas.append(theta[:, own])
         weights.append(probability * particles.weighted.weight[some])
-        by_error.append(_by_error(kind, theta, recording, off, height_mm, dark))
+        by_error.append(_by_error(kind, theta, recording, off, dark))
         by_shape.append(_by_shape(kind, theta, recording, own, _STEP_SD * last.sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
@@ -146,9 +153,7 @@ def _by_shape(kind: Kind, theta: FloatArray, recording: Recording, columns: IntA
     return np.stack(slopes, axis=-1)
 
 
-def _by_error(
-    kind: Kind, theta: FloatArray, recording: Recording, off: FloatArray, height_mm: float, dark: float
-) -> FloatArray:
+def _by_error(kind: Kind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float) -> FloatArray:
     """Give the slope of each hypothesis's log likelihood by each independent error, (n_samples, n_errors)."""
     plan, usable = recording.plan, recording.usable
     predicted = kind.model.predict(theta, plan)
@@ -161,7 +166,7 @@ def _by_error(
         [
             slope_by("x_mm", _STEP_MM),
             slope_by("y_mm", _STEP_MM),
-            -2.0 * (predicted - dark) / height_mm,
+            predicted - dark,
             slope_by("orientation_rad", _STEP_RAD),
         ],
         axis=-1,

@@ -212,8 +212,12 @@ class Exploration(ShowsItself):
 
     @property
     def stop_reason(self) -> str:
-        """Why the run ended."""
-        return self.last.stop_reason or "the caller ended it"
+        """Why the run ended, judged by the readings alone; and what the arm's own error leaves, where that is known."""
+        reason = self.last.stop_reason or "the caller ended it"
+        if self.arm is None:
+            return reason
+        widest = widest_mm(self.last.names, self.sd)
+        return f"{reason}; with the arm's own error the widest is known to {widest:.1f} mm"
 
     @property
     def reached(self) -> bool:

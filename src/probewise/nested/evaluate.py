@@ -181,7 +181,14 @@ class Evaluator:
         """Yield the likelihoods of the parts in order; the parts run in parallel where there is an executor."""
         # Copies: a likelihood that writes into its argument must not change the samples.
         if self.executor is not None and len(parts) > 1:
-            yield from self.executor.map(self.problem.log_likelihood, [part.copy() for part in parts])
+            # Not `map`: dask builds a task graph for it, which takes longer than submitting the parts.
+            sent = [self.executor.submit(self.problem.log_likelihood, part.copy()) for part in parts]
+            try:
+                for future in sent:
+                    yield future.result()
+            finally:
+                for future in sent:
+                    future.cancel()
         else:
             for part in parts:
                 yield self.problem.log_likelihood(part.copy())

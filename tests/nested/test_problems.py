@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nested_sampling import compare, problems, records, references, seeds, ssf
+from nested_sampling import compare, few, problems, records, references, seeds, ssf
 from nested_sampling.samplers import Counted, Outcome, ours
 from scipy.special import logsumexp
 
@@ -214,6 +214,15 @@ def test_evaluations_are_counted_and_samples_follow_the_weights() -> None:
     assert two.samples(400, 0).mean() == pytest.approx(1.75)
     assert two.n_eff == pytest.approx(1.6)
     assert two.mean(two.theta[:, 0])[0] == pytest.approx(1.75)
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+def test_few_live_points_count_the_search_and_the_draws_of_its_refinement() -> None:
+    """Two pilot rounds of two forms with an eighth of the draws each, at least 50, and the draws themselves."""
+    found = few.measure("plateau", range(2), 100, 400)
+    assert found["evaluations"] - found["of_these_the_search"] == 400 + 4 * 50
+    assert (found["peer"], found["work_ratio"]) == (None, None)
+    assert found["worst_z"] < 5
 
 
 def test_the_comparison_names_the_best_correct_peer() -> None:

@@ -8,6 +8,8 @@ The commands of the command line as functions:
 - `audit(plan)` says, before any data, which effects a plan cannot detect or distinguish
 - `diagnose(recordings, rng=rng)` finds the physics that the model leaves out
 
+`Inquiry(model, prior, settings, noise, rng=rng)` chooses the settings of any other instrument.
+
 `Recording.from_arrays` and `Recording.from_table` make recordings, `read_recording`, `read_plan` and `read_sensor` read
 files. Results display themselves in notebooks.
 
@@ -53,9 +55,11 @@ if TYPE_CHECKING:
         world,
     )
     from probewise.calibration import read_sensor
+    from probewise.inquiry import Inquiry
     from probewise.recordings import Plan, Recording, read_plan, read_recording
 
 __all__ = [
+    "Inquiry",
     "Plan",
     "Recording",
     "__version__",
@@ -93,6 +97,7 @@ __all__ = [
 
 # Where the names come from that are not packages; all are loaded when first used.
 _HOME = {
+    "Inquiry": "inquiry",
     "Plan": "recordings",
     "Recording": "recordings",
     "read_plan": "recordings",

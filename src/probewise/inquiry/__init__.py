@@ -5,9 +5,11 @@ their predictions differ most, a reading tells most. The worth of a reading is a
 behind one seam, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses; `InformationGain`
 asks the whole posterior and leaves out what is only noise. Thousands of hypotheses are not asked one by one
 (`AskedForecast`) but looked up: discs in a table of the sensor's own (`DiscForecast`), ellipses and convex polygons in
-tables of what the unit Gaussian sees of a corner and of a bent edge (`SilhouetteForecast`).
+tables of what the unit Gaussian sees of a corner and of a bent edge (`SilhouetteForecast`). An instrument that sees no
+field of shapes has an `Inquiry` over its own settings.
 """
 
+from probewise.inquiry.any_settings import Inquiry, Predictive, ReadingNoise
 from probewise.inquiry.batch import choose_several
 from probewise.inquiry.bound import Bound, capacity_bits, fewest_readings, target_entropy
 from probewise.inquiry.carded import CardedForecast, cards_of
@@ -51,12 +53,15 @@ __all__ = [
     "Grid",
     "InformationAbout",
     "InformationGain",
+    "Inquiry",
     "Label",
     "Outlook",
     "ParameterValue",
     "PerSecond",
+    "Predictive",
     "Prospect",
     "ReadingEntropy",
+    "ReadingNoise",
     "Readout",
     "Rival",
     "SilhouetteForecast",

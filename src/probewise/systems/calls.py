@@ -47,6 +47,8 @@ class Caller:
         Whether it takes parameters (n_samples, 1) and columns (n_points,) together.
     by_row
         Parameters that it takes as arrays (n_points,) when called for one sample; ignored where it broadcasts.
+    name
+        What a person calls the function, for messages.
 
     `cut_short` is set where something was left undone because there had been too many calls.
     """
@@ -58,6 +60,7 @@ class Caller:
     n_failed: int = 0
     interpolated: set[str] = field(default_factory=set)
     cut_short: bool = False
+    name: str = "simulate"
     on_call: Callable[[], None] = lambda: None
     _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
 
@@ -70,6 +73,7 @@ class Caller:
         *,
         per_run: tuple[str, ...],
         broadcasts: bool,
+        name: str = "simulate",
     ) -> Caller:
         """Find out how a function can be called, at some samples (n_samples, 1 or n_points) of its parameters.
 
@@ -80,24 +84,23 @@ class Caller:
         ShapeError
             If what it returns is not one number for each row.
         """
-        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run))
+        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:
-            together = cls(simulate, broadcasts=True)
+            together = cls(simulate, broadcasts=True, name=name)
             if not np.isfinite(together(samples, columns, strict=True)).any():
-                raise ParameterError("simulate", "NaN at every place of the prior that was tried", "finite readings")
+                raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
             return together
         alone = one(samples, columns, strict=True)
         if not np.isfinite(alone).any():
-            raise ParameterError("simulate", "NaN at every place of the prior that was tried", "finite readings")
-        together = cls(simulate, broadcasts=True)
+            raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
+        together = cls(simulate, broadcasts=True, name=name)
         try:
             if _alike(together(samples, columns, strict=True), alone):
                 return together
         except Exception:
             pass
-        return cls(
-            simulate, broadcasts=False, by_row=frozenset(per_run) | _taken_by_row(one, samples, columns, alone, per_run)
-        )
+        by_row = frozenset(per_run) | _taken_by_row(one, samples, columns, alone, per_run)
+        return cls(simulate, broadcasts=False, by_row=by_row, name=name)
 
     def __call__(
         self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, strict: bool = False
@@ -118,7 +121,7 @@ class Caller:
                         raise
                     self.n_failed += n_samples
                     return np.full((n_samples, n_points), np.nan)
-                return _of_shape(readings, (n_samples, n_points))
+                return _of_shape(readings, (n_samples, n_points), self.name)
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
                 own = {name: _row(values, k) for name, values in parameters.items()}
@@ -146,7 +149,8 @@ class Caller:
         known = self._known.pop(key := digest.digest(), None)
         if known is None:
             self._counted()
-            known = _of_shape(np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64), (n_points,))
+            returned = np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64)
+            known = _of_shape(returned, (n_points,), self.name)
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -249,16 +253,12 @@ def _alike(first: FloatArray, second: FloatArray) -> bool:
     )
 
 
-def _of_shape(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
+def _of_shape(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
     if readings.shape == wanted:
         return readings
-    try:
-        return (
-            np.array(np.broadcast_to(readings, wanted)) if readings.ndim == len(wanted) else _refuse(readings, wanted)
-        )
-    except ValueError:
-        return _refuse(readings, wanted)
-
-
-def _refuse(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
-    raise ShapeError(f"simulate returns an array of shape {readings.shape}; allowed: {wanted}, one number for each row")
+    if readings.ndim == len(wanted):
+        try:
+            return np.array(np.broadcast_to(readings, wanted))
+        except ValueError:
+            pass
+    raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number for each row")

@@ -1,0 +1,196 @@
+"""What is believed after some readings: weighted samples and evidence, reweighted, redrawn, or sampled anew."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp, ndtri
+from scipy.stats import chi2
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ParameterError
+from probewise.inquiry.any_settings.noise import ReadingNoise
+from probewise.inquiry.any_settings.settings import Column, Settings
+from probewise.nested import Weighted, pareto_k, run, update
+from probewise.nested.weights import n_effective
+from probewise.priors import Joint, Prior, Product
+from probewise.systems.calls import Caller
+
+__all__ = ["NOISE_SD", "Model", "Readings", "prior_samples", "updated"]
+
+NOISE_SD = "noise.sd"
+"""Name of the parameter that an unknown sd of the noise is."""
+
+_KEEP = 0.25  # share of the draws that must count, else they are drawn anew
+_N_PROBED = 3
+_BLOCK = 2_000_000  # readings predicted at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Prior, predictions and noise of one instrument."""
+
+    caller: Caller
+    own_prior: Prior
+    noise: ReadingNoise
+
+    @classmethod
+    def of(cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings) -> Model:
+        """Find out how a person's function can be called: for arrays at once, for one sample, for one reading."""
+
+        def many(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
+            return function(dict(parameters), settings.given(columns))
+
+        def single(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
+            rows = Settings(columns, settings.form)
+            return np.array([function(dict(parameters), rows[k]) for k in range(len(rows))])
+
+        u = np.linspace(0.2, 0.8, _N_PROBED)[:, None] * np.ones(len(prior.names))
+        theta = prior.from_unit_cube(u)
+        samples = {name: theta[:, [k]] for k, name in enumerate(prior.names)}
+        some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int))).columns
+        try:
+            caller = Caller.probed(many, samples, some, per_run=(), broadcasts=False, name="model")
+        except Exception:
+            caller = Caller.probed(single, samples, some, per_run=(), broadcasts=False, name="model")
+        return cls(caller, prior, noise)
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The prior, with that of the noise's sd at its end where that is unknown."""
+        if not self.noise.inferred:
+            return self.own_prior
+        return Joint((self.own_prior, Product({NOISE_SD: self.noise.sd})))  # type: ignore[dict-item]
+
+    def predict(self, theta: FloatArray, settings: Settings) -> FloatArray:
+        """Predict readings, theta (n_samples, n_params) -> (n_samples, n_settings).
+
+        Raises
+        ------
+        ParameterError
+            If a prediction is not finite. What the function itself raises is passed on.
+        """
+        names, n = self.own_prior.names, len(settings)
+        at_once = max(_BLOCK // n, 1)
+        if len(theta) > at_once:
+            return np.concatenate([self.predict(theta[k : k + at_once], settings) for k in range(0, len(theta), at_once)])
+        samples = {name: theta[:, [k]] for k, name in enumerate(names)}
+        out = self.caller(samples, settings.columns, strict=True)
+        if not np.isfinite(out).all():
+            self._blame(theta, settings, out)
+        return out
+
+    def _blame(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
+        """Raise what the function raises at the first sample whose prediction is not finite, or say which it is."""
+        sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
+        own = {name: theta[[sample], k : k + 1] for k, name in enumerate(self.own_prior.names)}
+        self.caller(own, settings.columns, strict=True)
+        at = ", ".join(f"{name} = {theta[sample, k]:.10g}" for k, name in enumerate(self.own_prior.names))
+        raise ParameterError(f"the model at {at}, setting {settings[row]}", float(out[sample, row]), "finite readings")
+
+    def scale(self, theta: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Sd of the noise of each prediction, (n_samples, n_settings)."""
+        return self.noise.scale(predicted, theta[:, -1] if self.noise.inferred else None)
+
+    def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
+        """Log density of each reading, (n_samples, n_readings)."""
+        predicted = self.predict(theta, settings)
+        return self.noise.log_density(readings, predicted, self.scale(theta, predicted))
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Readings with their settings, as a problem for nested sampling.
+
+    `settings` are the distinct ones, `row` says which of them each reading was taken at.
+    """
+
+    model: Model
+    settings: Settings
+    row: IntArray
+    values: FloatArray
+
+    @property
+    def prior(self) -> Prior:
+        """See `Problem`."""
+        return self.model.prior
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """See `Problem`."""
+        out = np.empty(len(theta))
+        at_once = max(_BLOCK // len(self.values), 1)
+        for k in range(0, len(theta), at_once):
+            own = theta[k : k + at_once]
+            predicted = self.model.predict(own, self.settings)
+            scale = self.model.scale(own, predicted)
+            density = self.model.noise.log_density(self.values, predicted[:, self.row], scale[:, self.row])
+            out[k : k + at_once] = density.sum(axis=1)
+        return out
+
+    def fit(self, theta: FloatArray) -> tuple[float, int]:
+        """How well one hypothesis (1, n_params) fits: upper tail of chi-square, and the reading it explains worst.
+
+        One degree of freedom for each reading, whatever was fitted, so that it errs towards fitting.
+        """
+        predicted = self.model.predict(theta, self.settings)
+        scale = self.model.scale(theta, predicted)
+        below = self.model.noise.cdf(self.values, predicted[0, self.row], scale[0, self.row])
+        z = np.abs(ndtri(np.clip(np.minimum(below, 1 - below), 1e-300, 0.5)))
+        return float(chi2.sf(float(z @ z), len(z))), int(np.argmax(z))
+
+
+def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
+    """Draw equally weighted samples of the prior: the posterior of no readings, whose evidence is one."""
+    theta = prior.from_unit_cube(rng.random((n, len(prior.names))))
+    return Weighted(prior.names, theta, np.zeros(n), np.full(n, -math.log(n)), 0.0, 0.0, float(n), 0, -math.inf)
+
+
+def updated(
+    previous: Weighted, readings: Readings, log_density: FloatArray, n: int, n_live: int, *, rng: np.random.Generator
+) -> Weighted:
+    """Take in the last of the readings.
+
+    Samples are reweighted; where too few count, `nested.update` draws `n` anew from a density fitted to them, against
+    all readings; where those are not sound either, nested sampling starts from the prior.
+
+    Parameters
+    ----------
+    previous
+        Posterior given the readings before.
+    readings
+        All readings.
+    log_density
+        Log density of the last reading given each sample, (n_samples,).
+    n, n_live
+        Samples, and live points of a run.
+    rng
+        Source of randomness.
+    """
+    reweighed = previous.log_weight + log_density
+    gained = float(logsumexp(reweighed))
+    n_eff = n_effective(reweighed)
+    now = replace(
+        previous,
+        log_likelihood=previous.log_likelihood + log_density,
+        log_weight=reweighed - gained,
+        log_z=previous.log_z + gained,
+        log_z_error=math.sqrt(previous.log_z_error**2 + max(1 / max(n_eff, 1e-9) - 1 / previous.n_eff, 0.0)),
+        n_eff=n_eff,
+        pareto_k=pareto_k(reweighed),
+        run=None,
+    )
+    if n_eff >= _KEEP * n and now.pareto_k < 0.7:
+        return now
+
+    def anew() -> Any:
+        return run(readings, rng=rng, n_live=n_live)
+
+    if n_eff < 3 * len(previous.names):
+        found = anew()
+        return update(found, readings, rng=rng, n_draws=n, fall_back=lambda: found)
+    return update(now, readings, rng=rng, n_draws=n, fall_back=anew)

@@ -1,0 +1,243 @@
+"""Measure, infer, inquire with any instrument: which setting to read next, and what is known after each reading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, floats
+from probewise._display import ShowsItself
+from probewise._kinds import did_you_mean, require_callable, require_finite_number, require_rng, require_whole
+from probewise.errors import ParameterError, ShapeError
+from probewise.inquiry.any_settings.belief import NOISE_SD, Model, Readings, prior_samples, updated
+from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
+from probewise.inquiry.any_settings.settings import Settings
+from probewise.inquiry.any_settings.worth import Predictive
+from probewise.inquiry.choice import choose
+from probewise.nested import Weighted, pose
+from probewise.nested.pose import AnyPrior
+from probewise.nested.weights import n_effective, resampled
+from probewise.priors import require_prior
+
+__all__ = ["Inquiry"]
+
+_N_ASKED = 1000  # samples whose predictions value the settings
+_FEWER_ASKED = 200  # of a model that is called for one sample at a time
+_DOUBT_P = 1e-6
+
+
+class Inquiry(ShowsItself):
+    """An inquiry: the posterior of a model's parameters, and the setting whose reading promises most.
+
+    Parameters
+    ----------
+    model
+        Predicts readings: `model(parameters, settings)`, `parameters` a dict by name, `settings` in the form in which they
+        are given here. It is called with arrays that broadcast, parameters (n_samples, 1) against settings (n_settings,),
+        if it gives the same that way; else for one sample after the other, and if need be for one setting after the
+        other.
+    prior
+        Distributions by name (`probewise.priors` or frozen ones of scipy.stats), or a prior.
+    settings
+        Every setting that the instrument has: numbers or names (n_settings,) of one knob; numbers (n_settings, n_knobs) of
+        several, which the model gets as (n_knobs, n_settings), to be unpacked; or a dict of columns by name.
+    noise
+        Sd of a reading's noise: a number, a function of the predicted reading, or its prior, where it is unknown;
+        or a `ReadingNoise`, for heavy tails and outliers.
+    rng
+        Source of randomness: the same generator and readings give the same choices.
+    goal
+        The posterior sd that is asked for, by parameter: `{"centre_hz": 0.5}`. Then readings are chosen for it, and
+        `settled` tells when it is reached. Without, readings are chosen for the information about all parameters.
+    cost_s
+        Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first) that
+        returns them. Then worth is counted per second.
+    n_samples
+        Posterior samples.
+    n_live
+        Live points of nested sampling, which starts anew where the samples cannot follow a surprising reading.
+
+    Raises
+    ------
+    ParameterError
+        If an argument is of the wrong kind.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        prior: AnyPrior,
+        settings: Any,
+        noise: AnyNoise,
+        *,
+        rng: np.random.Generator,
+        goal: Mapping[str, float] | None = None,
+        cost_s: Sequence[float] | FloatArray | Callable[[Any], Any] | None = None,
+        n_samples: int = 4000,
+        n_live: int = 300,
+    ) -> None:
+        require_callable("model", model, "a function model(parameters, settings) that predicts readings")
+        require_rng(rng)
+        named = pose(lambda _: 0.0, prior).prior
+        require_prior("prior", named, "to_unit_cube", "log_prob")
+        self._settings = Settings.of(settings)
+        self._model = Model.of(model, named, ReadingNoise.of(noise), self._settings)
+        self._rng = rng
+        self._goal = _goal(goal, self._model.prior.names)
+        self._cost_s = cost_s
+        self._n_samples, self._n_live = require_whole("n_samples", n_samples, least=400), require_whole("n_live", n_live)
+        self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
+        self._taken: list[tuple[Any, float]] = []
+        self._readings: Readings | None = None
+        self._worth: FloatArray | None = None
+        self._next: Any = None
+        self._costs()
+
+    @property
+    def posterior(self) -> Weighted:
+        """Weighted samples of the posterior: `mean()`, `sd()`, `interval(0.95)`, `samples(n, rng=rng)`."""
+        return self._posterior
+
+    @property
+    def evidence(self) -> tuple[float, float]:
+        """Natural log of the evidence of the readings, and its standard error."""
+        return self._posterior.log_z, self._posterior.log_z_error
+
+    @property
+    def readings(self) -> tuple[tuple[Any, float], ...]:
+        """Settings and readings so far; told to a new inquiry, one after the other, they are taken in again."""
+        return tuple(self._taken)
+
+    @property
+    def worth(self) -> FloatArray:
+        """What a reading at each setting promises, (n_settings,).
+
+        Without a goal, bits of information; with one, by how much the sum of ln(sd / goal) is expected to fall, or,
+        while ... Per second, where seconds are known.
+        """
+        if self._worth is None:
+            self._worth = self._valued(self._posterior.weight) / self._costs()
+            self._worth.flags.writeable = False
+        return self._worth
+
+    @property
+    def settled(self) -> bool:
+        """Whether every sd that the goal names is reached."""
+        if not self._goal:
+            raise ParameterError("goal", None, 'the sds that are asked for, by parameter: goal={"centre_hz": 0.5}')
+        sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
+        return all(sd[name] <= goal for name, goal in self._goal.items())
+
+    @property
+    def doubt(self) -> str | None:
+        """What speaks against the model: no hypothesis explains the readings (p < 1e-6); None where nothing does."""
+        if self._readings is None:
+            return None
+        best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
+        p_value, worst = self._readings.fit(best)
+        if p_value >= _DOUBT_P:
+            return None
+        setting, value = self._taken[worst]
+        return (
+            f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
+            f"({value:g} at {setting}); the model leaves something out, the prior excludes the truth, or the noise is "
+            "greater than stated"
+        )
+
+    def next(self) -> Any:
+        """Return the setting whose reading promises most, in the form of `settings`; ties are broken at random."""
+        if self._next is None:
+            row = choose(self.worth, np.ones(len(self._settings), dtype=np.bool_), rng=self._rng)
+            self._next = self._settings[row]
+        return self._next
+
+    def tell(self, reading: float, setting: Any = None) -> None:
+        """Take in a reading.
+
+        Parameters
+        ----------
+        reading
+            What was read.
+        setting
+            Where, if elsewhere than `next()` said; it need not be one of the settings.
+
+        Raises
+        ------
+        ParameterError
+            If the reading is not a finite number. Nothing is taken in.
+        NotConvergedError
+            If no hypothesis could have given these readings. Nothing is taken in.
+        """
+        value = require_finite_number("reading", reading, "a finite number; a reading that did not come is not told")
+        at = self._settings.one(self.next() if setting is None else setting)
+        readings = _with(self._readings, self._model, at, value)
+        theta = self._posterior.theta
+        log_density = self._model.log_density(theta, at, np.array([value]))[:, 0]
+        self._posterior = updated(
+            self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng
+        )
+        self._readings = readings
+        self._taken.append((at[0], value))
+        self._worth, self._next = None, None
+
+    def summary(self) -> str:
+        """Describe what is known, in plain text."""
+        return f"{len(self._taken)} readings"
+
+    def _valued(self, weight: FloatArray) -> FloatArray:
+        n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
+        theta = self._posterior.theta[self._rng.permutation(resampled(weight, n, self._rng))]
+        predicted = self._model.predict(theta, self._settings)
+        predictive = Predictive(predicted, self._model.scale(theta, predicted), self._model.noise)
+        mode = getattr(self, "mode", "info")
+        if not self._goal or mode == "info":
+            return predictive.information()
+        columns = [self._posterior.names.index(name) for name in self._goal]
+        values, goal = theta[:, columns], np.array(list(self._goal.values()))
+        sd = self._posterior.sd()[columns]
+        if mode.startswith("near") and (sd / goal).max() > float(mode[4:]):
+            return predictive.information()
+        now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
+        return now - predictive.distance(values, goal)
+
+    def _costs(self) -> FloatArray:
+        given = self._cost_s
+        if given is None:
+            return np.ones(len(self._settings))
+        if callable(given):
+            given = given(self._taken[-1][0] if self._taken else None)
+        cost_s = floats(given, "cost_s")
+        if cost_s.shape not in ((), (len(self._settings),)):
+            raise ShapeError(f"cost_s has shape {cost_s.shape}; allowed: ({len(self._settings)},), one a setting")
+        if not ((cost_s > 0) & np.isfinite(cost_s)).all():
+            raise ParameterError("cost_s", cost_s.tolist(), "seconds greater than 0, finite")
+        return cost_s
+
+
+def _goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
+    if goal is None:
+        return {}
+    if not isinstance(goal, Mapping) or not goal:
+        raise ParameterError("goal", goal, 'the sds that are asked for, by parameter: goal={"centre_hz": 0.5}')
+    for name, sd in goal.items():
+        if name not in names:
+            raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
+        if not require_finite_number(f"goal[{name!r}]", sd) > 0:
+            raise ParameterError(f"goal[{name!r}]", sd, "a sd greater than 0")
+    return dict(goal)
+
+
+def _with(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
+    """Append a reading; settings that were read before are not listed again."""
+    if readings is None:
+        return Readings(model, at, np.array([0]), np.array([value]))
+    known = readings.settings
+    same = np.ones(len(known), dtype=np.bool_)
+    for name, column in known.columns.items():
+        same &= column == at.columns[name][0]
+    row = int(np.argmax(same)) if same.any() else len(known)
+    settings = known if same.any() else known.joined(at)
+    return Readings(model, settings, np.append(readings.row, row), np.append(readings.values, value))

@@ -1,12 +1,15 @@
 """Find the centre of a resonance: `probewise.Inquiry` beside optbayesexpt (NIST), reading by reading.
 
-    python benchmarks/any_instrument.py --truths 200 --out docs/results/any_instrument.json
+    python benchmarks/any_instrument.py --truths 200 --runs runs.jsonl --out docs/results/any_instrument.json
+
+Every truth is a line of `--runs` as it ends; the same command goes on from there.
 
 Both get the same Lorentzian, the same prior, the same 301 settings and the same known noise; truth k is drawn from the
 prior, and both read it with the same noise (the generators are seeded by k). A run ends when the posterior sd of the
-centre is below 0.01, or after 400 readings. Per engine: how many runs ended, readings (mean and standard error, median;
-a run that did not end counts as 400), how often the central 95 % interval at the end holds the truth, runs that are sure
-and wrong (off by more than five of their own sds), processor time per reading, and lines of code that a user writes.
+centre is below 0.01, or after 400 readings. Per engine: how many runs ended, readings (mean and standard error,
+median; a run that did not end counts as 400), how often the central 95 % interval at the end holds the truth, runs that
+are sure and wrong (off by more than five of their own sds), processor time per reading, and lines of code that a user
+writes.
 
 optbayesexpt is run at its defaults, and with what its authors recommend for reliability and quality of choices: no
 contraction on resampling, its full utility, more draws, more particles. It is not on every package index; without it
@@ -34,7 +37,7 @@ import probewise
 from probewise.priors import Normal, Uniform
 
 GOAL = 0.01
-NOISE_SD = 0.3
+NOISE_SD = 0.2
 SETTINGS = np.linspace(1.5, 4.5, 301)
 MOST_READINGS = 400
 WRONG_SDS = 5.0
@@ -79,13 +82,11 @@ def theirs(
     rng: np.random.Generator,
     *,
     n_particles: int = 5000,
-    experiment_of: Callable[..., object] | None = None,
+    kind: Callable[..., object] | None = None,  # of the benchmark
     **options: object,
 ) -> Found:
     """Find the centre with optbayesexpt."""
     from optbayesexpt import OptBayesExpt
-
-    made = experiment_of or OptBayesExpt
 
     def peak(settings, parameters, constants):
         (x,) = settings
@@ -93,7 +94,7 @@ def theirs(
         return background + height / (1 + ((x - centre) / width) ** 2)
 
     samples = [marginal.from_unit(rng.random(n_particles)) for marginal in PRIOR.values()]
-    experiment = made(peak, (SETTINGS,), samples, (), default_noise_std=NOISE_SD, **options)
+    experiment = (kind or OptBayesExpt)(peak, (SETTINGS,), samples, (), default_noise_std=NOISE_SD, **options)
     experiment.rng = rng
     n_readings = 0
     while experiment.std()[0] > GOAL and n_readings < MOST_READINGS:
@@ -117,8 +118,8 @@ def theirs_at_best(read: Instrument, rng: np.random.Generator) -> Found:
             self.particle_weights[outside] = 0.0
             self.particle_weights /= self.particle_weights.sum()
 
-    options = {"scale": False, "utility_method": "full_kld_utility", "n_draws": 200}
-    return theirs(read, rng, n_particles=20_000, experiment_of=WithinPrior, **options)
+    options = {"scale": False, "utility_method": "full_kld_utility", "n_draws": 100}
+    return theirs(read, rng, n_particles=20_000, kind=WithinPrior, **options)
 
 
 ENGINES = {"probewise": ours, "optbayesexpt, defaults": theirs, "optbayesexpt, full utility": theirs_at_best}
@@ -173,16 +174,16 @@ def difference(first: list[dict[str, float]], second: list[dict[str, float]]) ->
 
 
 def lines(function: Callable[..., object]) -> int:
-    """Count the lines of code of a function: no docstring, no blank lines, no signature."""
+    """Count the lines of code of a function: no docstring, no blank lines, no imports, no signature."""
     body = inspect.getsource(function).split('"""')[-1].splitlines()
-    return sum(bool(line.strip()) for line in body)
+    return sum(bool(line.strip()) and " import " not in line for line in body)
 
 
 def main() -> None:
     """Write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--truths", type=int, default=200, metavar="N")
-    parser.add_argument("--engines", nargs="+", default=list(ENGINES), choices=list(ENGINES))
+    parser.add_argument("--runs", type=Path, required=True, metavar="FILE.jsonl")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     try:
@@ -191,13 +192,17 @@ def main() -> None:
         print(f"skipped: there is nothing to compare with ({error}); github.com/usnistgov/optbayesexpt has it")
         sys.exit(0)
     warnings.simplefilter("ignore")  # of both: their effects are in the figures
-    rows: dict[str, list[dict[str, float]]] = {name: [] for name in arguments.engines}
-    for k in tqdm(range(arguments.truths)):
-        for name in arguments.engines:
-            rows[name].append(run(ENGINES[name], k))
-    first, *others = arguments.engines
+    known = arguments.runs.read_text().splitlines() if arguments.runs.exists() else []
+    truths = [json.loads(line) for line in known][: arguments.truths]
+    with arguments.runs.open("a") as file:
+        for k in tqdm(range(len(truths), arguments.truths)):
+            truths.append({name: run(engine, k) for name, engine in ENGINES.items()})
+            file.write(json.dumps(truths[-1]) + "\n")
+            file.flush()
+    rows = {name: [truth[name] for truth in truths] for name in ENGINES}
+    first, *others = ENGINES
     found = {
-        "command": f"python benchmarks/any_instrument.py --truths {arguments.truths}",
+        "command": f"python benchmarks/any_instrument.py --truths {arguments.truths} --runs runs.jsonl",
         "date": date.today().isoformat(),
         "probewise": probewise.__version__,
         "seeds": "truth [k, 7], noise [k, 8], engine [k, 9], k from 0",

@@ -16,7 +16,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.inquiry.any_settings.noise import ReadingNoise
 from probewise.inquiry.any_settings.settings import Column, Settings
-from probewise.nested import Weighted, pareto_k, run, update
+from probewise.nested import NestedResult, Weighted, pareto_k, run, update
 from probewise.nested.weights import n_effective
 from probewise.priors import Joint, Prior, Product
 from probewise.systems.calls import Caller
@@ -78,7 +78,9 @@ class Model:
         names, n = self.own_prior.names, len(settings)
         at_once = max(_BLOCK // n, 1)
         if len(theta) > at_once:
-            return np.concatenate([self.predict(theta[k : k + at_once], settings) for k in range(0, len(theta), at_once)])
+            return np.concatenate(
+                [self.predict(theta[k : k + at_once], settings) for k in range(0, len(theta), at_once)]
+            )
         samples = {name: theta[:, [k]] for k, name in enumerate(names)}
         out = self.caller(samples, settings.columns, strict=True)
         if not np.isfinite(out).all():
@@ -171,8 +173,15 @@ def updated(
     rng
         Source of randomness.
     """
+
+    def anew() -> NestedResult:
+        return run(readings, rng=rng, n_live=n_live)
+
     reweighed = previous.log_weight + log_density
     gained = float(logsumexp(reweighed))
+    if not math.isfinite(gained):
+        found = anew()
+        return update(found, readings, rng=rng, n_draws=n, fall_back=lambda: found)
     n_eff = n_effective(reweighed)
     now = replace(
         previous,
@@ -187,10 +196,4 @@ def updated(
     if n_eff >= _KEEP * n and now.pareto_k < 0.7:
         return now
 
-    def anew() -> Any:
-        return run(readings, rng=rng, n_live=n_live)
-
-    if n_eff < 3 * len(previous.names):
-        found = anew()
-        return update(found, readings, rng=rng, n_draws=n, fall_back=lambda: found)
     return update(now, readings, rng=rng, n_draws=n, fall_back=anew)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,21 +11,25 @@ from probewise._arrays import FloatArray, floats
 from probewise._display import ShowsItself
 from probewise._kinds import did_you_mean, require_callable, require_finite_number, require_rng, require_whole
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry.any_settings.belief import NOISE_SD, Model, Readings, prior_samples, updated
+from probewise.inquiry.any_settings.belief import Model, Readings, prior_samples, updated
 from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
 from probewise.inquiry.any_settings.settings import Settings
 from probewise.inquiry.any_settings.worth import Predictive
 from probewise.inquiry.choice import choose
 from probewise.nested import Weighted, pose
 from probewise.nested.pose import AnyPrior
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import resampled
 from probewise.priors import require_prior
 
 __all__ = ["Inquiry"]
 
 _N_ASKED = 1000  # samples whose predictions value the settings
 _FEWER_ASKED = 200  # of a model that is called for one sample at a time
+_N_IMAGINED = 8
 _DOUBT_P = 1e-6
+_NEAR_GOAL = 3.0  # times the sds that are asked for
+_BITS = "expected information (bits)"
+_NEARER = "expected fall of the sum of ln(sd / goal)"
 
 
 class Inquiry(ShowsItself):
@@ -35,15 +38,15 @@ class Inquiry(ShowsItself):
     Parameters
     ----------
     model
-        Predicts readings: `model(parameters, settings)`, `parameters` a dict by name, `settings` in the form in which they
-        are given here. It is called with arrays that broadcast, parameters (n_samples, 1) against settings (n_settings,),
-        if it gives the same that way; else for one sample after the other, and if need be for one setting after the
-        other.
+        Predicts readings: `model(parameters, settings)`, `parameters` a dict by name, `settings` in the form in which
+        they are given here. It is called with arrays that broadcast, parameters (n_samples, 1) against settings
+        (n_settings,), if it gives the same that way; else for one sample after the other, and if need be for one
+        setting after the other.
     prior
         Distributions by name (`probewise.priors` or frozen ones of scipy.stats), or a prior.
     settings
-        Every setting that the instrument has: numbers or names (n_settings,) of one knob; numbers (n_settings, n_knobs) of
-        several, which the model gets as (n_knobs, n_settings), to be unpacked; or a dict of columns by name.
+        Every setting that the instrument has: numbers or names (n_settings,) of one knob; numbers (n_settings, n_knobs)
+        of several, which the model gets as (n_knobs, n_settings), to be unpacked; or a dict of columns by name.
     noise
         Sd of a reading's noise: a number, a function of the predicted reading, or its prior, where it is unknown;
         or a `ReadingNoise`, for heavy tails and outliers.
@@ -53,8 +56,8 @@ class Inquiry(ShowsItself):
         The posterior sd that is asked for, by parameter: `{"centre_hz": 0.5}`. Then readings are chosen for it, and
         `settled` tells when it is reached. Without, readings are chosen for the information about all parameters.
     cost_s
-        Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first) that
-        returns them. Then worth is counted per second.
+        Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first)
+        that returns them. Then worth is counted per second.
     n_samples
         Posterior samples.
     n_live
@@ -88,7 +91,10 @@ class Inquiry(ShowsItself):
         self._rng = rng
         self._goal = _goal(goal, self._model.prior.names)
         self._cost_s = cost_s
-        self._n_samples, self._n_live = require_whole("n_samples", n_samples, least=400), require_whole("n_live", n_live)
+        self._n_samples, self._n_live = (
+            require_whole("n_samples", n_samples, least=400),
+            require_whole("n_live", n_live),
+        )
         self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
         self._taken: list[tuple[Any, float]] = []
         self._readings: Readings | None = None
@@ -113,10 +119,10 @@ class Inquiry(ShowsItself):
 
     @property
     def worth(self) -> FloatArray:
-        """What a reading at each setting promises, (n_settings,).
+        """What a reading at each setting promises, (n_settings,), per second where seconds are known.
 
-        Without a goal, bits of information; with one, by how much the sum of ln(sd / goal) is expected to fall, or,
-        while ... Per second, where seconds are known.
+        Expected information, until every sd that the goal names is within three times its goal: then by how much the
+        sum of ln(sd / goal) is expected to fall.
         """
         if self._worth is None:
             self._worth = self._valued(self._posterior.weight) / self._costs()
@@ -124,12 +130,17 @@ class Inquiry(ShowsItself):
         return self._worth
 
     @property
+    def worth_label(self) -> str:
+        """What the worth is, with its unit, for an axis."""
+        per_second = "" if self._cost_s is None else " per second"
+        return f"{_NEARER if self._near else _BITS}{per_second}"
+
+    @property
     def settled(self) -> bool:
         """Whether every sd that the goal names is reached."""
         if not self._goal:
             raise ParameterError("goal", None, 'the sds that are asked for, by parameter: goal={"centre_hz": 0.5}')
-        sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
-        return all(sd[name] <= goal for name, goal in self._goal.items())
+        return self._times_goal <= 1.0
 
     @property
     def doubt(self) -> str | None:
@@ -176,32 +187,70 @@ class Inquiry(ShowsItself):
         readings = _with(self._readings, self._model, at, value)
         theta = self._posterior.theta
         log_density = self._model.log_density(theta, at, np.array([value]))[:, 0]
-        self._posterior = updated(
-            self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng
-        )
+        self._posterior = updated(self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng)
         self._readings = readings
         self._taken.append((at[0], value))
         self._worth, self._next = None, None
 
+    def several(self, n: int) -> list[Any]:
+        """Choose settings of readings that are to be taken together, before any of them is known; best first.
+
+        Each is the best beside those before it, on average over imagined results of those: greedy on the joint
+        information (Nemhauser, Wolsey & Fisher 1978). Told one by one: `tell(reading, setting)`.
+        """
+        require_whole("n", n)
+        everywhere = np.ones(len(self._settings), dtype=np.bool_)
+        rows = [choose(self.worth, everywhere, rng=self._rng)]
+        theta, noise = self._posterior.theta, self._model.noise
+        weights = [self._posterior.weight] * _N_IMAGINED
+        while len(rows) < n:
+            predicted = self._model.predict(theta, self._settings.take(np.array(rows[-1:])))
+            scale = self._model.scale(theta, predicted)
+            for k, weight in enumerate(weights):
+                truth = [self._rng.choice(len(weight), p=weight / weight.sum())]
+                imagined = noise.draw(predicted[truth], scale[truth], rng=self._rng)
+                log_density = noise.log_density(imagined, predicted, scale)[:, 0]
+                weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
+            worth = np.mean([self._valued(weight) for weight in weights], axis=0) / self._costs()
+            rows.append(choose(worth, everywhere, rng=self._rng))
+        return [self._settings[row] for row in rows]
+
     def summary(self) -> str:
         """Describe what is known, in plain text."""
-        return f"{len(self._taken)} readings"
+        found = self._posterior
+        width = max(9, *(len(name) for name in found.names))
+        low, high = found.interval(0.95)
+        lines = [
+            f"{len(self._taken)} readings, log Z {found.log_z:.2f} ± {found.log_z_error:.2f}, "
+            f"effective sample size {found.n_eff:.0f} of {len(found.theta)}",
+            f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval",
+        ]
+        for name, mean, sd, a, b in zip(found.names, found.mean(), found.sd(), low, high, strict=True):
+            goal = f", asked for {self._goal[name]:.3g}" if name in self._goal else ""
+            lines.append(f"{name:<{width}}  {mean:>11.5g}  {sd:>11.3g}  {a:.5g} to {b:.5g}{goal}")
+        return "\n".join([*lines, *([] if self.doubt is None else [f"doubtful: {self.doubt}"])])
+
+    @property
+    def _times_goal(self) -> float:
+        """How many times as wide as its goal the widest sd is."""
+        sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
+        return float(max(sd[name] / goal for name, goal in self._goal.items()))
+
+    @property
+    def _near(self) -> bool:
+        return bool(self._goal) and self._times_goal < _NEAR_GOAL
 
     def _valued(self, weight: FloatArray) -> FloatArray:
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
-        theta = self._posterior.theta[self._rng.permutation(resampled(weight, n, self._rng))]
+        theta = self._posterior.theta[resampled(weight, n, self._rng)]
+        theta = theta[self._rng.permutation(n)]  # copies of one sample apart
         predicted = self._model.predict(theta, self._settings)
         predictive = Predictive(predicted, self._model.scale(theta, predicted), self._model.noise)
-        mode = getattr(self, "mode", "info")
-        if not self._goal or mode == "info":
+        if not self._near:
             return predictive.information()
-        columns = [self._posterior.names.index(name) for name in self._goal]
-        values, goal = theta[:, columns], np.array(list(self._goal.values()))
-        sd = self._posterior.sd()[columns]
-        if mode.startswith("near") and (sd / goal).max() > float(mode[4:]):
-            return predictive.information()
+        values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
         now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
-        return now - predictive.distance(values, goal)
+        return np.asarray(now - predictive.distance(values, np.array(goal)))
 
     def _costs(self) -> FloatArray:
         given = self._cost_s

@@ -51,7 +51,7 @@ class ReadingNoise:
     between: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.sd, type) or (isinstance(self.sd, str | bytes)):
+        if isinstance(self.sd, type | str | bytes):
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
         if not (self.inferred or callable(self.sd)) and not 0 < require_number("noise sd", self.sd, _ALLOWED_SD) < (
             math.inf
@@ -91,7 +91,9 @@ class ReadingNoise:
         bad = ~((out > 0) & np.isfinite(out))
         if bad.any():
             where = predicted[bad][0]
-            raise ParameterError(f"noise sd of the predicted reading {where:g}", out[bad][0], "finite, greater than 0")
+            raise ParameterError(
+                f"noise sd of the predicted reading {where:g}", float(out[bad][0]), "finite, greater than 0"
+            )
         return out
 
     def log_density(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
@@ -109,6 +111,14 @@ class ReadingNoise:
             return np.asarray(core)
         low, high = self._ends
         return np.asarray((1 - self.outliers) * core + self.outliers * np.clip((readings - low) / (high - low), 0, 1))
+
+    def draw(self, predicted: FloatArray, scale: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw a reading for each prediction, arrays of one shape."""
+        z = rng.standard_normal(predicted.shape) if math.isinf(self.dof) else rng.standard_t(self.dof, predicted.shape)
+        core = predicted + scale * z
+        if not self.outliers:
+            return np.asarray(core)
+        return np.where(rng.random(predicted.shape) < self.outliers, rng.uniform(*self._ends, predicted.shape), core)
 
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:

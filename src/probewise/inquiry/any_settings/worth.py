@@ -2,8 +2,8 @@
 
 At each setting the samples of the posterior are sorted by the reading that they predict and put into groups. The
 predictive density is the mixture of the groups, each as wide as its noise and its own spread together; means over it
-are sums over the groups and over the nodes of a quadrature. Nothing is binned, so a reading that tells a hundredth of a
-bit is valued as surely as one that tells ten.
+are sums over samples of each group and nodes of a quadrature over the noise. Nothing is binned, so a reading that
+tells a hundredth of a bit is valued as surely as one that tells ten.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from probewise.inquiry.any_settings.noise import ReadingNoise
 
 __all__ = ["Predictive"]
 
-_N_GROUPS = 40
+_N_GROUPS = 32
 _N_OUTLIERS = 32
 _BLOCK = 2_000_000  # densities held at a time
 _LEAST_SHARE = 1e-9  # of the variance that rounding may leave
@@ -42,27 +42,48 @@ class Predictive:
         self._shape = (n_groups, n // n_groups)
         self._order = np.argsort(predicted[:n], axis=0)
         sorted_, scales = (np.take_along_axis(a[:n], self._order, axis=0) for a in (predicted, scale))
-        grouped = sorted_.reshape(*self._shape, -1)
+        grouped = self._grouped = sorted_.reshape(*self._shape, -1)
         self._centre = grouped.mean(axis=1)
         self._scale = np.sqrt((scales.reshape(*self._shape, -1) ** 2).mean(axis=1))
         self._width = np.sqrt(self._scale**2 + grouped.var(axis=1))
+        self._read = self._sampled(grouped, noise.nodes[1])
+
+    def _sampled(self, grouped: FloatArray, weight: FloatArray) -> FloatArray:
+        """Choose the sample of each group that each node of the noise is added to, (n_groups, n_nodes, n_settings).
+
+        A group may hold samples far apart, and its middle lie where nothing is predicted. Each pair of nodes, above and
+        below, stands at another sample, by turns from group to group. Where noise hides the spread of a group, they are
+        shifted and stretched to its mean and variance.
+        """
+        n_groups, size = self._shape
+        n_pairs = (len(weight) + 1) // 2
+        pair = np.minimum(np.arange(len(weight)), np.arange(len(weight))[::-1])
+        turn = (pair + np.arange(n_groups)[:, None]) % n_pairs
+        read = grouped[np.arange(n_groups)[:, None], (2 * turn + 1) * size // (2 * n_pairs)]
+        own = weight[:, None]
+        mean = (read * own).sum(axis=1, keepdims=True)
+        spread = ((read - mean) ** 2 * own).sum(axis=1, keepdims=True)
+        variance = self._width[:, None] ** 2 - self._scale[:, None] ** 2
+        stretch = np.sqrt(np.divide(variance, spread, out=np.zeros_like(spread), where=spread > 0))
+        hidden = variance < self._scale[:, None] ** 2
+        return np.where(hidden, self._centre[:, None] + (read - mean) * stretch, read)
 
     def information(self) -> FloatArray:
-        """Expected information about all parameters together, bits, (n_settings,)."""
+        """Give the expected information about all parameters together, bits, (n_settings,)."""
         node, weight = self.noise.nodes
         alone = self._centre[:, None, :] + self._scale[:, None, :] * node[:, None]
         log_own = self.noise.log_density(alone, self._centre[:, None, :], self._scale[:, None, :])
         given = (weight[:, None] * log_own).sum(axis=1).mean(axis=0)
-        mixed = np.concatenate([self._over_nodes(np.log(density)) for _, density, _ in self._blocks()])
+        mixed = np.concatenate([self._over_nodes(np.log(density)) for _, _, density, _ in self._blocks()])
         share = self.noise.outliers
         if share:
             outliers = self.noise.outlier_nodes(_N_OUTLIERS)[:, None, None]
             own = self.noise.log_density(outliers, self._centre, self._scale).mean(axis=(0, 1))
             given = (1 - share) * given + share * own
-        return np.maximum(given - mixed, 0.0) / math.log(2)
+        return np.asarray(np.maximum(given - mixed, 0.0) / math.log(2))
 
     def distance(self, values: FloatArray, goal: FloatArray) -> FloatArray:
-        """Expected distance from the goal after a reading, (n_settings,): the sum of ln(sd / goal) where above 0.
+        """Give the distance from the goal expected after a reading, (n_settings,): the sum of ln(sd / goal) above 0.
 
         Parameters
         ----------
@@ -73,23 +94,33 @@ class Predictive:
         """
         n = self._order.shape[0]
         centred = values[:n] - values[:n].mean(axis=0)
-        means, squares = [], []
-        for value in centred.T:
-            own = value[self._order].reshape(*self._shape, -1)
-            means.append(own.mean(axis=1))
-            squares.append((own**2).mean(axis=1))
+        lines = [self._regressed(value) for value in centred.T]
         least = _LEAST_SHARE * (centred**2).mean(axis=0)
         out = np.zeros(self._order.shape[1])
-        for rows, density, each in self._blocks():
-            for mean, square, sd, at_least in zip(means, squares, goal, least, strict=True):
-                given = np.einsum("gsn,gs->sn", each, mean[:, rows]) / density
-                variance = np.einsum("gsn,gs->sn", each, square[:, rows]) / density - given**2
+        for rows, at, density, each in self._blocks():
+            for (level, slope, rest), sd, at_least in zip(lines, goal, least, strict=True):
+                a, b, r = level[:, rows], slope[:, rows], rest[:, rows]
+                mean, by_reading, square, both, curve = (
+                    np.einsum("gsn,gs->sn", each, part) / density for part in (a, b, a**2 + r, 2 * a * b, b**2)
+                )
+                variance = square + at * (both + at * curve) - (mean + at * by_reading) ** 2
                 far = 0.5 * np.log(np.maximum(variance, at_least)) - math.log(sd)
                 out[rows] += self._over_nodes(np.maximum(far, 0.0))
         return out
 
-    def _blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-        """Yield settings by settings: rows, density of each node (n_rows, n_nodes), and each group's part of it."""
+    def _regressed(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Predict a value from the reading within each group: level, slope and variance left, (n_groups, n_settings).
+
+        Within a group value and reading are taken for jointly Gaussian.
+        """
+        own = value[self._order].reshape(*self._shape, -1)
+        mean = own.mean(axis=1)
+        together = ((own - mean[:, None]) * (self._grouped - self._centre[:, None])).mean(axis=1)
+        slope = together / self._width**2
+        return mean - slope * self._centre, slope, own.var(axis=1) - slope * together
+
+    def _blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
+        """Yield settings by settings: rows, nodes (n_rows, n_nodes), density of each, and each group's part of it."""
         n_groups, n_settings = self._centre.shape
         node = self.noise.nodes[0]
         outliers = self.noise.outlier_nodes(_N_OUTLIERS)
@@ -98,11 +129,12 @@ class Predictive:
         for start in range(0, n_settings, size):
             rows = slice(start, start + size)
             centre, width = self._centre[:, rows], self._width[:, rows]
-            at = (centre[:, None, :] + width[:, None, :] * node[:, None]).reshape(-1, centre.shape[1]).T
+            at = self._read[..., rows] + self._scale[:, None, rows] * node[:, None]
+            at = at.reshape(-1, centre.shape[1]).T
             if len(outliers):
                 at = np.concatenate([at, np.broadcast_to(outliers, (len(at), len(outliers)))], axis=1)
             each = np.exp(self.noise.log_density(at[None], centre[:, :, None], width[:, :, None])) / n_groups
-            yield rows, each.sum(axis=0), each
+            yield rows, at, each.sum(axis=0), each
 
     def _over_nodes(self, values: FloatArray) -> FloatArray:
         """Mean over the predictive distribution, (n_rows, n_nodes) -> (n_rows,)."""

@@ -83,4 +83,4 @@ for (readings, posterior, worth, chosen), ax in zip(views, axes, strict=True):
         title=f"after {len(readings)} readings", xlabel="x (mm)", xlim=(-4100, 4100), ylim=(-4100, 4100), aspect="equal"
     )
 axes[0].set_ylabel("y (mm)")
-axes[0].legend(fontsize=8, loc="upper right")
+fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)

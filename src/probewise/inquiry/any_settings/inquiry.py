@@ -122,7 +122,7 @@ class Inquiry(ShowsItself):
         """What a reading at each setting promises, (n_settings,), per second where seconds are known.
 
         Expected information, until every sd that the goal names is within three times its goal: then by how much the
-        sum of ln(sd / goal) is expected to fall.
+        sum of ln(sd / goal) is expected to fall. Once the goal is reached, information again.
         """
         if self._worth is None:
             self._worth = self._valued(self._posterior.weight) / self._costs()
@@ -238,7 +238,7 @@ class Inquiry(ShowsItself):
 
     @property
     def _near(self) -> bool:
-        return bool(self._goal) and self._times_goal < _NEAR_GOAL
+        return bool(self._goal) and 1.0 < self._times_goal < _NEAR_GOAL
 
     def _valued(self, weight: FloatArray) -> FloatArray:
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED

@@ -171,9 +171,22 @@ def test_a_heavy_tail_is_exact_at_both_ends():
     assert LogHeavyTailed(0.1).from_unit(np.array([0.5]))[0] == pytest.approx(1.0)
 
 
+def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
+    """Sds from one typical size: below half of it lies an eighth, where the wide mixture has a third."""
+    wide, shown = HeavyTailed(0.5, positive=True), HeavyTailed(0.5, positive=True, smallest=1.0)
+    u = np.linspace(0.01, 0.99, 25)
+    np.testing.assert_allclose(shown.to_unit(shown.from_unit(u)), u, atol=1e-9)
+    x = np.linspace(0.0, 120.0, 240_001)
+    assert np.trapezoid(np.exp(shown.log_prob(x)), x) == pytest.approx(1.0, abs=1e-6)
+    below = [float(prior.to_unit(np.array([0.25]))[0]) for prior in (wide, shown)]
+    assert below[0] > 2.5 * below[1]
+
+
 def test_a_heavy_tail_refuses_a_size_of_zero():
     with pytest.raises(ParameterError, match="greater than 0"):
         HeavyTailed(0.0)
+    with pytest.raises(ParameterError, match="smallest"):
+        HeavyTailed(1.0, smallest=30.0)
 
 
 def test_an_effect_that_could_not_show_is_not_built():

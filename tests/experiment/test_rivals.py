@@ -71,6 +71,7 @@ def test_the_rivals_share_what_trust_leaves(doubting):
     assert prior.pop("") == pytest.approx(0.9)
     np.testing.assert_allclose(list(prior.values()), 0.1 / len(prior))
     assert {"backlash", "saturation", "dropouts", "outliers", "flicker", "edge_shadow", "quantisation"} <= set(prior)
+    assert {"hysteresis", "lag"} <= set(prior)  # a run comes from every side
 
 
 def test_with_full_trust_there_is_one_kind():
@@ -87,6 +88,16 @@ def test_a_sensor_that_has_no_rivals_cannot_be_doubted(row):
 def test_trust_is_a_probability(trust):
     with pytest.raises(ParameterError, match="trust"):
         replace(experiment_of(REFERENCE), trust=trust)
+
+
+def test_a_rival_is_of_a_size_and_at_a_time_that_a_run_can_show():
+    found = {rival.name: rival.effect.prior.marginals for rival in rivals() if rival.effect is not None}
+    width, at_s = found["backlash"]["width_mm"], found["ambient_step"]["at_s"]
+    assert width.to_unit(np.array([0.5]))[0] < 0.3
+    run_of_twelve = at_s.to_unit(np.array([4.0, 12 * 8.0]))
+    assert run_of_twelve[0] == 0.0
+    assert run_of_twelve[1] > 0.5
+    assert at_s.to_unit(np.array([99 * 8.0]))[0] < 1.0  # nor is a run of a hundred readings safe from it
 
 
 def laws(*kinds):

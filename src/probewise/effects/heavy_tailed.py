@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,20 +25,22 @@ class HeavyTailed:
     """Scale mixture of normal distributions about zero, with sds from 0.05 to 25 times a typical size.
 
     The weights are equal, so the density falls about as 1/abs(x) over three decades and is
-    proper. With `positive` the distribution is folded onto x >= 0.
+    proper. With `positive` the distribution is folded onto x >= 0. `smallest` is the smallest sd, in typical sizes.
     """
 
     typical: float
     positive: bool = False
+    smallest: float = SMALLEST_AND_LARGEST[0]
 
     def __post_init__(self) -> None:
         if not 0 < self.typical < math.inf:
             raise ParameterError("HeavyTailed(typical)", self.typical, "greater than 0, finite")
+        if not 0 < self.smallest < SMALLEST_AND_LARGEST[1]:
+            raise ParameterError("HeavyTailed(smallest)", self.smallest, f"0 < smallest < {SMALLEST_AND_LARGEST[1]:g}")
 
     @cached_property
     def _sds(self) -> FloatArray:
-        low, high = SMALLEST_AND_LARGEST
-        return self.typical * np.geomspace(low, high, _N_SCALES)
+        return self.typical * np.geomspace(self.smallest, SMALLEST_AND_LARGEST[1], _N_SCALES)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Natural log of the density, any shape."""
@@ -71,7 +73,7 @@ class HeavyTailed:
         goal = -np.log(2 * tail)
         depth, size = self._table
         x = np.interp(goal, depth, size)
-        two_sided = HeavyTailed(self.typical) if self.positive else self
+        two_sided = replace(self, positive=False)
         for _ in range(3):
             upper = np.maximum(self._upper(x), 1e-300)
             slope = np.exp(two_sided.log_prob(x)) / upper
@@ -96,10 +98,11 @@ class LogHeavyTailed:
     """Prior of a factor or exponent near one: its logarithm is heavy-tailed about zero."""
 
     typical_log: float
+    smallest: float = SMALLEST_AND_LARGEST[0]
 
     @cached_property
     def _log(self) -> HeavyTailed:
-        return HeavyTailed(self.typical_log)
+        return HeavyTailed(self.typical_log, smallest=self.smallest)
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Quantile function, any shape."""

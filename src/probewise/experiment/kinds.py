@@ -6,14 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, frozen
-from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
-from probewise.experiment.pace import Paced
+from probewise.experiment.pace import Told
 from probewise.experiment.rivals import Rival
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import TabledChain
@@ -58,7 +56,7 @@ class Kind:
     likelihood: Likelihood
     placed: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
-    effect: NamedEffect[Any] | Paced | None = None
+    effect: Told | None = None
 
     def problem(self, recording: Recording) -> SensorProblem:
         """Set up the inference of this kind from a recording."""

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.effects import NamedEffect
 from probewise.priors import Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor.stages import Effect, Stage
 
-__all__ = ["EACH_S", "Pace", "Paced", "clocked"]
+__all__ = ["EACH_S", "Pace", "Paced", "Told", "clocked"]
 
 EACH_S = 8.0
 """Seconds of a run's own time that each reading takes on average."""
@@ -51,11 +50,19 @@ class Pace:
         return replace(recording, plan=self.on(recording.plan))
 
 
+class Told(Effect[Any], Protocol):
+    """An effect that can say what it does."""
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say it, of its parameters' posterior means and sds."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Paced(Effect[FloatArray]):
     """An effect that changes with time, in the run's own time where a plan has it."""
 
-    effect: NamedEffect[FloatArray]
+    effect: Told
 
     powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 
@@ -77,7 +84,7 @@ class Paced(Effect[FloatArray]):
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply it."""
         own = plan.covariates.get(_COLUMN)
-        return self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own))
+        return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
     def by_the_clock(self, theta: FloatArray, pace: Pace) -> FloatArray:
         """Turn parameters in the run's own time into seconds of the clock, any shape (..., n_params)."""

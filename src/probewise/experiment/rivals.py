@@ -1,8 +1,9 @@
 """What the sensor model may leave out: the effects that could act in a run, each a rival of the sensor as calibrated.
 
-The effects and their priors are those of the diagnosis. A run is no recording, though: before its first reading
+The effects and their typical sizes are those of the diagnosis. A run is no recording, though: before its first reading
 nothing is known of places and times. Effects of the pose and of the footprint take their scales from a scan of
 100 mm, as a calibration has it; effects that change with the place, from the whole field; with time, from five minutes.
+What a dozen readings could not show leaves nothing out that matters (`Shown`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from probewise.effects import (
 )
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import noise_laws
-from probewise.experiment.pace import EACH_S, Paced
+from probewise.experiment.pace import EACH_S, Paced, Told
+from probewise.experiment.shown import Shown
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import cards_of
@@ -66,7 +68,7 @@ class Rival:
     """One thing that the sensor model may leave out: an effect on the mean, or another law of the noise."""
 
     name: str
-    effect: NamedEffect[FloatArray] | Paced | None = None
+    effect: Told | None = None
     likelihood: Likelihood | None = None
 
 
@@ -109,12 +111,12 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     return tuple(found)
 
 
-def _ways(effect: NamedEffect[FloatArray]) -> list[NamedEffect[FloatArray] | Paced]:
+def _ways(effect: NamedEffect[FloatArray]) -> list[Told]:
     """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
     if effect.name not in _IN_TIME:
-        return [effect]
+        return [Shown(effect)]
     ways = [effect, GainLoss.like(effect)] if isinstance(effect, GainDrift) else [effect]
-    return [Paced(way) for way in ways]
+    return [Paced(Shown(way)) for way in ways]
 
 
 @dataclass(frozen=True)
@@ -149,11 +151,11 @@ def _noise_of(likelihood: Likelihood) -> tuple[float, float] | None:
 
 
 def _scan(length_mm: float) -> Plan:
-    """Lay out one scan of some length over the time that a run may take: what scales are taken from."""
-    n = int(_DURATION_S / EACH_S) + 1
+    """Lay out one scan there and back over the time that a run may take: what scales are taken from."""
+    n = 2 * int(_DURATION_S / EACH_S / 2) + 1
     zeros = np.zeros(n, dtype=np.int64)
     return Plan(
-        x_mm=np.linspace(0.0, length_mm, n),
+        x_mm=length_mm * (1.0 - np.abs(np.linspace(-1.0, 1.0, n))),
         y_mm=np.zeros(n),
         orientation_rad=np.zeros(n),
         time_s=np.linspace(0.0, _DURATION_S, n),

@@ -1,0 +1,65 @@
+"""Prior of an effect as a single run can show it: a size that matters, and a time within the run.
+
+A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small for the dozen readings
+of a run. Such an effect changes neither the readings nor the shape: it counts as nothing left out. A change point
+may come at any of up to a hundred readings, sooner as likely as later in proportion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+from probewise._arrays import FloatArray
+from probewise.effects import HeavyTailed, LogHeavyTailed, NamedEffect
+from probewise.experiment.pace import EACH_S
+from probewise.priors import LogUniform, Prior, Product
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Effect, Stage
+
+__all__ = ["Shown"]
+
+_SMALLEST = 1.0
+"""Smallest sd of an effect's size, in typical sizes: about what changes a reading by one noise sd."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown(Effect[Any]):
+    """An effect whose prior leaves out the sizes that a run cannot show."""
+
+    effect: NamedEffect[Any]
+
+    within_run: ClassVar[Mapping[str, LogUniform]] = {"at_s": LogUniform(0.5 * EACH_S, 100.0 * EACH_S)}
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        """The effect's stage."""
+        return self.effect.stage
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The effect's prior, of sizes that show."""
+        own = self.effect.prior
+        if not isinstance(own, Product):
+            return own
+        return Product({name: self._marginal(name, marginal) for name, marginal in own.marginals.items()})
+
+    def _marginal(self, name: str, marginal: Any) -> Any:
+        if isinstance(marginal, HeavyTailed | LogHeavyTailed):
+            return replace(marginal, smallest=_SMALLEST)
+        return self.within_run.get(name, marginal)
+
+    def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
+        """Apply it."""
+        return self.effect.apply(value, theta, plan)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Say what it does."""
+        return self.effect.sentence(mean, sd)

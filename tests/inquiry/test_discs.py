@@ -1,11 +1,12 @@
 """The table of what a sensor reads of a disc, against the sensor model itself."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from probewise.effects import VOCABULARY
+from probewise.effects import VOCABULARY, AlbedoGradient, Backlash, EdgeBlur, Hysteresis, Known, Saturation
 from probewise.inquiry import (
     AskedForecast,
     Designs,
@@ -15,6 +16,7 @@ from probewise.inquiry import (
     InformationGain,
     Prospect,
     Readout,
+    TabledChain,
     forecast_of,
     utility_map,
 )
@@ -22,6 +24,7 @@ from probewise.inquiry.forecast import MOST_LEVELS
 from probewise.scene import Circle, HypothesisScene, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
+SATURATION = Saturation(20.0, 75.0, 0.05, 15.0)
 LEVELS = np.linspace(10.0, 60.0, 101)
 
 
@@ -136,3 +139,30 @@ def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
     # A hundred times less noise tells no less anywhere, and what 200 circles can tell bounds both.
     assert (bits[1] > bits[0] - 0.05).all()
     assert bits[1].max() <= np.log2(200)
+
+
+@pytest.mark.parametrize("names", [("backlash",), ("edge_blur",), ("backlash", "edge_blur", "saturation")])
+def test_a_sensor_with_known_effects_is_looked_up_too(made, places, names):
+    """A repaired sensor predicts from the table what its chain predicts by quadrature."""
+    values = {
+        "backlash": (Backlash(), (6.0,)),
+        "edge_blur": (EdgeBlur(), (8.0,)),
+        "saturation": (SATURATION, (45.0, 1.0)),
+    }
+    model = replace(made.chain(), effects=tuple(Known(*values[name]) for name in names))
+    forecast, theta = forecast_of(model), made.circles(40)
+    assert isinstance(forecast.model, DiscTable | TabledChain)
+    run = replace(places, scan=np.zeros(len(places), dtype=np.int64), scan_names=("run",))
+    away = np.abs(forecast.predict(theta, run) - model.predict(theta, run))
+    assert away.max() < 0.05
+    assert np.sqrt((away**2).mean()) < 0.002
+    # A rival beside what is known looks the same table up.
+    acting = TabledChain.of(model.with_effects(Hysteresis()), forecast.model)
+    both = np.concatenate([theta, np.full((40, 1), 4.0)], axis=1)
+    expected = model.with_effects(Hysteresis()).predict(both, run)
+    assert np.abs(acting.predict(both, run) - expected).max() < 0.05
+
+
+def test_an_effect_that_changes_with_the_place_is_asked_itself(made):
+    graded = replace(made.chain(), effects=(Known(AlbedoGradient(), (1e-4, 0.0)),))
+    assert forecast_of(graded).model is graded

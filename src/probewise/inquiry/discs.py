@@ -15,15 +15,16 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.effects import EdgeBlur, Halo, Known
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.spans import ROWS, Interval, Ring, Spans, single
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
-from probewise.sensor.stages import SensorModel, require_columns
+from probewise.sensor.stages import AnyEffect, SensorModel, require_columns
 
-__all__ = ["DiscTable"]
+__all__ = ["DiscTable", "is_alike_everywhere"]
 
 NAMES = ("x_mm", "y_mm", "radius_mm")
 
@@ -63,8 +64,8 @@ class DiscTable:
     def of(cls, model: SensorModel) -> Self | None:
         """Tabulate a model, or return None for one that a table does not hold.
 
-        A table holds a known mixture, or the naive sensor, without effects, over a single circle; it must see
-        no farther than 80 mm.
+        A table holds a known mixture, or the naive sensor, over a single circle, with no effects but those of
+        `is_alike_everywhere`; it must see no farther than 80 mm.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
@@ -78,7 +79,7 @@ class DiscTable:
         if isinstance(model, NaiveSensor):
             dark, bright = _levels(model, high)
             return cls(dark, bright, 0.0, bends, frozen(np.empty((0, 0, 0))))
-        if model.effects or not isinstance(model.ssf, FixedMixture):
+        if not isinstance(model.ssf, FixedMixture) or not all(map(is_alike_everywhere, model.effects)):
             return None
         dark, bright = _levels(model, high)
         directions = _direction(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
@@ -216,6 +217,11 @@ class DiscTable:
     @property
     def _per_bend(self) -> float:
         return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
+
+
+def is_alike_everywhere(effect: AnyEffect) -> bool:
+    """Tell whether an effect is known and changes the footprint alike at every place and time: a table can hold it."""
+    return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
 
 def _spans(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> Spans:

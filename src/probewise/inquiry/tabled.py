@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.carded import CardedForecast, cards_of
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.discs import DiscTable
+from probewise.inquiry.discs import DiscTable, is_alike_everywhere
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
     AskedForecast,
@@ -24,6 +24,7 @@ from probewise.inquiry.forecast import (
 )
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.silhouettes import Silhouettes
+from probewise.inquiry.tabled_effects import TabledChain
 from probewise.recordings.plan import Instrumentation, Plan
 from probewise.scene import HypothesisScene, Shape, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -217,7 +218,15 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
     table = DiscTable.of(model) if highest is None else None
     if table is not None:
         return DiscForecast(table if table.margin_mm else model, table)
+    if highest is None and isinstance(model, Chain) and model.effects:
+        return AskedForecast(_tabled(model) or model)
     return SilhouetteForecast.of(model, highest=highest or 1.0) or AskedForecast(model)
+
+
+def _tabled(model: Chain) -> TabledChain | None:
+    """Look up what a chain with effects sees in a table of the same chain without those that no table holds."""
+    table = DiscTable.of(replace(model, effects=tuple(filter(is_alike_everywhere, model.effects))))
+    return None if table is None else TabledChain.of(model, table)
 
 
 def _over_cards(model: SensorModel, highest: float | None) -> Forecast:

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.inquiry.carded import CardedModel
-from probewise.inquiry.discs import DiscTable
+from probewise.inquiry.discs import DiscTable, is_alike_everywhere
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import laid_over
 from probewise.sensor import Chain
@@ -20,7 +20,7 @@ __all__ = ["TabledChain"]
 
 @dataclass(frozen=True, eq=False)
 class TabledChain:
-    """A chain over one disc whose effects change neither the disc nor the footprint."""
+    """A chain over one disc whose effects change neither the disc nor, but for what the table holds, the footprint."""
 
     chain: Chain
     table: DiscTable
@@ -28,12 +28,15 @@ class TabledChain:
 
     @classmethod
     def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
-        """Look up what `chain` sees in the table that `plain`, the same chain without effects, is; None where not."""
+        """Look up what `chain` sees in the table of `plain`, the same chain with fewer effects; None where not."""
+        if isinstance(plain, TabledChain):
+            plain = plain.table if plain.cards is None else plain.cards
         cards = plain if isinstance(plain, CardedModel) else None
         table = plain if cards is None else cards.plain
         if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
             return None
-        if any(effect.stage in (Stage.SCENE, Stage.FOOTPRINT) for effect in chain.effects):
+        seen = (effect for effect in chain.effects if effect.stage in (Stage.SCENE, Stage.FOOTPRINT))
+        if not all(map(is_alike_everywhere, seen)):
             return None
         return cls(chain, table, cards)
 

@@ -172,7 +172,7 @@ def test_a_heavy_tail_is_exact_at_both_ends():
 
 
 def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
-    """Sds from one typical size: below half of it lies an eighth, where the wide mixture has a third."""
+    """Sds from one typical size: an eighth lies below half of that, where the wide mixture has nearly a half."""
     wide, shown = HeavyTailed(0.5, positive=True), HeavyTailed(0.5, positive=True, smallest=1.0)
     u = np.linspace(0.01, 0.99, 25)
     np.testing.assert_allclose(shown.to_unit(shown.from_unit(u)), u, atol=1e-9)

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from probewise.arm import Pose, Reading
 from probewise.calibration import FittedSensor, mean_field
 from probewise.errors import ParameterError
 from probewise.experiment import CLEAN, Exploration, begin, left_out_of, repaired, result_json, step
 from probewise.experiment.asking import Field
+from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
+from probewise.experiment.posterior import prior_posterior, updated
 from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
@@ -254,3 +257,22 @@ def test_readings_lost_to_exactly_black_are_no_chance():
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (exact, noisy)]
     assert gained[0] > 5.0
     assert gained[1] < 0.5
+
+
+def test_a_step_of_the_light_is_not_lost_when_it_begins():
+    """Five readings of dark, then three that are brighter far apart: of few samples hardly any knew of the step."""
+    experiment = replace(experiment_of(REFERENCE), trust=0.9)
+    kinds = [kind for kind in experiment.kinds if kind.left_out in ("", "ambient_step")]
+    places = [(200.0, 150.0), (500.0, 250.0), (800.0, 350.0), (350.0, 400.0), (650.0, 120.0)]
+    places += [(420.0, 260.0), (850.0, 150.0), (180.0, 330.0)]
+    noise = np.random.default_rng(5).standard_normal(len(places))
+    read = [
+        Reading(10.0 + 8.0 * (k > 4) + float(e), Pose(*at), 8.0 * k)
+        for k, (at, e) in enumerate(zip(places, noise, strict=True))
+    ]
+    rng = np.random.default_rng(2)
+    now = prior_posterior(kinds, 3000, rng=rng)
+    for k in range(1, len(read) + 1):
+        recording = experiment.problem(read[:k]).recording
+        now = updated(now, recording, 3000, rng=rng, from_scratch=lambda problem: from_scratch(problem, 100, rng))
+    assert now.left_out["ambient_step"] > 0.5

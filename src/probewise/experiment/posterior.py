@@ -33,6 +33,7 @@ FromScratch = Callable[[SensorProblem], NestedResult]
 _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times
 _SUSPECTED = ((0.2, 1), (0.02, 2), (0.0, 6))  # probability from which on a rival has which fraction of the samples
+_SURPRISING = 5.0  # nats that a reading costs the leading kind, from which on every kind is heard by many samples
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
@@ -150,14 +151,7 @@ def updated(
         (only,), (problem,) = previous.particles, problems
         found = update(only, problem, rng=rng, fall_back=lambda: from_scratch(problem))
         return replace(previous, particles=(found,))
-    few = [
-        bool(kind.left_out) and p < _SUSPECTED[1][0]
-        for kind, p in zip(previous.kinds, previous.probability, strict=True)
-    ]
-    particles = [
-        update(p, problem, rng=rng, effort=BRIEF if improbable else THOROUGH)
-        for p, problem, improbable in zip(previous.particles, problems, few, strict=True)
-    ]
+    particles = _taken_in(previous, problems, n_particles, rng)
     now = replace(previous, particles=tuple(particles))
     if any(kind.left_out for kind in now.kinds):
         particles = [
@@ -177,6 +171,43 @@ def updated(
         if n > had or p < _IMPROBABLE:
             particles[k] = resized(particles[k], n, problems[k], rng=rng)
     return replace(now, particles=tuple(particles))
+
+
+def _taken_in(
+    previous: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator
+) -> list[Particles]:
+    """Take the last reading into every kind; where it surprises the leading one, into many samples of every kind.
+
+    What has just begun to act is likely for few of a rival's samples: of few hundred there may be none.
+    """
+    particles, probability = list(previous.particles), previous.probability
+    first, surprising = [], False
+    if any(kind.left_out for kind in previous.kinds):
+        k = previous.leader
+        led = update(particles[k], problems[k], rng=rng)
+        surprising = len(problems[k].recording) > 1 and _surprise(led, particles[k], problems[k]) > _SURPRISING
+        particles[k], first = led, [k]
+    for k, (kind, problem) in enumerate(zip(previous.kinds, problems, strict=True)):
+        if k in first:
+            continue
+        effort = THOROUGH
+        if kind.left_out and probability[k] < _SUSPECTED[1][0]:
+            if surprising:
+                earlier = kind.problem(problem.recording.take(slice(0, -1)))
+                particles[k] = resized(particles[k], n_particles // 2, earlier, rng=rng)
+            else:
+                effort = BRIEF
+        particles[k] = update(particles[k], problem, rng=rng, effort=effort)
+    return particles
+
+
+def _surprise(now: Particles, before: Particles, problem: SensorProblem) -> float:
+    """How much less likely the last reading was, given those before, than one that is expected exactly, nats."""
+    recording = problem.recording
+    if not recording.usable[-1] or now.log_z == -math.inf:
+        return 0.0
+    reading = recording.readings[-1:]
+    return float(problem.likelihood.log_prob(reading, reading[None])[0]) - (now.log_z - before.log_z)
 
 
 def _size(kind: Kind, probability: float, n_particles: int) -> int:

@@ -259,20 +259,25 @@ def test_readings_lost_to_exactly_black_are_no_chance():
     assert gained[1] < 0.5
 
 
-def test_a_step_of_the_light_is_not_lost_when_it_begins():
-    """Five readings of dark, then three that are brighter far apart: of few samples hardly any knew of the step."""
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
+    """Six readings of dark, then all 8 units brighter: a wide footprint explains them too, but no better."""
     experiment = replace(experiment_of(REFERENCE), trust=0.9)
-    kinds = [kind for kind in experiment.kinds if kind.left_out in ("", "ambient_step")]
-    places = [(200.0, 150.0), (500.0, 250.0), (800.0, 350.0), (350.0, 400.0), (650.0, 120.0)]
-    places += [(420.0, 260.0), (850.0, 150.0), (180.0, 330.0)]
-    noise = np.random.default_rng(5).standard_normal(len(places))
-    read = [
-        Reading(10.0 + 8.0 * (k > 4) + float(e), Pose(*at), 8.0 * k)
-        for k, (at, e) in enumerate(zip(places, noise, strict=True))
+    kinds = [kind for kind in experiment.kinds if kind.left_out in ("", "ambient_step", "edge_blur")]
+    taken = [(766, 284, 9.4), (419, 284, 9.5), (210, 268, 9.6), (605, 227, 7.7), (838, 171, 10.6), (419, 154, 8.6)]
+    taken += [
+        (597, 366, 18.2),
+        (597, 374, 16.8),
+        (588, 341, 16.3),
+        (572, 414, 19.1),
+        (556, 349, 16.6),
+        (500, 431, 17.7),
     ]
-    rng = np.random.default_rng(2)
+    read = [Reading(value, Pose(x, y), 8.0 * k) for k, (x, y, value) in enumerate(taken)]
+    rng = np.random.default_rng(seed)
     now = prior_posterior(kinds, 3000, rng=rng)
     for k in range(1, len(read) + 1):
         recording = experiment.problem(read[:k]).recording
         now = updated(now, recording, 3000, rng=rng, from_scratch=lambda problem: from_scratch(problem, 100, rng))
-    assert now.left_out["ambient_step"] > 0.5
+    assert now.left_out["ambient_step"] > 0.97

@@ -172,3 +172,35 @@ def test_a_switch_is_proposed_for_each_column_that_takes_many_values():
     shifted = switch.apply(np.zeros((1, N_ROWS)), np.array([[0.3, 20.5]]), TABLE)
     np.testing.assert_array_equal(shifted[0], np.where(TABLE.columns["room_c"] > 20.5, 0.3, 0.0))
     assert all(low < high for low, high in zip(switch.moments.at[:-1], switch.moments.at[1:], strict=True))
+
+
+def test_a_state_stops_at_a_floor_as_well_as_at_a_ceiling():
+    """Closed form: x' = -1 from x = 9 falls on a straight line to where it is held."""
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"rate": (0.0, 2.0)},
+        law=Law({"x": 9.0}, lambda s, p, u: {"x": -p["rate"] + 0 * s["x"]}, max_step_s=0.02),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    about = _about(simulator)
+    form = forms_of(about)["limit:x"]
+    falling = about.predicted
+    level = falling.min() + 0.2 * np.ptp(falling)
+    floored = _read("limit:x", level, about=about, forms={"limit:x": form})
+    np.testing.assert_allclose(floored, np.maximum(falling, level), atol=1e-6)
+    np.testing.assert_allclose(
+        _read("limit:x", form.nothing[0], about=about, forms={"limit:x": form}), falling, atol=1e-9
+    )
+    assert "falls no further" in form.sentence(np.array([level]), np.array([0.01]))
+    assert form.prior.log_prob(form.bank()[:, 0, :]).min() > -np.inf
+
+
+def test_an_input_is_cut_off_below_as_well_as_above():
+    """On u = drive and y = offset + gain u: what is cut off is the drive."""
+    drive, form = TABLE.columns["drive"], FORMS["input_saturation:drive"]
+    offset, gain = ABOUT.theta[0]
+    for level, cut in ((0.7, np.minimum), (-0.6, np.maximum)):
+        np.testing.assert_allclose(_read(form.name, level), offset + gain * cut(drive, level))
+    np.testing.assert_allclose(_read(form.name, form.nothing[0]), ABOUT.predicted)
+    said = [form.sentence(np.array([level]), np.array([0.01])) for level in (0.7, -0.6)]
+    assert "rises no further" in said[0]
+    assert "falls no further" in said[1]

@@ -12,6 +12,7 @@ from probewise.effects import HeavyTailed
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
+from probewise.systems.forms.ends import ends_of
 from probewise.systems.forms.form import Act, Form, Say, with_unit
 from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.forms.readings import earlier
@@ -57,7 +58,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
         yield from _linear(about, f"input_offset:{name}", _on(name, _raised), 1e-4 * spread, name, says, name)
         says = partial(_said, f"{name} is {{}} more than it says, for each unit of it")
         yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
-        yield from _ceiling(about, name, low, high)
+        yield from _cut_off(about, name, low, high)
         says = partial(_said, f"{name} does nothing within {{}} of 0")
         if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # farther off it is an offset
             yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
@@ -126,22 +127,30 @@ def _sized(
         yield Form(name, Stage.INPUT, {parameter: prior}, (unit,), covariates, act, entries, (), says, absent={0: 0.0})
 
 
-def _ceiling(about: About, name: str, low: float, high: float) -> Iterator[Form]:
-    act = _on(name, lambda c, theta, _: np.minimum(c, theta[:, :1]))
-    levels = high - (high - low) * np.geomspace(0.003, 0.9, 16)
-    rms = about.rms(Stage.INPUT, act, levels[:, None])
-    if np.nanmax(rms, initial=0.0) > 0.05:
+def _cut_off(about: About, name: str, low: float, high: float) -> Iterator[Form]:
+    ends = ends_of(low, high)
+    if ends is None:
+        return
+
+    def change(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        level = theta[:, :1]
+        return np.asarray(np.where(level > ends.middle, np.minimum(c, level), np.maximum(c, level)))
+
+    act = _on(name, change)
+    if np.nanmax(about.rms(Stage.INPUT, act, ends.levels[:, None]), initial=0.0) > 0.05:
         yield Form(
             f"input_saturation:{name}",
             Stage.INPUT,
-            {"level": Uniform(float(levels[-1]), high)},
+            {"level": ends.prior},
             (name,),
             (name,),
             act,
-            levels[:, None, None],
+            ends.levels[:, None, None],
             (),
-            lambda m, s: f"{name} goes no further than {with_unit(m[0], s[0], '')}",
-            absent={0: high},
+            lambda m, s: (
+                f"{name} {'rises' if m[0] > ends.middle else 'falls'} no further than {with_unit(m[0], s[0], '')}"
+            ),
+            absent={0: ends.nowhere},
         )
 
 

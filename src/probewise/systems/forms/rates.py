@@ -12,6 +12,7 @@ from probewise.effects import HeavyTailed
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
+from probewise.systems.forms.ends import ends_of
 from probewise.systems.forms.form import Form, with_unit
 from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.motion import Limit, Motion
@@ -150,26 +151,31 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
 
 
 def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
-    def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
-        return value.with_limit(Limit(state, theta[:, :1]))
-
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    if not low < high:
+    ends = ends_of(float(np.nanmin(values)), float(np.nanmax(values)))
+    if ends is None:
         return
-    levels = high - (high - low) * np.geomspace(0.003, 0.9, 12)
-    rms = about.rms(Stage.RATE, act, levels[:, None])
-    if np.nanmax(rms, initial=0.0) > 0.05:
+
+    def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
+        level = theta[:, :1]
+        above = level > ends.middle
+        ceiling = Limit(state, np.where(above, level, np.inf))
+        return value.with_limit(ceiling).with_limit(Limit(state, np.where(above, -np.inf, level), upper=False))
+
+    if np.nanmax(about.rms(Stage.RATE, act, ends.levels[:, None]), initial=0.0) > 0.05:
         yield Form(
             f"limit:{state}",
             Stage.RATE,
-            {"level": Uniform(float(levels[-1]), high)},
+            {"level": ends.prior},
             (state,),
             (f"state:{state}", "level"),
             act,
-            levels[:, None, None],
+            ends.levels[:, None, None],
             (),
-            lambda mean, sd: f"{state} stops at {with_unit(mean[0], sd[0], '')}",
-            absent={0: high + (high - low)},
+            lambda mean, sd: (
+                f"{state} {'rises' if mean[0] > ends.middle else 'falls'} no further than "
+                f"{with_unit(mean[0], sd[0], '')}"
+            ),
+            absent={0: ends.nowhere},
         )
 
 

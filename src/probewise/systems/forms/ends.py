@@ -1,0 +1,51 @@
+"""Where something that is cut off may end: a ceiling in the upper part of its range, a floor in the lower."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.priors import Uniform
+
+__all__ = ["Ends", "ends_of"]
+
+_LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
+_LEAST = 0.003  # of a range, that is cut off at least by what is looked for
+_N_LEVELS = 10  # of either
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Levels between `low` and `high`: what lies above `middle` is a ceiling, what does not, a floor."""
+
+    low: float
+    high: float
+
+    @property
+    def middle(self) -> float:
+        """Where ceilings begin."""
+        return self.low + _LOWER_PART * (self.high - self.low)
+
+    @property
+    def levels(self) -> FloatArray:
+        """Settings to look with, (n_levels,): dense at both ends."""
+        range_ = self.high - self.low
+        ceilings = self.high - range_ * np.geomspace(_LEAST, 0.97 * (1 - _LOWER_PART), _N_LEVELS)
+        return np.append(ceilings, self.low + range_ * np.geomspace(_LEAST, 0.97 * _LOWER_PART, _N_LEVELS))
+
+    @property
+    def prior(self) -> Uniform:
+        """Prior of the level."""
+        return Uniform(self.low, self.high)
+
+    @property
+    def nowhere(self) -> float:
+        """A level that nothing reaches."""
+        return self.high + (self.high - self.low)
+
+
+def ends_of(low: float, high: float) -> Ends | None:
+    """Take a range; None where there is none."""
+    return Ends(low, high) if low < high else None

@@ -151,7 +151,8 @@ def _formula(formula: Formula) -> str:
     """Write a formula with its numbers."""
     numbers = ", ".join(f"{p.name} = {give_or_take(p.mean, p.sd)}" for p in formula.parameters)
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
-    gained = f"log evidence {formula.log_evidence:+.1f} nats"
+    held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"
+    gained = f"log evidence {formula.log_evidence:+.1f} nats, {held_out}"
     return readable(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
 
 

@@ -36,13 +36,17 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Formula:
-    """A short expression proposed for what has no name: on which side, of what, and what it gains."""
+    """A short expression proposed for what has no name: on which side, of what, and what it gains.
+
+    In log evidence, nats, and `heldout_log_density_per_reading`, nats per held-out reading; both over the null.
+    """
 
     expression: str
     side: str
     target: str
     parameters: tuple[ParameterFound, ...]
     log_evidence: float
+    heldout_log_density_per_reading: float
 
 
 def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.random.Generator) -> Remainder | None:
@@ -75,5 +79,8 @@ def formula_of(searched: Searched, judged: Judged, best: Best, samples: ModelSam
         if expression and is_out_of_vocabulary(effect.name):
             _, side, target, _ = effect.name.split(":", 3)
             parameters = parameters_of(effect, samples.columns(effect.name), unit)
-            return Formula(expression, side, target, parameters, best.improvement.log_evidence)
+            gain = best.improvement
+            return Formula(
+                expression, side, target, parameters, gain.log_evidence, gain.heldout_log_density_per_reading
+            )
     return None

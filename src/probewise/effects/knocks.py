@@ -75,7 +75,7 @@ class GainStep(ChangePointEffect[FloatArray]):
 
     typical: float = 0.02
 
-    name: ClassVar[str] = "gain_step"
+    name: ClassVar[str] = "gain_jump"
     stage: ClassVar[Stage] = Stage.GAIN
     units: ClassVar[tuple[str, ...]] = ("1", "s")
     covariates: ClassVar[tuple[str, ...]] = ("time", "level")

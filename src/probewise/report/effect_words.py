@@ -45,7 +45,7 @@ EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
         "dropouts": "lost readings",
         "drifting_noise": "noise that changes in time",
         "arm_knock": "an arm or sheet that was pushed",
-        "gain_step": "a sudden change of the signal's strength",
+        "gain_jump": "a sudden change of the signal's strength",
         "bent_rails": "bent rails",
         "missing_tooth": "a jump of the arm's position",
         "stick_slip": "a slide that sticks and jumps",
@@ -60,6 +60,7 @@ EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
     {
         "offset_step": "a jump of all readings",
+        "gain_step": "a jump of the readings' gain",
         "offset_per_run": "an offset of its own in each run",
         "gain_per_run": "a gain of its own in each run",
         "delay": "readings that come late",

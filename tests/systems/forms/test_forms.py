@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from probewise.effects import is_out_of_vocabulary
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.proposals import proposals
@@ -204,3 +205,9 @@ def test_an_input_is_cut_off_below_as_well_as_above():
     said = [form.sentence(np.array([level]), np.array([0.01])) for level in (0.7, -0.6)]
     assert "rises no further" in said[0]
     assert "falls no further" in said[1]
+
+
+def test_no_form_has_the_name_of_an_effect_out_of_vocabulary():
+    """Such a name would count as unknown however sure it is: `gain_step` did, as a light sensor's jump of the gain."""
+    assert "gain_step" in FORMS
+    assert not any(is_out_of_vocabulary(name) for name in FORMS)

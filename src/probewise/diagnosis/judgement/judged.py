@@ -117,6 +117,10 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
             hypotheses, test.p_value, noise_names=prepared.on_noise, aliases=pairs, aliased_with=aliased_with
         )
     )
+    if verdict == "unknown" and searched.evidences.one_name_explains_more():
+        # It leads by what was believed before alone.
+        named = [h.effects for h in hypotheses if h.effects not in ((), ("unknown",))]
+        verdict, combination = "cannot_tell", named[0] if named else ()
     return Judged(
         verdict,
         combination,

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, TypeVar, cast
@@ -59,6 +60,8 @@ _ALLOWED = "a sensor.json as `probewise calibrate` writes"
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
 _FOR_A_FREE_FORM = 4  # Gaussians that approximate a free-form SSF where a mixture is required
 # Effects that may be restricted to some patterns.
+# The light sensor's own `gain_step`, until 0.1, before any simulator had an effect of that name.
+_GAIN_STEP = re.compile(r'"gain_step(?="|\.frac"|\.at_s")')
 _BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
 
 
@@ -337,7 +340,7 @@ class FittedSensor(ShowsItself):
         FileError
             If the text is damaged, incomplete, or of another format or version.
         """
-        document = json_of(path, text, _ALLOWED)
+        document = json_of(path, _GAIN_STEP.sub('"gain_jump', text), _ALLOWED)
         found = document.get("format") if isinstance(document, dict) else None
         if found != FORMAT:
             raise FileError(

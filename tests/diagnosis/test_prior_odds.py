@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
+from typing import Any, cast
 
 import pytest
 
 from probewise.diagnosis import PriorOdds
+from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import Stage
@@ -31,3 +33,11 @@ def test_half_of_the_unknown_has_a_name_of_our_own():
     assert sum(math.exp(odds.log_mean((name,))) for name in UNNAMED) == pytest.approx(math.exp(odds.log_unknown(())))
     beside = odds.log_mean(("arm_knock", "backlash")) - odds.log_mean(("backlash",))
     assert math.exp(beside) * len(UNNAMED) == pytest.approx(odds.unknown_beside * odds.out_of_vocabulary)
+
+
+def test_two_effects_of_a_simulator_are_no_less_likely_than_one_beside_a_fault_of_the_noise():
+    """And all that may be missing from the mean sums to one."""
+    odds = PersonsSystem.prior_odds(cast(Any, None), {})
+    assert odds.clean_mean + odds.unknown + sum(odds.by_size) == pytest.approx(1.0)
+    one_and_noise = odds.by_size[0] * odds.noise_by_size[0]
+    assert odds.by_size[1] * odds.white >= one_and_noise

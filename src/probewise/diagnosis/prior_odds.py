@@ -39,6 +39,7 @@ class PriorOdds:
     noise_by_size: tuple[float, ...] = (0.057, 0.0028, 0.0002)
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
+    unknown_explains_most: bool = False
 
     @classmethod
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:

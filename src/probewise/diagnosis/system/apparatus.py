@@ -113,7 +113,7 @@ class PersonsSystem:
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Share the odds out over these effects."""
-        return replace(PriorOdds.over(effects), by_size=_BY_SIZE)
+        return replace(PriorOdds.over(effects), by_size=_BY_SIZE, unknown_explains_most=True)
 
     def null_forms(self, recording: Recording) -> Any:
         """There is one: the simulator."""

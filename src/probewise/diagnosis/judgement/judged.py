@@ -118,8 +118,8 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         )
     )
     if verdict == "unknown" and searched.prior.unknown_explains_most and searched.evidences.one_name_explains_more():
-        # It leads by what was believed before alone. For a light sensor that stays the verdict: of 431 in 5,988 concealed
-        # recordings at most seven would be withdrawn, and all of these were right.
+        # It leads by what was believed before alone. For a light sensor it stays the verdict: of 431 in 5,988 concealed
+        # recordings at most seven would be withdrawn, all of them right.
         named = [h.effects for h in hypotheses if h.effects not in ((), ("unknown",))]
         verdict, combination = "cannot_tell", named[0] if named else ()
     return Judged(

@@ -65,22 +65,23 @@ class Evidences:
         return named if named and log_z[named] - log_z[()] > log_z[mean] - log_z[named] else ("unknown",)
 
     def one_name_explains_more(self) -> bool:
-        """Tell whether one effect, on the mean or on the noise, explains more than anything without a name does.
+        """Tell whether one effect, on the mean or on the noise, explains more than what has no name does by itself.
 
         Several names together were chosen from too many combinations for their evidence alone to say so.
         """
-        plain = min((len(noise) for fit in self.fits.values() for noise in fit.evidence), default=0)
-        named = [
-            evidence.log_z
-            for (_, names), fit in self.fits.items()
-            for noise, evidence in fit.evidence.items()
-            if len(names) + len(noise) - plain == 1 and in_vocabulary(noise) == noise and not out_of_vocabulary(names)
-        ]
-        without = [
-            *self.unknown.values(),
-            *(fit.log_z for (_, mean), fit in self.fits.items() if out_of_vocabulary(mean)),
-        ]
-        return max(named, default=-math.inf) > max(without, default=math.inf)
+        plain = self._plain
+        nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]
+        alone: dict[bool, list[float]] = {True: [], False: nameless}
+        for (_, names), fit in self.fits.items():
+            for noise, evidence in fit.evidence.items():
+                if len(names) + len(noise) - len(plain) == 1 and in_vocabulary(noise) == noise:
+                    alone[not out_of_vocabulary(names)].append(evidence.log_z)
+        return max(alone[True], default=-math.inf) > max(alone[False], default=math.inf)
+
+    @property
+    def _plain(self) -> Names:
+        """The plainest noise: that which the readings show without doubt."""
+        return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
     def _log_z(self, names: Names) -> float:
         """Give the most evidence of a refitted combination; minus infinity where it was not refitted."""

@@ -24,12 +24,15 @@ __all__ = ["Climb", "Rung", "climb"]
 
 # Effective share of the particles that a change of temperature leaves.
 _KEPT = 0.5
-_N_STEPS = 20
+_N_STEPS = 5
 _BISECTIONS = 40
+_BRIDGE_STEPS = 30
+# Draws of the reference for each particle that is kept: one costs as much as a move.
+_DRAWS = 6
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 12
-# A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', a fresh last one, a split.
-_BLOCK_FROM, _FRESH_FROM, _SPLIT_FROM = 0.4, 0.8, 0.9
+# A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
+_BLOCK_FROM, _FRESH_FROM = 0.35, 0.7
 _WHOLE_JUMP = 0.1
 _JITTER = 1e-5
 # Doubt the clouds where they agree less than this.
@@ -146,6 +149,10 @@ class _Cloud:
         out.log_likelihood[rows], out.log_reference[rows] = other.log_likelihood, other.log_reference
         return out
 
+    @property
+    def rise(self) -> FloatArray:
+        return self.log_likelihood - self.log_reference
+
     def tempered(self, beta: float) -> FloatArray:
         return np.asarray(self.log_prior + beta * self.log_likelihood + (1.0 - beta) * self.log_reference)
 
@@ -204,23 +211,28 @@ def climb(
     n = len(rest) // n_clouds
     log_z = np.array(log_z_below)
     with np.errstate(invalid="ignore"):
-        now = known(space.enter(reference.draw(rest, rng=rng)))
+        now = known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
     temperatures, accepted = [0.0], 0.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
-        rise = now.log_likelihood - now.log_reference
+        rise = now.rise
         beta = _next(rise, temperatures[-1])
-        log_weight = ((beta - temperatures[-1]) * rise).reshape(n_clouds, n)
-        log_z += logsumexp(log_weight, axis=1) - math.log(n)
-        if not np.isfinite(log_z).all():
+        width = beta - temperatures[-1]
+        log_weight = (width * rise).reshape(n_clouds, -1)
+        if not np.isfinite(log_weight.max(axis=1)).all():
+            log_z[:] = -np.inf
             break
-        weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
-        now = now.take(np.concatenate([k * n + resampled(own, n, rng) for k, own in enumerate(weight)]))
+        here = log_weight.shape[1]
+        # Cut off (truncated importance sampling, Ionides 2008): a single particle must not take over its cloud.
+        mean = logsumexp(log_weight, axis=1, keepdims=True) - math.log(here)
+        weight = np.exp(np.minimum(log_weight - mean, 0.5 * math.log(here)))
+        now = now.take(np.concatenate([k * here + resampled(own, n, rng) for k, own in enumerate(weight)]))
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
             now, share = _moved(now, known, reference, beta, rng)
             shares.append(share)
         accepted = float(np.mean(shares))
+        log_z += _log_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
         if told is not None:
             told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
     theta, _ = space.leave(now.x)
@@ -235,6 +247,21 @@ def climb(
         accepted=accepted,
         n_calls=n_calls,
     )
+
+
+def _log_ratio(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Bridge two temperatures in each cloud (Bennett 1976): log of the ratio of their evidences, (n_clouds,).
+
+    `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each.
+    """
+    log_before, log_after = math.log(before.shape[1]), math.log(after.shape[1])
+    log_ratio = logsumexp(before, axis=1) - log_before
+    for _ in range(_BRIDGE_STEPS):
+        level = log_ratio[:, None] + (log_before - log_after)
+        forward = logsumexp(before - np.logaddexp(before, level), axis=1) - log_before
+        backward = logsumexp(-np.logaddexp(after, level), axis=1) - log_after
+        log_ratio = forward - backward
+    return np.asarray(log_ratio)
 
 
 def _next(rise: FloatArray, beta: float) -> float:
@@ -279,22 +306,33 @@ def _moved(
         x = old.x + np.where(by_block[:, None] & ~in_block, 0.0, step)
         fresh = np.flatnonzero(kind > _FRESH_FROM)
         here, _ = space.leave(old.x[fresh])
-        split = kind[fresh] > _SPLIT_FROM
-        there = np.where(
-            split[:, None],
-            reference.split(reference.merged(here), rng=rng),
-            reference.with_last(reference.without_last(here), rng=rng),
-        )
+        there, log_drawn = _redrawn(here, reference, rng)
         with np.errstate(invalid="ignore"):
             x[fresh] = space.enter(there)
             new = known(x)
             log_accept = new.tempered(beta) - old.tempered(beta)
             # A fresh Gaussian comes from the reference's density: only the rest of the target counts.
-            drawn_here = np.where(split, reference.log_split(here), reference.log_added(here))
-            drawn_there = np.where(split, reference.log_split(there), reference.log_added(there))
-            log_accept[fresh] += drawn_here - drawn_there + old.log_prior[fresh] - new.log_prior[fresh]
-            log_accept[fresh[~np.isfinite(drawn_there)]] = -np.inf
+            log_accept[fresh] += log_drawn + old.log_prior[fresh] - new.log_prior[fresh]
             better = np.log(rng.random(m)) < log_accept
         n_accepted += int(better.sum())
         now = now.put(own[better], new.take(np.flatnonzero(better)))
     return now, n_accepted / n
+
+
+def _redrawn(here: FloatArray, reference: Reference, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Take away a Gaussian and draw another one, each by one way of the reference.
+
+    Returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new, both over the
+    prior's, (n,); -inf where the move is impossible.
+    """
+    there, log_drawn = np.full(here.shape, np.nan), np.full(len(here), -np.inf)
+    which = rng.choice(len(reference.ways), size=len(here), p=[way.share for way in reference.ways])
+    for k, way in enumerate(reference.ways):
+        rows = np.flatnonzero(which == k)
+        rest, log_here = way.back(here[rows])
+        rows, rest, log_here = (part[np.isfinite(log_here)] for part in (rows, rest, log_here))
+        there[rows] = way.draw(rest, rng=rng)
+        rows, log_here = (part[np.isfinite(there[rows]).all(axis=1)] for part in (rows, log_here))
+        log_there = way.back(there[rows])[1]
+        log_drawn[rows] = np.where(np.isfinite(log_there), log_here - log_there, -np.inf)
+    return there, log_drawn

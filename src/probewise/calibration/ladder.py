@@ -1,22 +1,22 @@
 """Fit one order after another: search the prior of one Gaussian, and climb from each order to the next.
 
 The steps take a tenth of the evaluations of nested sampling of every order. What they cannot see is a peak that is
-far from every posterior of the order below. So one short nested search of the highest order's whole prior stands
-beside them: where its evidence, or its best likelihood, lies above what the climb found, no climb is believed.
+far from every posterior of the order below. So one short nested search of a whole prior stands beside them, that of the
+order after the one with the greatest evidence: where its evidence, or its best likelihood, lies above what the climb
+found, no climb is believed.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from probewise._arrays import FloatArray
 from probewise.calibration.climb import Climb, Rung, climb
+from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, search_order
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
@@ -26,8 +26,7 @@ from probewise.nested.sampler import search
 __all__ = ["climb_orders", "next_order"]
 
 _N_CLOUDS = 8
-# The step from one Gaussian to two scatters most: a second one near the first is found by few particles.
-_N_FIRST, _N_LATER = 2000, 1000
+_N_PARTICLES = 1000
 # Live points of the searches that no evidence is read from.
 _FEW_LIVE = 100
 _VOUCHING_LIVE = 60
@@ -43,7 +42,6 @@ def climb_orders(
     n_live: int,
     rng: np.random.Generator,
     progress: Progress | None = None,
-    executor: Executor | None = None,
 ) -> tuple[dict[int, Found], tuple[str, ...]]:
     """Climb as far as the greatest of the orders.
 
@@ -56,16 +54,15 @@ def climb_orders(
     if unlike:
         return {}, (unlike,)
     climbing, vouching = rng.spawn(2)
-    vouch = partial(_vouch, posing, highest, vouching)
-    vouched = executor.submit(vouch) if executor is not None and highest > 1 else None
     found = {1: search_order(posing, 1, climbing, n_live=min(n_live, _FEW_LIVE), progress=progress)}
     if found[1].evidence is found[1].result:
         found[1] = search_order(posing, 1, climbing, n_live=n_live, progress=progress)
     for n in range(2, highest + 1):
         found[n] = next_order(posing, n, found[n - 1], climbing, n_live=n_live, progress=progress)
     if highest > 1:
-        seen = vouch(progress) if vouched is None else vouched.result()
-        missed = _missed(found[highest], seen, highest)
+        best = max(found, key=lambda n: found[n].evidence.log_z)
+        vouched = min(best + 1, highest)
+        missed = _missed(found[vouched], _vouch(posing, vouched, vouching, progress), vouched)
         if missed:
             return {1: found[1]}, (missed,)
     return {n: found[n] for n in orders}, ()
@@ -85,15 +82,16 @@ def next_order(
     posing: Posing, n: int, below: Found, rng: np.random.Generator, *, n_live: int, progress: Progress | None
 ) -> Found:
     """Climb to an order; search it in full where the climb is doubtful."""
-    prior, problem = posing.belief(n), posing.problem(n)
-    reference = Reference(prior, posing.problem(n - 1))
+    prior, problem, problem_below = posing.belief(n), posing.problem(n), posing.problem(n - 1)
+    coordinates = posing.belief(n - 1).coordinates
     start = below.evidence
     if isinstance(start, Climb):
-        rest, log_z, error = _thinned(start.theta, rng), start.log_z_of_clouds, start.start_error
+        rest, log_z, error = start.theta, start.log_z_of_clouds, start.start_error
     else:
-        coordinates = posing.belief(n - 1).coordinates
-        rest, _ = coordinates.leave(coordinates.enter(start.samples(_N_FIRST if n == 2 else _N_LATER, rng=rng)))
+        rest, _ = coordinates.leave(coordinates.enter(start.samples(_N_PARTICLES, rng=rng)))
         log_z, error = np.full(_N_CLOUDS, start.log_z), start.log_z_error
+    compensation = Compensation.of(problem_below, coordinates, posing.problem(1), rest, rng=rng)
+    reference = Reference(prior, problem_below, compensation)
     told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
     made = climb(problem, reference, rest, log_z_below=log_z, error_below=error, rng=rng, told=told)
     if not made.warnings:
@@ -103,14 +101,7 @@ def next_order(
     return replace(full, notes=(*full.notes, note))
 
 
-def _thinned(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Choose as many samples of each cloud as a later climb takes, (n, n_params), cloud after cloud."""
-    clouds = theta.reshape(_N_CLOUDS, -1, theta.shape[1])
-    chosen = rng.permuted(np.tile(np.arange(clouds.shape[1]), (_N_CLOUDS, 1)), axis=1)[:, : _N_LATER // _N_CLOUDS]
-    return np.asarray(np.take_along_axis(clouds, chosen[..., None], axis=1).reshape(-1, theta.shape[1]))
-
-
-def _vouch(posing: Posing, n: int, rng: np.random.Generator, progress: Progress | None = None) -> NestedResult:
+def _vouch(posing: Posing, n: int, rng: np.random.Generator, progress: Progress | None) -> NestedResult:
     """Search an order's prior with few live points."""
     report = None if progress is None else partial(progress, n)
     problem = posing.problem(n)

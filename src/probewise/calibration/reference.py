@@ -1,24 +1,28 @@
 """A density of N Gaussians to start from: the posterior of N - 1 with one more Gaussian, lighter than they are.
 
-The new one is added to the others, or taken out of the first so that light, centre and covariance of the two stay
-(split and merge moves: Richardson & Green 1997).
+The new one is added to the others as they are; or added while the others shift to compensate for it; or taken out of
+the first so that light, centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
+from probewise.calibration.compensation import Compensation
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.priors import Uniform
 
-__all__ = ["Reference", "has_reference"]
+__all__ = ["Reference", "Way", "has_reference"]
 
 # Share of the new Gaussians that lie near one of the others, and how near: of the cube's side, in precision and
 # correlation; in place, by the other's own width.
@@ -30,8 +34,10 @@ _LEAST_WIDTH, _MOST_WIDTH = 0.005, 1.0
 _EVEN_MASS = 0.3
 _LEAST_RATIO = 1e-4
 _SHAPE = slice(1, 6)
-# Share of the draws that split the first Gaussian instead.
-_SPLIT = 0.3
+# Shares of the draws, with a compensation and without: added as is, split, compensated for.
+_WITH, _WITHOUT = (0.05, 0.15, 0.8), (0.7, 0.3, 0.0)
+# Share of the compensated ones whose light follows the first-order posterior.
+_TOLD = 0.7
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -40,20 +46,46 @@ def has_reference(prior: SSFPrior) -> bool:
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
+class _Draw(Protocol):
+    def __call__(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray: ...
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to get from N - 1 sorted Gaussians to N.
+
+    Attributes
+    ----------
+    share
+        Of the draws.
+    draw
+        One Gaussian more for each, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible.
+    back
+        What `draw` started from, and the log of the density over the prior's but for likelihood and N,
+        (n, 6 N + 2) -> (n, 6 N - 4), (n,).
+    """
+
+    share: float
+    draw: _Draw
+    back: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
+
 @dataclass(frozen=True)
 class Reference:
     """The posterior of N - 1 Gaussians with one more, lighter than each of them.
 
     Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N
-    the prior of N unsorted Gaussians, L the likelihood and Z the evidence of N - 1, the density mixes two:
+    the prior of N unsorted Gaussians, L the likelihood and Z the evidence of N - 1, the density mixes three ways:
 
     - One is added. With m the least mass of the N - 1 in the prior's unit and r the new one's density over its prior's
       below m: N! p_N L r / (N m Z). r mixes Gaussians of the prior, light ones more often, and some near one of the
       others.
+    - One is added and the others shift, by an amount that depends on the new one and the masses alone, so that volumes
+      stay; see `Compensation`.
     - The first is split. The moments of the first (mass, mass times centre, mass times second moment) lose those of
       the new one, which lies near it; at a fixed new one that is a shift, so volumes of moments stay.
 
-    Both integrate to one, so that the evidence of N over that of N - 1 is the mean of posterior density over
+    All integrate to one, so that the evidence of N over that of N - 1 is the mean of posterior density over
     reference, both without their Z, over draws from the reference.
 
     Parameters
@@ -62,28 +94,47 @@ class Reference:
         Of N Gaussians, 2 or more, with uniform mass; see `has_reference`.
     below
         Problem of N - 1 Gaussians.
+    compensation
+        How the others shift; None: nothing is compensated for.
     """
 
     prior: SSFPrior
     below: SensorProblem
+    compensation: Compensation | None = None
 
     def __post_init__(self) -> None:
         if self.prior.n_gaussians < 2 or not has_reference(self.prior):
             raise ParameterError("prior", self.prior, "of 2 Gaussians or more, mass uniform from 0 to 1 unit")
 
+    @cached_property
+    def ways(self) -> tuple[Way, ...]:
+        """The ways that are mixed."""
+        added, split, compensated = _WITHOUT if self.compensation is None else _WITH
+        plain = (
+            Way(added, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
+            Way(split, self.split, lambda theta: (self.merged(theta), self.log_split(theta))),
+        )
+        if self.compensation is None:
+            return plain
+        return (*plain, Way(compensated, self.with_compensated, self.uncompensated))
+
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
-        added = self.below.log_likelihood(self.without_last(theta)) + self.log_added(theta) + math.log(1.0 - _SPLIT)
-        log_split = self.log_split(theta)
-        possible = np.flatnonzero(log_split > -np.inf)
-        if possible.size:
-            log_split[possible] += self.below.log_likelihood(self.merged(theta[possible])) + math.log(_SPLIT)
-        return np.asarray(np.logaddexp(added, log_split) - math.log(self.prior.n_gaussians))
+        parts = np.empty((len(self.ways), len(theta)))
+        for part, way in zip(parts, self.ways, strict=True):
+            rest, part[:] = way.back(theta)
+            possible = np.flatnonzero(part > -np.inf)
+            if possible.size:
+                part[possible] += self.below.log_likelihood(rest[possible]) + math.log(way.share)
+        return np.asarray(logsumexp(parts, axis=0) - math.log(self.prior.n_gaussians))
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw one Gaussian more for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
-        split = rng.random(len(rest)) < _SPLIT
-        return np.where(split[:, None], self.split(rest, rng=rng), self.with_last(rest, rng=rng))
+        which = rng.choice(len(self.ways), size=len(rest), p=[way.share for way in self.ways])
+        out = np.empty((len(rest), rest.shape[1] + 6))
+        for k, way in enumerate(self.ways):
+            out[which == k] = way.draw(rest[which == k], rng=rng)
+        return out
 
     def without_last(self, theta: FloatArray) -> FloatArray:
         """Leave out the last Gaussian, (n, 6 N + 2) -> (n, 6 N - 4)."""
@@ -91,26 +142,77 @@ class Reference:
 
     def with_last(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Add a Gaussian drawn from r to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
-        n, others = len(rest), self.prior.n_gaussians - 1
-        u = rng.random((n, len(self.prior.names)))
+        n = len(rest)
         near = rng.random(n) < _NEAR
-        centre, width = self._places(rest)
-        chosen = np.arange(n), rng.integers(others, size=n)
-        u[:, _SHAPE] = np.where(near[:, None], _drawn_near(centre[chosen], width[chosen], rng), u[:, _SHAPE])
-        ratio = np.where(near, 1.0 - rng.random(n), _drawn_ratio(n, rng))
-        last = self.prior.from_unit_cube(u)[:, :6]
+        last = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))[:, :6]
+        last[near] = self._drawn_near_one(rest[near], rng)
+        ratio = np.where(near, 1.0 - rng.random(len(rest)), _drawn_ratio(len(rest), rng))
         last[:, 0] = ratio * self._masses(rest).min(axis=1) * self._scale(last)
-        return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
+        return _with(rest, last)
 
     def log_added(self, theta: FloatArray) -> FloatArray:
         """Log of r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
         mass = self._masses(theta)
         least = mass[:, :-1].min(axis=1)
-        centre, width = self._places(theta)
-        near = logsumexp(_log_near(centre[:, -1:], centre[:, :-1], width[:, :-1]), axis=1)
-        near -= math.log(self.prior.n_gaussians - 1)
+        near = self._log_near_one(theta[:, -8:-2], self.without_last(theta))
         anywhere = _log_ratio_density(mass[:, -1] / least)
         return np.asarray(np.logaddexp(math.log(1.0 - _NEAR) + anywhere, math.log(_NEAR) + near) - np.log(least))
+
+    def with_compensated(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Add a Gaussian to N - 1 sorted ones and shift these, (n, 6 N - 4) -> (n, 6 N + 2)."""
+        last, answer = self._compensation.draw(len(rest), rng=rng)
+        near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
+        last[near] = self._drawn_near_one(rest[near], rng)
+        answer = answer.put(near, self._compensation.linear.answer(last[near]))
+        masses = self._masses(rest)
+        whole, least = masses.sum(axis=1), masses.min(axis=1)
+        told = answer.draw_share(least / (whole + least), rng=rng)
+        by_share = rng.random(len(rest)) < _TOLD
+        ratio = np.where(by_share, told / (1.0 - told) * whole / least, _drawn_ratio(len(rest), rng))
+        last[:, 0] = ratio * least * self._scale(last)
+        share = ratio * least / (whole + ratio * least)
+        coordinates = self._compensation.coordinates
+        return _with(coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last)
+
+    def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Undo `with_compensated`; also the log density as `Way.back` has it."""
+        last, rest = theta[:, -8:-2], self.without_last(theta)
+        answer = self._compensation.linear.answer(last)
+        masses = self._masses(theta)
+        whole, least = masses[:, :-1].sum(axis=1), masses[:, :-1].min(axis=1)
+        share, ratio = masses[:, -1] / (whole + masses[:, -1]), masses[:, -1] / least
+        coordinates = self._compensation.coordinates
+        x = coordinates.enter(rest)
+        before, log_before = coordinates.leave(x - share[:, None] * answer.shift)
+        _, log_after = coordinates.leave(x)
+        log_share = answer.log_share_density(share, least / (whole + least))
+        log_share += np.log(least * whole) - 2.0 * np.log(whole + masses[:, -1])  # d share / d ratio
+        log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_ratio_density(ratio), math.log(_TOLD) + log_share)
+        near = self._log_near_one(last, np.where(np.isfinite(log_before)[:, None], before, rest))
+        log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self._compensation.log_tilt(answer), math.log(_NEAR) + near)
+        found = log_shape + log_ratio - np.log(least) + log_before - log_after
+        return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
+
+    @property
+    def _compensation(self) -> Compensation:
+        if self.compensation is None:
+            raise ParameterError("compensation", None, "a Compensation")
+        return self.compensation
+
+    def _drawn_near_one(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw Gaussians of no certain mass near one of the others, (n, 6 N - 4) -> (n, 6)."""
+        n = len(rest)
+        u = rng.random((n, len(self.prior.names)))
+        centre, width = self._places(rest)
+        chosen = np.arange(n), rng.integers(self.prior.n_gaussians - 1, size=n)
+        u[:, _SHAPE] = _drawn_near(centre[chosen], width[chosen], rng)
+        return self.prior.from_unit_cube(u)[:, :6]
+
+    def _log_near_one(self, last: FloatArray, rest: FloatArray) -> FloatArray:
+        """Log density of shapes, (n, 6), near one of the others, over the prior's, (n,)."""
+        centre, width = self._places(rest)
+        at = self._places(_with(rest[:, -2:], last))[0]
+        return np.asarray(logsumexp(_log_near(at, centre, width), axis=1) - math.log(self.prior.n_gaussians - 1))
 
     def split(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Take the last Gaussian out of the first, (n, 6 N - 4) -> (n, 6 N + 2); nan where no Gaussian is left."""
@@ -175,13 +277,13 @@ class Reference:
 
     def _masses(self, theta: FloatArray) -> FloatArray:
         """Masses in the prior's unit, (n, 6 N' + 2) -> (n, N')."""
-        g = theta[:, :-2].reshape(len(theta), -1, 6)
+        g = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
         return np.asarray(g[..., 0] / self._scale(g))
 
     def _places(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Place of each Gaussian in its five sides of the prior's cube, (n, N', 5), and the kernel's widths there."""
         prior = self.prior
-        g = theta[:, :-2].reshape(len(theta), -1, 6)
+        g = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
         a, b = g[..., 3], g[..., 4]
         correlation = g[..., 5] / np.sqrt(a * b)
         sides = [
@@ -199,6 +301,11 @@ class Reference:
         width[..., 2:4] = _NEAR_PRECISION
         width[..., 4] = _NEAR_CORRELATION
         return centre, width
+
+
+def _with(rest: FloatArray, last: FloatArray) -> FloatArray:
+    """Put a Gaussian, (n, 6), before the levels, (n, 6 N - 4) -> (n, 6 N + 2)."""
+    return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
 
 
 def _most_split(masses: FloatArray) -> FloatArray:

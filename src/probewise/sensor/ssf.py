@@ -29,6 +29,7 @@ __all__ = [
     "total_variation",
 ]
 
+_REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
 _NEGLIGIBLE = 1e-9  # share of a field's light that is not drawn
 
 
@@ -268,7 +269,6 @@ def field_of(
     w, mu, mv, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
     w = w * np.repeat(shares, arrays[0].shape[2])
     total = np.zeros((len(v_mm), len(u_mm)))
-    own = np.empty_like(total)  # reused for every Gaussian: allocating it costs more than the sums
     weight = np.abs(w)  # a free form's may be negative
     lightest_first = np.argsort(weight)
     # Of the dead points of a nested run few carry weight.
@@ -277,16 +277,23 @@ def field_of(
         # Conditioning v on u leaves one exponential per Gaussian and pixel.
         slope = cov[n] / var_u[n]
         var_free = var_v[n] - slope * cov[n]
-        off_u = u_mm - mu[n]
-        np.subtract((v_mm - mv[n])[:, None], slope * off_u, out=own)
+        across = _within(u_mm, mu[n], np.sqrt(var_u[n]))
+        up = _within(v_mm, mv[n], np.sqrt(var_v[n]))
+        off_u = u_mm[across] - mu[n]
+        own = (v_mm[up] - mv[n])[:, None] - slope * off_u
         own *= own
         own /= var_free
         own += off_u**2 / var_u[n]
         own *= -0.5
         np.exp(own, out=own)
         own *= w[n] / (2 * np.pi * np.sqrt(var_u[n] * var_free))
-        total += own
+        total[up, across] += own
     return SSFField(total, pixel, (float(u_mm[0]), float(v_mm[0])))
+
+
+def _within(centres: FloatArray, mean: float, sd: float) -> slice:
+    """Find the pixels that a Gaussian reaches."""
+    return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
 
 
 def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1) -> FixedMixture:

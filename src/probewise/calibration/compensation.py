@@ -1,0 +1,220 @@
+"""How the posterior of N - 1 Gaussians answers a light one more, to first order.
+
+Adding a Gaussian that holds the share s of the light changes the predicted readings by s times a known curve. To first
+order the other parameters answer by a shift, which the covariances of parameters and predictions over the posterior's
+samples tell (as in the ensemble Kalman filter, Evensen 1994), and s itself has a normal posterior. Its integral over s
+tells which places and widths of the new Gaussian the readings ask for, before any likelihood is evaluated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr, logsumexp, ndtri_exp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.calibration.coordinates import MomentCoordinates
+from probewise.inference import SensorProblem, sd_floor
+from probewise.nested.weights import resampled
+
+__all__ = ["Answer", "Compensation"]
+
+_N_POOL = 20_000
+_AT_ONCE = 500
+# First-order evidences are tempered, and a share of the shapes does without: far from the mean they mislead.
+_TEMPERED, _PLAIN = 0.8, 0.1
+
+# A share is told by at least this part of the information that a sensor with fixed other parameters would give.
+_LEAST_TOLD = 0.1
+_WIDENED = 1.2
+_LOG_ROOT_2PI = 0.5 * float(np.log(2.0 * np.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The answer to one Gaussian more: shift of the coordinates per share, (n, d); mean and sd of the share, (n,)."""
+
+    shift: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+
+    def take(self, rows: IntArray) -> Answer:
+        """Select rows."""
+        return Answer(self.shift[rows], self.mean[rows], self.sd[rows])
+
+    def put(self, rows: IntArray, other: Answer) -> Answer:
+        """Replace rows."""
+        out = self.take(np.arange(len(self.mean)))
+        out.shift[rows], out.mean[rows], out.sd[rows] = other.shift, other.mean, other.sd
+        return out
+
+    def log_evidence(self, most: float) -> FloatArray:
+        """Log of the mean likelihood over shares from 0 to `most`, over that without the Gaussian, (n,)."""
+        true_sd = self.sd / _WIDENED
+        low, high, _ = Answer(self.shift, self.mean, true_sd)._bounds(np.full(len(self.mean), most))
+        log_mass = _log_between(low, high)
+        return np.asarray(0.5 * (self.mean / true_sd) ** 2 + log_mass + np.log(true_sd / most) + _LOG_ROOT_2PI)
+
+    def draw_share(self, most: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw shares from 0 to `most`, both (n,)."""
+        low, high, mirrored = self._bounds(most)
+        at_low, at_high = log_ndtr(low), log_ndtr(high)
+        # Both bounds are in the lower tail or about 0, so that logarithms keep their digits.
+        z = ndtri_exp(at_high + np.log(rng.random(len(most)) * -np.expm1(at_low - at_high) + np.exp(at_low - at_high)))
+        return np.asarray((self.mean + self.sd * np.where(mirrored, -z, z)).clip(1e-12 * most, most))
+
+    def log_share_density(self, share: FloatArray, most: FloatArray) -> FloatArray:
+        """Natural log of the density of `draw_share`, (n,)."""
+        low, high, _ = self._bounds(most)
+        log_mass = _log_between(low, high)
+        z = (share - self.mean) / self.sd
+        return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
+
+    def _bounds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        low, high = -self.mean / self.sd, (most - self.mean) / self.sd
+        mirrored = low > 0
+        return np.where(mirrored, -high, low), np.where(mirrored, -low, high), mirrored
+
+
+def _log_between(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Log of the normal mass between bounds of which the greater is not far in the upper tail, (n,)."""
+    at_low, at_high = log_ndtr(low), log_ndtr(high)
+    return np.asarray(at_high + np.log(-np.expm1(np.minimum(at_low - at_high, -1e-15))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """Linear model of the posterior of N - 1 Gaussians about its mean; n_used readings.
+
+    Attributes
+    ----------
+    alone
+        Problem of one Gaussian.
+    gain
+        Shift of the coordinates per change of the readings, (d, n_used). The masses do not shift.
+    inverse
+        Inverse covariance of the coordinates that shift, with zeros for the others, (d, d).
+    precision, pull
+        Of each reading: one over its noise variance, and that times its mean residual, (n_used,).
+    dark, bright
+        Mean prediction less the dark level, (n_used,); mean difference of the levels.
+    """
+
+    alone: SensorProblem
+    gain: FloatArray
+    inverse: FloatArray
+    precision: FloatArray
+    pull: FloatArray
+    dark: FloatArray
+    bright: float
+
+    @classmethod
+    def of(
+        cls, below: SensorProblem, coordinates: MomentCoordinates, alone: SensorProblem, theta: FloatArray
+    ) -> _Linear:
+        """Learn from posterior samples of N - 1 Gaussians, (n, 6 N - 4)."""
+        recording = below.recording
+        used = recording.usable
+        predicted = below.model.predict(theta, recording.plan)[:, used]
+        mean = predicted.mean(axis=0)
+        residual = recording.readings[used] - mean
+        scan = np.unique(recording.plan.scan[used], return_inverse=True)[1]
+        variance = np.bincount(scan, residual**2) / np.bincount(scan)
+        precision = 1.0 / np.maximum(variance, sd_floor(recording) ** 2)[scan]
+        x = coordinates.enter(theta)
+        off = x - x.mean(axis=0)
+        # The masses stay, so that the share of light does; the first one's alone changes no reading.
+        shifts = np.ones(x.shape[1], dtype=np.bool_)
+        shifts[:-2:6] = False
+        off[:, ~shifts] = 0.0
+        covariance = off.T @ off / len(off)
+        inverse = np.zeros_like(covariance)
+        own = np.ix_(shifts, shifts)
+        inverse[own] = np.linalg.pinv(covariance[own], hermitian=True)
+        return cls(
+            alone,
+            off.T @ ((predicted - mean) * precision) / len(off),
+            inverse,
+            precision,
+            precision * residual,
+            mean - float(theta[:, -2].mean()),
+            float((theta[:, -1] - theta[:, -2]).mean()),
+        )
+
+    def answer(self, gaussian: FloatArray) -> Answer:
+        """Tell the answer to Gaussians, (n, 6), of any amplitude."""
+        recording = self.alone.recording
+        levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
+        lone = np.concatenate([np.ones((len(gaussian), 1)), gaussian[:, 1:], levels], axis=1)
+        change = self.bright * self.alone.model.predict(lone, recording.plan)[:, recording.usable] - self.dark
+        shift = -change @ self.gain.T
+        told = (change * change) @ self.precision
+        explained = np.einsum("ni,ij,nj->n", shift, self.inverse, shift)
+        told = np.maximum(told - explained, _LEAST_TOLD * told) + 1e-12
+        return Answer(shift, change @ self.pull / told, _WIDENED / np.sqrt(told))
+
+
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """Shapes (places and widths) of one Gaussian more, and how those of N - 1 Gaussians shift to compensate for it.
+
+    Shapes are drawn from a large pool of the prior's, by their first-order evidence; some by the prior alone.
+
+    Attributes
+    ----------
+    coordinates
+        Of N - 1 Gaussians.
+    linear
+        Tells the answer to a Gaussian.
+    pool
+        Gaussians drawn from the prior, (n_pool, 6).
+    answers
+        To those of the pool.
+    most
+        Share of the light up to which first-order evidences are integrated.
+    log_norm
+        Log of their mean over the pool, tempered.
+    """
+
+    coordinates: MomentCoordinates
+    linear: _Linear
+    pool: FloatArray
+    answers: Answer
+    most: float
+    log_norm: float
+
+    @classmethod
+    def of(
+        cls,
+        below: SensorProblem,
+        coordinates: MomentCoordinates,
+        alone: SensorProblem,
+        theta: FloatArray,
+        *,
+        rng: np.random.Generator,
+        n_pool: int = _N_POOL,
+    ) -> Compensation:
+        """Learn from the problem of N - 1 Gaussians and samples of its posterior, (n, 6 N - 4)."""
+        linear = _Linear.of(below, coordinates, alone, theta)
+        prior = coordinates.prior
+        pool = prior.from_unit_cube(rng.random((n_pool, len(prior.names))))[:, :6]
+        parts = [linear.answer(part) for part in np.array_split(pool, -(-n_pool // _AT_ONCE))]
+        answers = Answer(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
+        mass = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
+        mass = mass[..., 0] / np.sqrt(mass[..., 3] * mass[..., 4] - mass[..., 5] ** 2)
+        most = float(np.mean(mass.min(axis=1) / (mass.sum(axis=1) + mass.min(axis=1))))
+        log_norm = float(logsumexp(_TEMPERED * answers.log_evidence(most))) - math.log(n_pool)
+        return cls(coordinates, linear, pool, answers, most, log_norm)
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, Answer]:
+        """Draw shapes, (n, 6) with amplitudes to be replaced, and the answers to them."""
+        log_weight = self.log_tilt(self.answers)
+        rows = rng.permutation(resampled(np.exp(log_weight - log_weight.max()), n, rng))
+        return self.pool[rows], self.answers.take(rows)
+
+    def log_tilt(self, answer: Answer) -> FloatArray:
+        """Log of the density of the shapes over the prior's, (n,)."""
+        asked = _TEMPERED * answer.log_evidence(self.most) - self.log_norm
+        return np.asarray(np.logaddexp(math.log(_PLAIN), math.log(1.0 - _PLAIN) + asked))

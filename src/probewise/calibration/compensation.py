@@ -92,23 +92,20 @@ class _Linear:
     ----------
     alone
         Problem of one Gaussian.
-    gain
-        Shift of the coordinates per change of the readings, (d, n_used). The masses do not shift.
+    response
+        To a change of the readings in units of their noise sd: product with the mean residual, and minus the shift of
+        the coordinates, (n_used, 1 + d). The masses do not shift.
     inverse
         Inverse covariance of the coordinates that shift, with zeros for the others, (d, d).
-    precision, pull
-        Of each reading: one over its noise variance, and that times its mean residual, (n_used,).
     dark, bright
-        Mean prediction less the dark level, (n_used,); mean difference of the levels.
+        Mean prediction less the dark level, mean difference of the levels, in noise sds, (n_used,).
     """
 
     alone: SensorProblem
-    gain: FloatArray
+    response: FloatArray
     inverse: FloatArray
-    precision: FloatArray
-    pull: FloatArray
     dark: FloatArray
-    bright: float
+    bright: FloatArray
 
     @classmethod
     def of(
@@ -122,7 +119,7 @@ class _Linear:
         residual = recording.readings[used] - mean
         scan = np.unique(recording.plan.scan[used], return_inverse=True)[1]
         variance = np.bincount(scan, residual**2) / np.bincount(scan)
-        precision = 1.0 / np.maximum(variance, sd_floor(recording) ** 2)[scan]
+        per_sd = 1.0 / np.maximum(np.sqrt(variance), sd_floor(recording))[scan]
         x = coordinates.enter(theta)
         off = x - x.mean(axis=0)
         # The masses stay, so that the share of light does; the first one's alone changes no reading.
@@ -135,25 +132,32 @@ class _Linear:
         inverse[own] = np.linalg.pinv(covariance[own], hermitian=True)
         return cls(
             alone,
-            off.T @ ((predicted - mean) * precision) / len(off),
+            np.column_stack([residual * per_sd, ((predicted - mean) * per_sd).T @ off / len(off)]),
             inverse,
-            precision,
-            precision * residual,
-            mean - float(theta[:, -2].mean()),
-            float((theta[:, -1] - theta[:, -2]).mean()),
+            (mean - float(theta[:, -2].mean())) * per_sd,
+            float((theta[:, -1] - theta[:, -2]).mean()) * per_sd,
         )
 
     def answer(self, gaussian: FloatArray) -> Answer:
         """Tell the answer to Gaussians, (n, 6), of any amplitude."""
+        blocks = np.array_split(gaussian, max(1, -(-len(gaussian) // _AT_ONCE)))
+        parts = [self._answer(block) for block in blocks]
+        return Answer(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
+
+    def _answer(self, gaussian: FloatArray) -> Answer:
         recording = self.alone.recording
         levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
         lone = np.concatenate([np.ones((len(gaussian), 1)), gaussian[:, 1:], levels], axis=1)
-        change = self.bright * self.alone.model.predict(lone, recording.plan)[:, recording.usable] - self.dark
-        shift = -change @ self.gain.T
-        told = (change * change) @ self.precision
-        explained = np.einsum("ni,ij,nj->n", shift, self.inverse, shift)
-        told = np.maximum(told - explained, _LEAST_TOLD * told) + 1e-12
-        return Answer(shift, change @ self.pull / told, _WIDENED / np.sqrt(told))
+        change = self.alone.model.predict(lone, recording.plan)
+        if not recording.usable.all():
+            change = change[:, recording.usable]
+        change = change * self.bright
+        change -= self.dark
+        told = np.einsum("ni,ni->n", change, change)
+        both = change @ self.response
+        shift = -both[:, 1:]
+        told = np.maximum(told - np.einsum("ni,ni->n", shift @ self.inverse, shift), _LEAST_TOLD * told) + 1e-12
+        return Answer(shift, both[:, 0] / told, _WIDENED / np.sqrt(told))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +204,7 @@ class Compensation:
         linear = _Linear.of(below, coordinates, alone, theta)
         prior = coordinates.prior
         pool = prior.from_unit_cube(rng.random((n_pool, len(prior.names))))[:, :6]
-        parts = [linear.answer(part) for part in np.array_split(pool, -(-n_pool // _AT_ONCE))]
-        answers = Answer(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
+        answers = linear.answer(pool)
         mass = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
         mass = mass[..., 0] / np.sqrt(mass[..., 3] * mass[..., 4] - mass[..., 5] ** 2)
         most = float(np.mean(mass.min(axis=1) / (mass.sum(axis=1) + mass.min(axis=1))))

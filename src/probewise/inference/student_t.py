@@ -25,6 +25,7 @@ __all__ = ["PooledSigma", "StudentT", "log_sigma_integral"]
 _LOG_2PI = math.log(2 * math.pi)
 _TINY = 1e-250
 _N_TERMS = 100
+_MANY_GROUPS = 16  # from here on, sums in place are cheaper than a product with a mostly zero matrix
 
 
 def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float) -> FloatArray:
@@ -147,6 +148,19 @@ class StudentT:
         return np.asarray(self.groups[:, None] == np.unique(self.groups)[None, :], dtype=np.float64)
 
     @cached_property
+    def _starts(self) -> IntArray | None:
+        """First reading of each data set, where these are many and each is in one piece."""
+        starts = np.flatnonzero(np.diff(self.groups, prepend=self.groups[:1] - 1))
+        in_one_piece = starts.size == self._sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
+        return starts if in_one_piece and starts.size > _MANY_GROUPS else None
+
+    def _sums(self, square: FloatArray) -> FloatArray:
+        """Sum over each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
+        if self._starts is None:
+            return square @ self._membership
+        return np.asarray(np.add.reduceat(square, self._starts, axis=1))
+
+    @cached_property
     def _sizes(self) -> FloatArray:
         return np.asarray(self._membership.sum(axis=0))
 
@@ -155,7 +169,7 @@ class StudentT:
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
             raise ShapeError(f"{residual.shape[1]} readings against {self.groups.size} groups; allowed: one each")
-        square = np.square(residual, out=residual) @ self._membership
+        square = self._sums(np.square(residual, out=residual))
         integral = log_sigma_integral(square, self._sizes, self.sd_floor, self.sd_ceiling)
         constant = 0.5 * self.groups.size * _LOG_2PI + self._sizes.size * math.log(
             math.log(self.sd_ceiling / self.sd_floor)

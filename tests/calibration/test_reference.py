@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior, default_prior
+from probewise.calibration.compensation import Compensation
+from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
@@ -27,25 +30,39 @@ def _sorted_draws(prior: SSFPrior, n: int, rng: np.random.Generator) -> FloatArr
     return space.leave(space.enter(prior.from_unit_cube(rng.random((n, len(prior.names))))))[0]
 
 
+def _compensation(recording: Recording, n: int, rng: np.random.Generator) -> Compensation:
+    """Learn the answers of N - 1 Gaussians that are known to a tenth of a mm, narrower than what they are used for."""
+    below = default_prior(recording, n - 1)
+    shapes = np.tile([0.3, 0.5, 1.5, 0.03, 0.08, -0.005, 0.2, -4.0, 2.0, 0.05, 0.02, 0.0][: 6 * (n - 1)], (300, 1))
+    theta = np.concatenate([shapes, np.tile([11.0, 58.0], (300, 1))], axis=1)
+    theta *= 1.0 + 0.02 * rng.standard_normal(theta.shape)
+    rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
+    posing = Posing(recording, default_prior)
+    return Compensation.of(posing.problem(n - 1), below.coordinates, posing.problem(1), rest, rng=rng, n_pool=4000)
+
+
 @pytest.fixture
 def references(recording: Recording) -> dict[int, Reference]:
     silent = cast("SensorProblem", _Silent())
     return {n: Reference(default_prior(recording, n), silent) for n in (2, 3)}
 
 
+@pytest.mark.parametrize("compensated", [False, True])
 @pytest.mark.parametrize("n", [2, 3])
 def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
-    references: dict[int, Reference], recording: Recording, n: int
+    references: dict[int, Reference], recording: Recording, n: int, compensated: bool
 ) -> None:
     """Mean weight one, and moments of the prior's own draws; four standard errors, so one false alarm in 16 000."""
     rng = np.random.default_rng(31)
     reference = references[n]
+    if compensated:
+        reference = replace(reference, compensation=_compensation(recording, n, rng))
     drawn = reference.draw(_sorted_draws(default_prior(recording, n - 1), 10_000, rng), rng=rng)
     weight = np.zeros(len(drawn))
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
     alive = alive[np.isfinite(reference.prior.log_prob(drawn[alive]))]
     weight[alive] = np.exp(-reference.log_likelihood(drawn[alive]))
-    assert 0.5 < len(alive) / len(drawn) < 1.0
+    assert 0.2 < len(alive) / len(drawn) < 1.0
     assert abs(weight.mean() - 1.0) < 4 * weight.std() / np.sqrt(len(weight))
     plain = _sorted_draws(reference.prior, 10_000, rng)
 
@@ -57,6 +74,50 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     found[alive] = weight[alive] * asked(drawn[alive])
     error = np.hypot(found.std(), asked(plain).std()) / np.sqrt(len(drawn))
     assert abs(found.mean() - asked(plain).mean()) < 4 * error
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_undoing_a_compensated_gaussian_gives_the_others_back(
+    references: dict[int, Reference], recording: Recording, n: int
+) -> None:
+    rng = np.random.default_rng(33)
+    reference = replace(references[n], compensation=_compensation(recording, n, rng))
+    rest = _sorted_draws(default_prior(recording, n - 1), 200, rng)
+    drawn = reference.with_compensated(rest, rng=rng)
+    back, log_density = reference.uncompensated(drawn)
+    alive = np.isfinite(log_density)
+    assert alive.sum() > 20
+    assert not np.allclose(drawn[alive, 1], rest[alive, 1], rtol=1e-6)
+    np.testing.assert_allclose(back[alive], rest[alive], rtol=1e-6, atol=1e-9)
+
+
+def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth: FloatArray, noise_sd: float) -> None:
+    """Two routes: covariances over posterior samples, and the normal equations with a numerical derivative."""
+    rng = np.random.default_rng(34)
+    posing = Posing(recording, default_prior)
+    problem, space = posing.problem(1), default_prior(recording, 1).coordinates
+    truth = truth.copy()
+    truth[0] = 0.5  # changes no reading; below the prior's bound
+
+    def predicted(x: FloatArray) -> FloatArray:
+        return problem.model.predict(space.leave(x)[0], recording.plan)
+
+    told = [1, 2, 3, 4, 6, 7]  # edges at right angles say nothing of the correlation
+    centre, step = space.enter(truth[None]), 1e-5 * np.eye(8)[told]
+    slope = (predicted(centre + step) - predicted(centre - step)) / 2e-5
+    covariance = noise_sd**2 * np.linalg.inv(slope @ slope.T)
+    x = np.tile(centre, (4000, 1))
+    x[:, told] += rng.standard_normal((4000, 6)) @ np.linalg.cholesky(covariance).T
+    compensation = Compensation.of(problem, space, problem, space.leave(x)[0], rng=rng, n_pool=10)
+    other = np.array([[1.0, 4.0, -3.0, 0.02, 0.05, 0.0]])
+    lone = np.concatenate([other, truth[None, -2:]], axis=1)
+    change = problem.model.predict(lone, recording.plan)[0] - predicted(centre)[0]
+    refit = -np.linalg.solve(slope @ slope.T, slope @ change)
+    shift = compensation.linear.answer(other).shift[0]
+    assert shift[0] == 0.0
+    sds = np.sqrt(np.diag(covariance))
+    apart = np.linalg.norm((shift[told] - refit) / sds)
+    assert apart < 0.15 * np.linalg.norm(refit / sds)
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -330,9 +330,11 @@ def _redrawn(here: FloatArray, reference: Reference, rng: np.random.Generator) -
     for k, way in enumerate(reference.ways):
         rows = np.flatnonzero(which == k)
         rest, log_here = way.back(here[rows])
-        rows, rest, log_here = (part[np.isfinite(log_here)] for part in (rows, rest, log_here))
-        there[rows] = way.draw(rest, rng=rng)
-        rows, log_here = (part[np.isfinite(there[rows]).all(axis=1)] for part in (rows, log_here))
+        possible = np.isfinite(log_here)
+        rows, log_here = rows[possible], log_here[possible]
+        there[rows] = way.draw(rest[possible], rng=rng)
+        possible = np.isfinite(there[rows]).all(axis=1)
+        rows, log_here = rows[possible], log_here[possible]
         log_there = way.back(there[rows])[1]
         log_drawn[rows] = np.where(np.isfinite(log_there), log_here - log_there, -np.inf)
     return there, log_drawn

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import resampled
@@ -72,7 +72,7 @@ class Answer:
         z = (share - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
 
-    def _bounds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _bounds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         low, high = -self.mean / self.sd, (most - self.mean) / self.sd
         mirrored = low > 0
         return np.where(mirrored, -high, low), np.where(mirrored, -low, high), mirrored

@@ -115,6 +115,7 @@ def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth:
     refit = -np.linalg.solve(slope @ slope.T, slope @ change)
     shift = compensation.linear.answer(other).shift[0]
     assert shift[0] == 0.0
+    assert compensation.linear.answer(other[:0]).shift.shape == (0, 8)
     sds = np.sqrt(np.diag(covariance))
     apart = np.linalg.norm((shift[told] - refit) / sds)
     assert apart < 0.15 * np.linalg.norm(refit / sds)

@@ -332,6 +332,8 @@ def _redrawn(here: FloatArray, reference: Reference, rng: np.random.Generator) -
         rest, log_here = way.back(here[rows])
         possible = np.isfinite(log_here)
         rows, log_here = rows[possible], log_here[possible]
+        if not rows.size:
+            continue
         there[rows] = way.draw(rest[possible], rng=rng)
         possible = np.isfinite(there[rows]).all(axis=1)
         rows, log_here = rows[possible], log_here[possible]

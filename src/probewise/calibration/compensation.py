@@ -145,6 +145,8 @@ class _Linear:
         return Answer(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
 
     def _answer(self, gaussian: FloatArray) -> Answer:
+        if not len(gaussian):
+            return Answer(np.empty((0, len(self.inverse))), np.empty(0), np.empty(0))
         recording = self.alone.recording
         levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
         lone = np.concatenate([np.ones((len(gaussian), 1)), gaussian[:, 1:], levels], axis=1)

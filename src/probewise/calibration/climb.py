@@ -30,7 +30,7 @@ _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
 _DRAWS = 6
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
-_MOST_TEMPERATURES = 12
+_MOST_TEMPERATURES = 6
 # A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
 _BLOCK_FROM, _FRESH_FROM = 0.35, 0.7
 _WHOLE_JUMP = 0.1

@@ -455,5 +455,5 @@ def test_what_is_imagined_is_not_ruled_out_by_the_readings_taken(monkeypatch):
     noise = 0.005 * np.random.default_rng(3).standard_normal(len(edge))
     rivals, sd, _ = asked_about(monkeypatch, dataclasses.replace(edge, readings=edge.readings + noise))
     null, imagined = (rival.model.predict(rival.z[None, :])[0] for rival in rivals)
-    assert rivals[1].label.endswith("too weak to be felt so far")
+    assert rivals[1].label.endswith("too weak to be detected so far")
     assert 0.5 < np.linalg.norm(imagined - null) / sd < 6.5

@@ -23,7 +23,7 @@ def test_the_matrix_marks_the_row_that_is_taken_for_the_column_and_leaves_out_wh
     assert np.isnan(image[:, columns.index("outliers")]).all()
     (circle,) = zip(*matrix.lines[0].get_data(), strict=True)
     assert circle == (columns.index("backlash"), rows.index("lag"))
-    assert "row: the effect that is there" in matrix.get_title(loc="left")
+    assert "row: the effect present" in matrix.get_title(loc="left")
     assert matrix.get_xlabel() == "effect that it may be taken for"
 
 

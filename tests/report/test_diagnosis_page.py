@@ -9,13 +9,13 @@ import pytest
 
 from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
+from probewise.report import covariate_view
 from probewise.report import diagnosis as page
-from probewise.report import witness
 from probewise.report.covariate import category_names, covariate_label, covariate_values
+from probewise.report.covariate_view import is_line
 from probewise.report.diagnosis_figures import changed_most
 from probewise.report.plots import gain_by_scan, one_scan
 from probewise.report.residual_means import mean_residuals
-from probewise.report.witness import is_line
 from probewise.report.words import readable
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -215,10 +215,12 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     where = [place_of(name, start) for name, start in (("slope", 0.0), ("time", 1.0), ("place", 2.0))]
     judged = SimpleNamespace(unknown_shares={"place, smooth": 0.9})
     found = SimpleNamespace(verdict="unknown", judged=judged, where=(*where, dataclasses.replace(where[2], scan="s")))
-    monkeypatch.setattr(witness, "covariate_values", lambda d: {place.witness: np.arange(3.0) for place in d.where})
-    monkeypatch.setattr(witness, "_views", lambda d, place, at: [place])
+    monkeypatch.setattr(
+        covariate_view, "covariate_values", lambda d: {place.witness: np.arange(3.0) for place in d.where}
+    )
+    monkeypatch.setattr(covariate_view, "_views", lambda d, place, at: [place])
     chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(stands_out=sizes[view.covariate]))
-    ordered = witness.seen_first(found, chance)
+    ordered = covariate_view.seen_first(found, chance)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
 
 
@@ -231,5 +233,5 @@ def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():
     words = SimpleNamespace(next_plan="next_plan.csv")
     found = SimpleNamespace(next_measurement=plan, apparatus=SimpleNamespace(words=words))
     said = page._next_in_words(found)
-    assert said.startswith("Nothing that is worth the time: of all plans of up to")
-    assert "tell 0.0 nats. It is in next_plan.csv, if you want it: scan again (8 readings, about 1 minute)." in said
+    assert said.startswith("Nothing that is worth the time: the best plan of up to")
+    assert "factor of 0.0 nats. It is in next_plan.csv: scan again (8 readings, about 1 minute)." in said

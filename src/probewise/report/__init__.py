@@ -1,4 +1,4 @@
-"""One self-contained HTML page a run, and the figures in it."""
+"""One self-contained HTML page per run, and its figures."""
 
 from __future__ import annotations
 

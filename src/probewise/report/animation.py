@@ -1,4 +1,4 @@
-"""A run as a moving picture: its frames, one after another, in a GIF."""
+"""An animated GIF of a run: one frame per step."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["gif"]
 
 
 def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
-    """Join PNGs into a GIF that repeats for ever.
+    """Join PNGs into a GIF that loops for ever.
 
     Parameters
     ----------
     frames
         One PNG or more; smaller ones are set on white at the upper left.
     frame_s, last_s
-        How long each is shown, and the last one, in seconds.
+        Seconds that each frame is shown, and the last frame.
     """
     if not frames:
         raise ParameterError("frames", 0, "one picture or more")
@@ -41,9 +41,9 @@ def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -
 
 
 def _palette(sheets: Sequence[Image.Image]) -> Image.Image:
-    """Choose 256 colours for all frames together: a palette a frame would let one colour change from frame to frame.
+    """Choose 256 colours for all frames together: with a palette per frame, one colour would change between frames.
 
-    By coverage, not by frequency: the one small square that shows the next place has a colour of its own.
+    The choice is by coverage, not by frequency, so that the small square that marks the next place keeps its colour.
     """
     weights = np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     codes = np.unique(np.concatenate([np.unique(np.asarray(sheet) @ weights) for sheet in sheets]))

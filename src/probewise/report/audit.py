@@ -1,4 +1,4 @@
-"""The page of an audit: what a plan sees before any data, what it cannot tell apart, what would cure that."""
+"""The page of an audit: which effects a plan can detect and tell apart, and which readings would help."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from probewise.report.words import count, number, readable
 
 __all__ = ["answer", "figures", "picture", "write_page"]
 
-_CURED_BY = "The fewest readings that would cure it"
+_CURED_BY = "The fewest extra readings that would help"
 
 
 def answer(audit: PlanAudit) -> str:
-    """Say in twenty words at most what the plan can do, and what it takes to cure the rest."""
+    """Summarise in twenty words at most which effects the plan can identify, and what the others need."""
     n_fine, n_aliased = len(audit.seen_as("fine")), len(audit.seen_as("aliased"))
     of = f"{n_fine} of {len(audit.effects)} effects"
     said = f"This plan can identify {of}; {n_aliased} are aliased, {len(audit.seen_as('invisible'))} undetectable."
     if not audit.cures:
         return said
     cured = len(audit.seen_as("fine", after=True)) - n_fine
-    return f"{said} {count(audit.extra_readings, 'more reading')} would cure {cured}."
+    return f"{said} {count(audit.extra_readings, 'more reading')} would identify {cured} more."
 
 
 def figures(audit: PlanAudit) -> dict[str, bytes]:
@@ -35,24 +35,28 @@ def figures(audit: PlanAudit) -> dict[str, bytes]:
 
 
 def picture(audit: PlanAudit) -> AxesGrid:
-    """Draw what the plan sees of every effect, and what it cannot tell apart."""
-    names, sights = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
-    return audit_matrix(names, sights, audit.cosines, alias=ALIAS)
+    """Draw the detectability of every effect, and which effects are aliased."""
+    names, statuses = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
+    return audit_matrix(names, statuses, audit.cosines, alias=ALIAS)
 
 
 def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
     """Write the whole page."""
     shown = figure(
         drawn["audit.png"],
-        "Left: of what each effect changes in the readings, the share that "
+        "Left: share of each effect's change in the readings that "
         f"{audit.words.null}'s own parameters cannot absorb. "
-        "Right, read along a row: the effect of the row is there, at a typical setting; the cosine says how well the "
-        "effect of the column, at the setting that suits it best, would pass for it. So it matters which of the two is "
-        "there: an effect with many settings passes for a plain one, but not the other way round. A circle marks an "
-        f"alias: at size λ = {LAMBDA:g} these readings tell the row from the column by less than {LEAST_NATS:g} nats.",
+        "Right: the effect of the row is present, at typical parameters; the cosine measures how well the effect of "
+        "the "
+        "column imitates it, at the parameters that suit it best. The matrix is not symmetric: an effect with many "
+        "parameters can imitate a simple one, but not the other way round. A circle marks an "
+        f"alias: at size λ = {LAMBDA:g} these readings favour the row over the column by less than {LEAST_NATS:g} "
+        f"nats.",
     )
     sections = [
-        Section("Not told apart", _classes(audit)) if audit.classes is not None else Section(_CURED_BY, _cures(audit)),
+        Section("Effects that cannot be told apart", _classes(audit))
+        if audit.classes is not None
+        else Section(_CURED_BY, _cures(audit)),
         Section("Every effect", (audit_table(audit.effects, audit.words.null),)),
         Section(
             "What was assumed",
@@ -62,7 +66,7 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
                         ("plan", source),
                         ("readings", f"{len(audit.plan)} in {count(len(audit.plan.scan_names), audit.words.run)}"),
                         (audit.words.null.removeprefix("the "), audit.assumed),
-                        ("can be set", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
+                        ("controls of the instrument", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
                     )
                 ),
             ),
@@ -79,8 +83,8 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
 
 def _classes(audit: PlanAudit) -> tuple[Markup, ...]:
     if not audit.classes:
-        return (paragraph("Every effect that these rows show changes the readings in a way of its own."),)
-    opening = "Effects that are taken for each other, directly or by way of others:"
+        return (paragraph("These rows can tell all effects apart that they can detect."),)
+    opening = "Classes of aliased effects, directly or through others in the class:"
     rows = ((str(k), ", ".join(map(spoken_name, names))) for k, names in enumerate(audit.classes, start=1))
     return (paragraph(opening), table(("class", "effects"), rows))
 
@@ -92,8 +96,8 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
             return (paragraph("None are needed: every effect can be identified."),)
         return (
             paragraph(
-                "No scan that this arm can take, repeated, reversed, faster or turned, nor the sheet laid otherwise, "
-                "would help enough."
+                "No scan that this arm can take (repeated, reversed, faster or turned) and no other position of the "
+                "sheet would help enough."
             ),
         )
     left = [spoken_name(e.name) for e in audit.after if e.detectability != "fine"]
@@ -112,7 +116,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
         ),
         paragraph(
             f"{count(len(plan), 'reading')}, about {number(audit.extra_minutes, 0)} minutes; "
-            f"the plan is in cure_plan.csv. Still not identified: {', '.join(left) or 'nothing'}."
+            f"the plan is in cure_plan.csv. Still not identifiable: {', '.join(left) or 'nothing'}."
         ),
     )
 

@@ -1,4 +1,4 @@
-"""The table of an audit, which the page of a diagnosis shows too."""
+"""The table of an audit; the report of a diagnosis shows it too."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ _SIZES = {
     "x": "along X",
     "y": "along Y",
 }
-"""What a parameter that scales an effect is called in words."""
+"""Names in words of the parameters that scale an effect."""
 
 
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
-    """Build the table of all effects: how each is seen, what it is taken for, the size at which it shows.
+    """Build the table of all effects: detectability, aliases, and the size at which each is detectable.
 
-    `of` is what has parameters of its own. Rows that would show an effect have a column where they were counted.
+    `of` names the model whose own parameters absorb part of an effect. A column gives the number of rows that an effect
+    needs, where that was computed.
     """
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")
@@ -54,23 +55,27 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
         ),
         caption="Status: fine (these readings detect the effect and tell it from every other), aliased (they detect "
-        "it, but would take it for the one named, whose cosine stands behind it; where that one is there, they may "
-        "still tell it from this one), or invisible (they cannot detect it). Detectable share: of what the effect "
-        f"changes in the readings, the share that {of}'s own parameters do not absorb. Size at λ = 8: how large each "
-        "of its parameters must be to stand out from the noise by eight sds; – where none says how large it is."
-        + (" Rows: so many like these show it where it changes readings by one noise sd rms." if counted else ""),
+        "it, but cannot tell it from the effect named, given with its cosine; the reverse need not hold), or invisible "
+        f"(they cannot detect it). Detectable share: share of the effect's change in the readings that {of}'s own "
+        "parameters do not absorb. Size at λ = 8: value of each parameter at which the effect reaches eight noise sds; "
+        "– where no parameter scales the effect."
+        + (
+            " Rows: how many rows like these detect the effect when it changes the readings by one noise sd (rms)."
+            if counted
+            else ""
+        ),
     )
 
 
 def _smallest(parameter: str, unit: str, amount: float | None) -> str:
-    """Write a size with the name of its parameter in words, where that says more than its unit."""
+    """Write a size, with the name of its parameter where the unit does not already say it."""
     name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
     value = "at no size" if amount is None else f"{amount:.2g} {_unit(unit)}"
     return f"{name} {value}".strip()
 
 
 def _unit(unit: str) -> str:
-    """Write "1/V" as "per V" and "LEGO/h" as "LEGO units per h"; a unit of a person's own stays as it is."""
+    """Write "1/V" as "per V" and "LEGO/h" as "LEGO units per h"; a user's own unit is kept."""
     upper, _, lower = unit.partition("/")
     if upper not in ("1", "LEGO", "mm"):
         return unit_name(unit)

@@ -1,4 +1,4 @@
-"""The page of a calibration: which SSF the recording asks for, and how well it predicts."""
+"""The page of a calibration: the SSF that the evidence favours, and how well it predicts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["answer", "evidence_table", "figures", "parameter_table", "sections",
 def answer(sensor: FittedSensor) -> str:
     """Say in one sentence what the calibration found."""
     n = sensor.n_gaussians
-    said = f"The recording asks for {count(n, 'Gaussian')}"
+    said = f"The evidence favours {count(n, 'Gaussian')}"
     others = sorted((o for o in sensor.orders if o.n_gaussians != n), key=lambda o: -o.log_z)
     if others:
         chosen = next(o for o in sensor.orders if o.n_gaussians == n)
@@ -43,7 +43,7 @@ def answer(sensor: FittedSensor) -> str:
 
 
 def field_shape(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
-    """Centre (mm) and the sds (mm) along the long and the short axis of the mean SSF field."""
+    """Return the centre of the mean SSF and its sds along the long and the short axis (mm)."""
     u, v = sensor.field.mean_mm
     short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0))
     return float(u), float(v), (float(long), float(short))
@@ -70,7 +70,7 @@ def figures(calibration: Calibration, recording: Recording, prediction: Predicti
 def sections(
     sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> list[Section]:
-    """Build everything below the answer."""
+    """Build the sections below the headline."""
     ok = recording.usable
     z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
     return [
@@ -106,7 +106,7 @@ def sections(
                 ),
                 figure(
                     drawn["residuals.png"],
-                    "Standardised residuals in the order they were taken; 95 % should lie between the dashed lines.",
+                    "Standardised residuals in the order of the readings; 95 % should lie between the dashed lines.",
                 ),
             ),
         ),
@@ -155,7 +155,7 @@ def evidence_table(sensor: FittedSensor) -> Markup:
 
 
 def parameter_table(sensor: FittedSensor) -> Markup:
-    """Build the table of posterior medians and 95 % intervals: no single sample far off moves them."""
+    """Build the table of posterior medians and 95 % intervals, which are robust to single outlying samples."""
     median, ends = sensor.median(), sensor.interval()
     return table(
         ("parameter", "unit", "median", "95 % interval"),

@@ -1,4 +1,4 @@
-"""The page of a challenge: the table of targets, what is taken for what, and whether probabilities are honest."""
+"""The page of a challenge: the table of targets, the confusion matrix, and the calibration of probabilities."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: "
 
 
 def answer(rows: Sequence[Row], n_cases: int) -> str:
-    """Say in one sentence how many targets are met."""
+    """Summarise in one sentence how many targets are met."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
         f"{count(n_cases, 'case')} of concealed physics: {count(n['met'], 'target')} met, {n['missed']} missed, "
@@ -53,13 +53,13 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
 
 
 def _indented(name: str) -> str:
-    """Keep the indentation of a row that is part of the one above: a page drops plain spaces."""
+    """Keep the indentation of a sub-row as an em space: HTML drops plain spaces."""
     own = name.lstrip()
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
 def table_csv(rows: Sequence[Row]) -> str:
-    """Write the table as CSV; what is not there is empty."""
+    """Write the table as CSV; missing values are empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"])
@@ -73,16 +73,16 @@ def table_csv(rows: Sequence[Row]) -> str:
 
 
 def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: bool = False) -> str:
-    """Write the whole page; `rows` are its table, `command` made it, and `systems` says that cases are of systems."""
+    """Write the whole page from results and table `rows`; `systems`: the cases are simulators, not sensors."""
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (table_of_rows(rows), _legend()))]
     if done:
         drawn = figure(
             png(confusion_matrix(*confusion(done, label=family_of if systems else str))),
-            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as it."
-            + (" Targets are left out." if systems else ""),
+            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
+            "truth." + (" Targets are left out." if systems else ""),
         )
-        sections.append(Section("What is taken for what", (drawn,)))
+        sections.append(Section("Confusion matrix", (drawn,)))
         sections.append(
             Section("Case by case", (_cases(results),))
             if systems
@@ -98,7 +98,7 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
     )
     known: set[str] = set()
     return page(
-        "What a diagnosis is worth",
+        "How good a diagnosis is",
         answer=answer(rows, len(results)),
         key_figure=fragment(honest, *terms_of(honest, known)),
         sections=explained(sections, known),
@@ -125,7 +125,7 @@ def _cases(results: Results) -> Markup:
             "said",
             "probability",
             "right",
-            "held-out gain, of the right model's (nats)",
+            "held-out gain, and that of the right model (nats)",
         ),
         (_case(number, result) for number, result in enumerate(results)),
     )
@@ -151,10 +151,11 @@ def _case(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _legend() -> Markup:
     return paragraph(
-        "A target is met or missed only where the whole 95 % interval says so; otherwise it is undecided. "
-        "Intervals of shares are Wilson's, of means Student's, of the others bootstrap ones. "
-        "Detection and covariates: effects on the mean. Held-out gain: white noise. "
-        "Aliases: effects that so many readings could tell apart by less than 3 nats."
+        "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is "
+        "undecided. "
+        "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
+        "Rows on detection and covariates count effects on the mean; those on held-out gain, cases with white noise. "
+        "Aliases are effects that a plan of this many readings could tell apart by less than 3 nats."
     )
 
 

@@ -1,4 +1,4 @@
-"""The covariates of a diagnosis as people read them, and their values row by row."""
+"""The covariates of a diagnosis: labels, units, and values row by row."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ __all__ = [
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
-"""Units by the last part of a column's own name, such as battery_mv."""
+"""Units by the last part of a user's column name, such as battery_mv."""
 WORDS = {
     "level": "predicted reading",
-    "slope": "slope of the predicted reading along the move",
+    "slope": "slope of the predicted reading along the motion",
     "place": "place along the scans",
-    "direction": "direction of the move",
+    "direction": "direction of motion",
     "orientation": "orientation of the sensor",
     "edge_distance": "distance from the edge",
 }
 
 
 def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
-    """Name a covariate with its unit; `unit` is the reading's."""
+    """Name a covariate with its unit; `unit` is that of the readings."""
     said, own = covariate_words(name), covariate_unit(name, unit)
     if scan is not None and name != "scan":
         said += f", scan {scan}"
@@ -42,13 +42,13 @@ def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
 
 
 def covariate_words(name: str) -> str:
-    """Name a covariate."""
+    """Name a covariate in words."""
     stem, _, suffix = name.rpartition("_")
     return WORDS.get(name, (stem if stem and suffix in SUFFIXES else name).replace("_", " "))
 
 
 def family_words(family: str) -> str:
-    """Name what something unknown depends on: a covariate, in all or within each scan, and how."""
+    """Name a family of free-form terms: a covariate, over all scans or within each, and the form of the dependence."""
     name, _, how = family.partition(", ")
     stem = name.removesuffix(" within scans")
     said = covariate_words(stem) + (", scan by scan" if stem != name else "")
@@ -56,13 +56,13 @@ def family_words(family: str) -> str:
 
 
 def covariate_unit(name: str, unit: str) -> str:
-    """Name its unit, "" where it has none that is known; `unit` is the reading's."""
+    """Return the unit of a covariate, "" if none is known; `unit` is that of the readings."""
     known = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
     return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
 
 
 def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
-    """Name a covariate of a diagnosis, and its unit, "" where it has none that is known."""
+    """Return the name of a covariate in words and its unit, "" if none is known."""
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
     if not isinstance(apparatus, PersonsSystem):
         return ("scan" if name == "scan" else covariate_words(name)), covariate_unit(name, unit)
@@ -77,7 +77,7 @@ def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
 
 
 def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
-    """Label an axis with a covariate of a diagnosis and its unit."""
+    """Return an axis label: the covariate and its unit."""
     said, unit = words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
@@ -85,10 +85,10 @@ def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
 
 
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
-    """Give each row's value of the covariate of each place, (n_points,), by the place's witness.
+    """Return the covariate of each located residual, (n_points,), by the name of its figure.
 
-    NaN for rows that a place does not speak of. They are the values in which the place was found: a window of three
-    readings holds others where a slope is worked out from another estimate of the same sensor.
+    Rows that a place does not cover are NaN. The values are those used when the residual was located: recomputing them
+    (slopes, for instance) from another estimate of the sensor could move a reading across the end of an interval.
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:
@@ -99,7 +99,7 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
 
 
 def category_names(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
-    """Name the values of a covariate that has no scale: scans, directions, orientations; None for all others."""
+    """Return the names of a categorical covariate's values (scans, directions, orientations), else None."""
     match place.covariate:
         case "scan" | "run":
             return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}

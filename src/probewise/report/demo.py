@@ -1,4 +1,4 @@
-"""The page of the main job: the sensor, the search with and without knowing it, a mismatch found and repaired."""
+"""The page of the demo: calibration, a search with each sensor model, and a diagnosis with its repair."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ __all__ = [
     "write_page",
 ]
 
-FIRST = 3  # the paper shows the first three measurements side by side
+FIRST = 3  # as in the paper's figure
 HEADER = (
     "sensor model",
     "readings",
@@ -78,7 +78,7 @@ _SENSOR = (
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """One robot's search: the name of its sensor model, its run, what lay there."""
+    """One robot's search: the name of its sensor model, its run, and the true shape."""
 
     model: str
     run: Exploration
@@ -88,7 +88,7 @@ class Search:
 
     @property
     def largest_error_mm(self) -> float:
-        """Largest absolute error of a parameter in mm."""
+        """Largest absolute error of a parameter, in mm."""
         last = self.run.last
         return max(
             abs(float(mean) - self.truth[name])
@@ -98,18 +98,18 @@ class Search:
 
     @property
     def first_white(self) -> int:
-        """Number of the first reading that saw more white than black: until then it is luck, whatever the model."""
+        """Number of the first reading closer to white than to black: reaching it is luck, whatever the model."""
         middle = sum(self.levels) / 2
         seen = [r.value > middle for r in self.run.readings]
         return seen.index(True) + 1 if any(seen) else len(seen)
 
     def step_at(self, n: int) -> int:
-        """Give the number of the step after `n` readings; a run that has ended stays at its last."""
+        """Return the number of the step after `n` readings, or of the last step if the run ended earlier."""
         return min(n, len(self.run.steps))
 
 
 def answer(searches: Sequence[Search]) -> str:
-    """Say in one sentence what knowing the sensor is worth, from the same first reading on."""
+    """Summarise in one sentence how many readings the SSF model saves, after the same first reading."""
     naive, ssf = (len(s.run.steps) - 1 for s in searches)
     how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
     return (
@@ -119,7 +119,7 @@ def answer(searches: Sequence[Search]) -> str:
 
 
 def equal_start(searches: Sequence[Search]) -> str:
-    """Compare two robots after as many readings as the one that knows its sensor needed."""
+    """Compare both robots after the number of readings that the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
     widest = naive.run.steps[naive.step_at(n) - 1].widest_mm
@@ -132,7 +132,7 @@ def equal_start(searches: Sequence[Search]) -> str:
 def answers(
     started_alike: Sequence[Search], diagnosis: Diagnosis, *, concealed: str, seed: int
 ) -> dict[str, str | int]:
-    """Give what the page says in its first lines, to be quoted elsewhere."""
+    """Return the page's main findings, for other pages to quote."""
     return {
         "seed": seed,
         "search": answer(started_alike),
@@ -163,7 +163,7 @@ def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
 
 
 def comparison_table(searches: Sequence[Search], caption: str = "") -> Markup:
-    """Build the table of the comparison; without a caption of its own it explains its columns."""
+    """Build the comparison table; the default caption explains its columns."""
     return table(
         HEADER,
         comparison_rows(searches),
@@ -190,11 +190,11 @@ def figures(
     Parameters
     ----------
     calibration, recording, prediction
-        The sensor model, what it was made from, what it predicts of that.
+        The sensor model, the recording it was fitted to, and its prediction of that recording.
     searches
-        Of both robots, from nothing.
+        Both robots' searches from an empty field.
     started_alike
-        Of both robots, from the same first reading, each next place chosen by the paper's rule.
+        Both robots' searches from the same first reading, with places chosen by the paper's rule.
     geometry
         Of the arm.
     """
@@ -222,7 +222,7 @@ def figures(
 
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw what the page shows of a diagnosis: PNG by file name."""
+    """Draw the diagnosis figures of the page: PNG by file name."""
     likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
     labels = [h.label.replace("+", " + ") for h in likely]
     recording, before, after = diagnosis.recording, diagnosis.repair.before.readings, diagnosis.repair.after.readings
@@ -239,13 +239,13 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
 
 
 def _at_the_edge(outline_mm: FloatArray) -> tuple[float, float]:
-    """Place on an outline to stand at for a picture."""
+    """Choose a point of an outline at which to draw the arm."""
     x_mm, y_mm = outline_mm[0]
     return float(x_mm), float(y_mm)
 
 
 def _views(searches: Sequence[Search], numbers: Sequence[int]) -> AxesGrid:
-    """Draw the paper's view, a column for each search, after each of these numbers of readings."""
+    """Draw the paper's view after each of these numbers of readings, one column per search."""
     window = window_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
     size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
@@ -288,7 +288,7 @@ def write_page(
     drawn
         From `figures` and `diagnosis_figures`.
     concealed
-        What the world that made the second recording conceals.
+        Effect that the simulated world concealed in the second recording.
     seed, seconds
         Of this run.
     """
@@ -303,7 +303,11 @@ def write_page(
                     (
                         ("seed", str(seed)),
                         ("time", f"{number(seconds, 0)} s"),
-                        ("recordings", "the two that ship with the package, both simulated by an independent world"),
+                        (
+                            "recordings",
+                            "the two that ship with the package, both simulated by a world that shares no code with "
+                            "the models",
+                        ),
                         ("version", f"probewise {calibration.sensor.version}"),
                     )
                 ),
@@ -312,8 +316,8 @@ def write_page(
     ]
     caption = (
         f"{equal_start(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn from the "
-        "posterior. Copper: entropy of the readings that these circles predict; the brighter, the more a reading there "
-        "promises to tell. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
+        "posterior. Copper: entropy of the readings that these circles predict; brighter places promise more "
+        "information. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
         "circle."
     )
     return page(
@@ -375,11 +379,12 @@ def _search_section(
         (
             figure(
                 drawn["first_three.png"],
-                "Both robots start with the same reading on white and go on by the paper's rule, a place of highest "
-                "entropy (paper, figures 2 and 8). With the naive model (left) the circles cut the field into cells "
-                "of even entropy, at most 1 bit. With the SSF model (right) the circles' edges are bright: a reading "
-                "there also says how much of the edge the sensor sees. Their inference is not the paper's: they "
-                "carry samples from reading to reading. The paper's, nested sampling anew after each reading, is "
+                "Both robots start with the same reading on white, then follow the paper's rule: read where the "
+                "entropy is highest (paper, figures 2 and 8). With the naive model (left) the circles cut the field "
+                "into cells of uniform entropy, at most 1 bit. With the SSF model (right) the circles' edges are "
+                "bright: a reading there also measures how much white the sensor sees. The inference differs from the "
+                "paper's: posterior samples are reweighted after each reading. The paper's own, a new nested sampling "
+                "run after each reading, is "
                 "probewise explore --method paper.",
             ),
             comparison_table(started_alike),
@@ -398,10 +403,11 @@ def _search_section(
         "A whole search, step by step",
         (
             paragraph(
-                f"From an empty field it takes luck to meet the circle, whatever the model: the naive robot met it at "
+                f"From an empty field, finding the circle at all takes luck, whatever the model: the naive robot met "
+                f"it at "
                 f"reading {naive.first_white} of {len(naive.run.steps)}, the SSF robot at reading {ssf.first_white} of "
                 f"{len(ssf.run.steps)}. These robots choose by the default rule: the expected information of a reading "
-                "and, near the end, the probability that it ends the run. The colour bar says which one is shown."
+                f"or, near the end, the probability that it ends the run. The colour bar names the one shown."
             ),
             slideshow(
                 list(zip(side_by_side(*frames), texts, strict=True)),
@@ -428,34 +434,35 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
     )
     explanations = Section(
         "What it could be",
-        (figure(drawn["explanations.png"], "Probability of each explanation; all of them together sum to one."),),
+        (figure(drawn["explanations.png"], "Probability of each explanation; they sum to one."),),
     )
     gain = diagnosis.improvement
     repair = [
         figure(
             drawn["scans.png"],
-            "Recorded minus predicted along the scans that the repair changes most: each reading, and means of "
-            "neighbours. Orange: the calibrated model. Blue: the repaired model.",
+            "Residuals (recorded minus predicted) along the scans that the repair changes most: each reading, and "
+            "running means. Orange: the calibrated model. Blue: the repaired model.",
         )
     ]
     if "before_after.png" in drawn:
         caption = (
-            "The held-out scan on which the repair gains most: readings, and both models as fitted to the whole "
-            "recording; below, recorded minus predicted."
+            "The held-out scan on which the repair gains most: readings and both models, fitted to the whole "
+            "recording; "
+            "below, the residuals."
         )
         held = (
-            f"Predicting scans that it was not fitted to, the repaired model gains "
+            f"On scans that were held out of the fit, the repaired model gains "
             f"{number(gain.heldout_log_density_per_reading, 3)} ± {number(gain.heldout_sd, 3)} nats per reading. (A "
             "nat is a unit of log probability: one nat more makes a reading e = 2.7 times as probable.)"
         )
         repair = [figure(drawn["before_after.png"], caption), paragraph(held), *repair]
     link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
-    more = paragraph("Where it shows, what could not be told apart and what to measure next: ", link, ".")
+    more = paragraph("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
     return Section("A mismatch, found and repaired", said, (explanations, Section("The repair", (*repair, more))))
 
 
 def comparison_lines(searches: Sequence[Search]) -> list[str]:
-    """Lay the comparison out as lines of text: a table for the cost of each search, another for its errors."""
+    """Write the comparison as lines of text: a table of each search's cost, another of its errors."""
     rows = [HEADER, *comparison_rows(searches)]
     costs, errors = [row[:-2] for row in rows], [(row[0], *row[-2:]) for row in rows]
     return [

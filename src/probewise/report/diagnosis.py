@@ -1,4 +1,4 @@
-"""The page of a diagnosis: the verdict, the figure that shows it, what to measure next; then the details."""
+"""The page of a diagnosis: the verdict, its main figure, what to measure next; then the details."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import family_words, words_and_unit
+from probewise.report.covariate_view import ResidualNoise, seen_first
 from probewise.report.diagnosis_figures import figures, shown_first
 from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hypothesis_in_words, is_in_words, listed
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.terms import explained, terms_of
-from probewise.report.witness import Chance, seen_first
 from probewise.report.words import count, number, probability, readable, unit_name
 
 __all__ = ["answer", "figures", "sections", "write_page"]
@@ -36,27 +36,27 @@ __all__ = ["answer", "figures", "sections", "write_page"]
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
 _MOST_CREDIBLE = 6
-_LIKELY = 0.05  # of an effect that is spoken of at once
-_CHANCE = 0.05  # p-value above which nobody is surprised
+_LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
+_CHANCE = 0.05  # p-value above which chance is a sufficient explanation
 _TELLS_SOMETHING = 0.5  # nats
-_WEAK = " too weak to be felt so far"
+_WEAK = " too weak to be detected so far"
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
-    "random_walk": "Correlation of residuals, by how many readings they lie apart: that of a walk falls slowly.",
-    "signal_dependent_noise": "How far residuals scatter, by the predicted reading: plain noise scatters evenly.",
-    "outliers": "How many residuals lie how far out, on a logarithmic scale, beside a normal distribution.",
-    "dropouts": "Recorded against predicted readings; lost readings stand at one value, whatever is predicted.",
-    "quantisation": "Where readings lie between two multiples of the rounding step; unrounded ones lie anywhere.",
+    "random_walk": "Correlation of residuals, by how many readings they lie apart: for a random walk it falls slowly.",
+    "signal_dependent_noise": "Scatter of residuals by predicted reading: constant for white noise.",
+    "outliers": "Histogram of residuals on a logarithmic scale, with a normal distribution.",
+    "dropouts": "Recorded against predicted readings; lost readings have one value, whatever is predicted.",
+    "quantisation": "Position of readings between two multiples of the rounding step; unrounded readings lie anywhere.",
 }
 
 
 def answer(diagnosis: Diagnosis) -> str:
-    """Say the verdict in twenty words at most."""
+    """Return the verdict in twenty words at most."""
     return headline(diagnosis)
 
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Build everything below the first screen."""
+    """Build the sections below the first screen."""
     return [
         Section("What it could be", _explanations(diagnosis)),
         Section("Where it shows", _places(diagnosis, drawn)),
@@ -73,7 +73,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
 def write_page(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
-    """Write the whole page; `audit` is that of the readings' design, where there is one."""
+    """Write the whole page; `audit`, if given, is the audit of the recording's plan."""
     run = Section(
         "This run",
         (
@@ -103,18 +103,18 @@ def _first_caption(diagnosis: Diagnosis) -> str:
     shown = shown_first(diagnosis)
     bars = "Below: the possible explanations with their probabilities."
     if shown == "readings":
-        return "The readings in the order taken. Below: prior probabilities; these readings do not change them."
+        return "The readings in the order of time. Below: prior probabilities; these readings do not change them."
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = ", blue squares the repaired model" if diagnosis.repair.changes_predictions else ""
     where = f" {_where(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: the model as calibrated{after}."
-    band = "95 % of such means lie in the grey band by chance alone."
-    return f"Residuals, averaged in steps. {circles} {band}{where} {bars}"
+    band = "By chance alone, 95 % of the means would lie in the grey band."
+    return f"Residuals, averaged in bins. {circles} {band}{where} {bars}"
 
 
 def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Answer, in words that need no statistics: what to do now, what was found, is it real, does the repair help."""
+    """Answer in plain words: what to do next, what was found, whether it is real, whether the repair helps."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(_found(diagnosis)))]
     if diagnosis.report.formula is not None:
@@ -128,7 +128,7 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     if diagnosis.repair.changes_predictions:
         left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
         model = diagnosis.apparatus.words.model
-        only_here = f". What has no name is corrected in these readings alone; {model} does not carry it"
+        only_here = f". The unknown part is corrected in these readings only; {model} does not contain it"
         facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
     if diagnosis.repair.left_open:
         facts.append(("In the repaired model", _shares(diagnosis.repair.left_open, diagnosis.apparatus.words.model)))
@@ -136,7 +136,7 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def _simulator(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Name the simulator, where it is a person's own, and how often it was called."""
+    """Name the user's simulator, if there is one, and how often it was called."""
     if not isinstance(diagnosis.apparatus, PersonsSystem):
         return []
     system = diagnosis.apparatus.system
@@ -148,7 +148,7 @@ def _simulator(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def _formula(formula: Formula) -> str:
-    """Write a formula with its numbers."""
+    """Write a formula with its estimated parameters."""
     numbers = ", ".join(f"{p.name} = {give_or_take(p.mean, p.sd)}" for p in formula.parameters)
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
     held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"
@@ -157,7 +157,7 @@ def _formula(formula: Formula) -> str:
 
 
 def _found(diagnosis: Diagnosis) -> str:
-    """Give the reason without the plan, which is said already, and names without underscores."""
+    """Return the reason without the plan, which the page gives elsewhere, and with names in words."""
     said = diagnosis.reason.partition("; to tell: ")[0]
     names = "|".join(EFFECTS_IN_WORDS)
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
@@ -166,7 +166,7 @@ def _found(diagnosis: Diagnosis) -> str:
 def _predicts(nats: float, sd: float) -> str:
     measured = f"{_signed_nats(nats, sd)} per held-out reading"
     if nats > 2 * sd:
-        return f"Yes: each is {math.exp(min(nats, 50.0)):.3g} times as probable as before ({measured})."
+        return f"Yes: each reading is {math.exp(min(nats, 50.0)):.3g} times as probable as before ({measured})."
     return f"{'No better than before' if nats > -2 * sd else 'Worse than before'}: {measured}."
 
 
@@ -180,7 +180,7 @@ def _shares(shares: Mapping[tuple[str, ...], float], model: str) -> str:
         f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
         for names, share in shares.items()
     )
-    return f"Samples in {model} hold: {', '.join(held)}."
+    return f"Posterior samples in {model} contain: {', '.join(held)}."
 
 
 def _chance(diagnosis: Diagnosis) -> str:
@@ -192,10 +192,10 @@ def _chance(diagnosis: Diagnosis) -> str:
     else:
         often = f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})"
     if diagnosis.verdict == "noise":
-        gained = f"its evidence over plain noise is {diagnosis.improvement.log_evidence:.0f} nats"
-        said = f"The noise model, hardly: {gained}. In the mean nothing stands out: {often}."
+        gained = f"its log evidence over white noise is {diagnosis.improvement.log_evidence:.0f} nats"
+        said = f"For the noise model, hardly: {gained}. The mean shows nothing significant: {often}."
     elif diagnosis.verdict == "unknown" and p_value > _CHANCE:
-        said = f"In the mean, yes: {often}. But chance does not put so many outlying readings together."
+        said = f"For the mean, yes: {often}. But chance would not put so many outlying readings together."
     else:
         said = f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
     return readable(said)
@@ -207,23 +207,24 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
         cure = diagnosis.apparatus.words.find_signal
         return f"{cure[:1].upper()}{cure[1:]}, and take more readings."
     if plan is None:
-        return "Nothing that this apparatus can do would tell more."
+        return "No measurement that this apparatus can take would tell more."
     told = plan.expected_log_bayes_factor
     asked = f"{count(len(plan.plan), 'reading')}, about {count(max(round(plan.minutes), 1), 'minute')}"
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
     if told < _TELLS_SOMETHING:
         return (
-            f"Nothing that is worth the time: of all plans of up to {MOST_READINGS} readings the best is expected to "
-            f"tell {number(told, 1)} nats. It is in {file}, if you want it: {description} ({asked})."
+            f"Nothing that is worth the time: the best plan of up to {MOST_READINGS} readings has an expected log "
+            f"Bayes "
+            f"factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
     *others, last = map(_plain, plan.between)
-    rivals = f"{others[0]} from {last}" if len(others) == 1 else f"apart {', '.join(others)} and {last}"
-    return f"{said[:1].upper()}{said[1:]} Expected to tell {rivals}, by {number(told, 1)} nats."
+    rivals = f"{others[0]} from {last}" if len(others) == 1 else f"{', '.join(others)} and {last}"
+    return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number(told, 1)} nats."
 
 
 def _plain(label: str) -> str:
-    """Name a rival of a plan in words, where it goes by names of effects; it may be a phrase already."""
+    """Write a rival hypothesis of a plan in words; a label that holds no effect names is a phrase already."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
     said = listed(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
@@ -255,7 +256,7 @@ def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _effects_of(label: str) -> tuple[str, ...]:
-    """Take a label of the credible set apart."""
+    """Split a label of the credible set into effects."""
     return () if label == "clean" else tuple(label.split("+"))
 
 
@@ -267,12 +268,12 @@ def _credible(names: Sequence[str]) -> tuple[Markup, ...]:
 
 
 def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """Say what something unknown may be, where it may be there at all."""
+    """List the candidates for an unknown effect, if one is likely."""
     likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
     said = ", ".join(f"{_candidate(name)} ({probability(p)})" for name, p in likely)
-    return (paragraph(f"What is unknown may depend on, or be: {said}."),)
+    return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {said}."),)
 
 
 def _candidate(name: str) -> str:
@@ -280,7 +281,7 @@ def _candidate(name: str) -> str:
 
 
 def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """Say what the repaired sensor carries that no explanation above does."""
+    """List corrections in the repaired sensor that are in none of the explanations above."""
     return tuple(
         paragraph(_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.carried
@@ -288,7 +289,7 @@ def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """Set both evidences of what was weighed twice side by side."""
+    """Tabulate the explanations whose evidence was computed twice: by Laplace and by nested sampling."""
     if not diagnosis.report.weighings:
         return ()
     return (
@@ -310,17 +311,17 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    """Show what the headline names and what is seen first, the rest folded away."""
+    """Show where the residuals are significant; all but the first few figures are folded away."""
     if not diagnosis.where:
-        return (paragraph("Nothing stands out more than noise explains."),)
+        return (paragraph("No residual is larger than noise explains."),)
     shown = [
         figure(drawn[place.witness], _where(diagnosis, place, seen=seen))
-        for place, seen in seen_first(diagnosis, Chance.of(diagnosis))
+        for place, seen in seen_first(diagnosis, ResidualNoise.of(diagnosis))
     ]
     opening = paragraph(
-        "Residuals of the calibrated model against each covariate in which they stand out. First comes what the "
-        "headline names, then what is seen best. Each dot is a reading; 95 % of the means lie in the grey band by "
-        "chance alone."
+        "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
+        "first, then the most visible. Each dot is a reading; by chance alone, 95 % of the means would lie in the grey "
+        "band."
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
     more = (element("details", element("summary", f"{len(rest)} more"), *rest),) if rest else ()
@@ -336,7 +337,7 @@ def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
             drawn["before_after.svg"],
             f"{which}: readings (black) and predictions ({colours}), and below the residuals with their running means.",
         ),
-        figure(drawn["residuals.svg"], "All residuals in time and by predicted reading, with running means."),
+        figure(drawn["residuals.svg"], "All residuals against time and against predicted reading, with running means."),
     )
 
 
@@ -347,8 +348,8 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
             figure(
                 drawn["gain.svg"],
                 f"Gain in log predictive density of each held-out {diagnosis.apparatus.words.run}, both models fitted "
-                "to the others: blue where "
-                "the repaired model predicts better, orange where worse. Grey: mean of all, with standard error.",
+                "to the others: blue where the repaired model predicts better, orange where worse. Grey: mean over "
+                "all, with standard error.",
             ),
         )
         if "gain.svg" in drawn
@@ -367,7 +368,7 @@ def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...
                     if diagnosis.repair.changes_predictions
                     else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)
                 ),
-                ("test that nothing more is missing", readable(p_in_words(gain.p_value_after))),
+                ("test for further missing effects", readable(p_in_words(gain.p_value_after))),
             )
         ),
     )
@@ -392,9 +393,8 @@ def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ..
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
         figure(
             drawn["noise.svg"],
-            "Residuals after the repair, if any. Above: correlation within "
-            f"{diagnosis.apparatus.words.run}s by the number of readings between. "
-            "Middle: scatter by predicted reading. Below: how many lie how far out, on a logarithmic scale.",
+            "Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
+            "Middle: scatter by predicted reading. Below: histogram on a logarithmic scale.",
         ),
     )
 
@@ -424,13 +424,13 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
 
 
 def _with_name(name: str) -> str:
-    """Name an effect in words and as diagnosis.json does."""
+    """Name an effect in words, with its name in diagnosis.json."""
     said = effect_in_words(name)
     return f"{said} ({name})" if said != name else name
 
 
 def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
-    """Write a parameter with its sd, with its unit where asked, and its interval."""
+    """Write a parameter with its sd (and unit, if asked), and its interval."""
     low, high = found.interval95
     own = _unit(found) if unit else ""
     return readable(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), readable(f"{low:.4g} to {high:.4g}")
@@ -441,11 +441,11 @@ def _unit(found: ParameterFound) -> str:
 
 
 def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """List pairs that look alike, those among the credible explanations first and the rest folded away."""
+    """List the aliased pairs: those among the credible explanations first, the others folded away."""
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
-        return (paragraph("None: each effect that could show here changes these readings in a way of its own."),)
+        return (paragraph("None: these readings can tell all effects apart that they can detect."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
     if not rest:
         return (_alias_table(first),)
@@ -469,7 +469,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
 
 
 def _readings(n: int) -> str:
-    """Write how many readings would settle something; more than a plan may have are not counted."""
+    """Write the number of readings that would separate a pair, up to the largest plan."""
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 
@@ -491,7 +491,7 @@ def _design(audit: PlanAudit) -> tuple[Markup, ...]:
             )
         ),
         element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),
-        paragraph("What readings would cure this, before any are taken: probewise audit PLAN.csv."),
+        paragraph("probewise audit PLAN.csv lists the readings that would help, before any are taken."),
     )
 
 
@@ -500,7 +500,7 @@ def _sentence(text: str) -> str:
 
 
 def _where(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
-    """Say where the residuals stand out, and whether it is seen in their means."""
+    """Describe where residuals are significant, and whether their means leave the band."""
     run = diagnosis.apparatus.words.run
     covariate, unit = words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:
@@ -513,6 +513,6 @@ def _where(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
         what = f"{covariate}, {ends} {unit}".rstrip()
     if place.scan and place.covariate != run:
         what += f", {run} {place.scan}"
-    chance = "" if place.p_value < ALARM else ", which may be chance"
-    hidden = "" if seen else " No mean leaves the band: what changes its sign, or scatters, leaves none."
-    return readable(f"What stands out: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")
+    chance = "" if place.p_value < ALARM else ", possibly chance"
+    hidden = "" if seen else " No mean leaves the band: residuals that change sign, or only scatter, average to zero."
+    return readable(f"Significant residuals: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")

@@ -1,4 +1,4 @@
-"""The figures of a diagnosis: SVG by file name, each witness under the name that the JSON gives it."""
+"""The figures of a diagnosis: SVG by file name; diagnosis.json refers to them by these names."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.recordings import Plan
 from probewise.report.covariate import covariate_values, label_of
+from probewise.report.covariate_view import CovariateView, ResidualNoise, along_scan, is_line, of_place, telling
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
     correlation_of_neighbours,
@@ -28,7 +29,6 @@ from probewise.report.plots import (
     tails,
 )
 from probewise.report.plots.residuals import AFTER, BEFORE
-from probewise.report.witness import Chance, Witness, along_scan, is_line, of_place, telling
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
@@ -36,12 +36,12 @@ __all__ = ["changed_most", "figures", "shown_first"]
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
-_LOST = 5.0  # sds from the prediction at which a reading of the lost ones' value is one of them
+_LOST = 5.0  # sds from the prediction beyond which a reading at the lost readings' value counts as lost
 
 
 def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw all figures: the first screen's, before and after, the noise, the held-out gain, a witness of each place."""
-    chance, values = Chance.of(diagnosis), covariate_values(diagnosis)
+    """Draw all figures: the first screen, before and after, noise, held-out gain, and one for each located residual."""
+    chance, values = ResidualNoise.of(diagnosis), covariate_values(diagnosis)
     drawn = {
         "first.svg": _first(diagnosis, chance),
         "before_after.svg": _before_and_after(diagnosis),
@@ -63,18 +63,18 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     return drawn
 
 
-def shown_first(diagnosis: Diagnosis, chance: Chance | None = None) -> Witness | str:
-    """Say what the first figure shows: residuals along a witness, or of the noise the effect that is named."""
+def shown_first(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:
+    """Choose the content of the first figure: residuals along a covariate, or the noise effect that is named."""
     if diagnosis.judged.too_little:
         return "readings"
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
         return max(diagnosis.combination, key=lambda name: sizes.get(name, 0.0))
-    return telling(diagnosis, Chance.of(diagnosis) if chance is None else chance)
+    return telling(diagnosis, ResidualNoise.of(diagnosis) if chance is None else chance)
 
 
-def _first(diagnosis: Diagnosis, chance: Chance) -> bytes:
-    """Draw what shows the verdict, and below it every explanation with its probability."""
+def _first(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+    """Draw the evidence for the verdict and, below it, every explanation with its probability."""
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names = [hypothesis_in_words(h.effects) for h in listed]
     n_bars = min(len(listed), _MOST_BARS) + (len(diagnosis.hypotheses) > min(len(listed), _MOST_BARS))
@@ -86,7 +86,7 @@ def _first(diagnosis: Diagnosis, chance: Chance) -> bytes:
         _noise_panel(diagnosis, chance, shown)(above)
     else:
         _along(diagnosis, chance, shown, after=True, each=False, ax=above)
-    # All are passed on, for the last bar sums up those that are not drawn.
+    # All are passed on: the last bar adds up those that are not drawn.
     rest = [h.probability for h in diagnosis.hypotheses[len(listed) :]]
     hypothesis_probabilities(
         [*names, *("" for _ in rest)],
@@ -97,10 +97,10 @@ def _first(diagnosis: Diagnosis, chance: Chance) -> bytes:
     return svg(above)
 
 
-def _witness(diagnosis: Diagnosis, chance: Chance, place: Place, at: FloatArray) -> bytes:
-    """Draw the calibrated model's residuals against a place's covariate: each reading, means, band of chance.
+def _witness(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
+    """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
-    A scan is drawn along its way first, then among the others: a residual that changes its sign leaves no mean.
+    A scan is drawn along its path first, then among the other scans: residuals that change sign average to zero.
     """
     by_covariate = of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
@@ -112,7 +112,9 @@ def _witness(diagnosis: Diagnosis, chance: Chance, place: Place, at: FloatArray)
     return svg(axes)
 
 
-def _along(diagnosis: Diagnosis, chance: Chance, witness: Witness, *, after: bool, each: bool, ax: Axes) -> Axes:
+def _along(
+    diagnosis: Diagnosis, chance: ResidualNoise, witness: CovariateView, *, after: bool, each: bool, ax: Axes
+) -> Axes:
     names = witness.shown_names
     at = witness.at if names is None else _side_by_side(witness.at)
     return mean_residuals_along(
@@ -127,7 +129,7 @@ def _along(diagnosis: Diagnosis, chance: Chance, witness: Witness, *, after: boo
 
 
 def _side_by_side(at: FloatArray) -> FloatArray:
-    """Spread the rows of each value evenly over its place, in the order they were taken, (n_points,)."""
+    """Spread the rows of each categorical value evenly about its position, in order of time, (n_points,)."""
     out = np.full(at.shape, np.nan)
     for k, value in enumerate(np.unique(at[np.isfinite(at)])):
         rows = np.flatnonzero(at == value)
@@ -136,7 +138,7 @@ def _side_by_side(at: FloatArray) -> FloatArray:
 
 
 def _before_and_after(diagnosis: Diagnosis) -> bytes:
-    """Draw the scan along a line that the repair changes most, or the longest: readings, models, residuals of each."""
+    """Draw the line scan that the repair changes most (or the longest): readings, both models, residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
     rows = changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
     shown = along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
@@ -149,9 +151,9 @@ def _before_and_after(diagnosis: Diagnosis) -> bytes:
 
 
 def changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
-    """Choose the scan along a line whose readings change most in all, the longest where none do; any if none is a line.
+    """Choose the line scan with the largest total change; the longest if none changes; any scan if none is a line.
 
-    `change` is that of each reading, (n_points,).
+    `change` is the change of each predicted reading, (n_points,).
     """
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
     lines = [rows for rows in scans if is_line(plan, rows)]
@@ -159,7 +161,7 @@ def changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
 
 
 def _residuals(diagnosis: Diagnosis) -> bytes:
-    """Draw all residuals in time and by predicted reading, before and after."""
+    """Draw all residuals against time and predicted reading, before and after the repair."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
     models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
@@ -172,20 +174,20 @@ def _residuals(diagnosis: Diagnosis) -> bytes:
     )
 
 
-def _noise(diagnosis: Diagnosis, chance: Chance) -> bytes:
-    """Draw what the noise model was tested on: neighbours, spread by level, tails."""
+def _noise(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+    """Draw the tests of the noise model: autocorrelation, spread by level, tails."""
     axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):
         _noise_panel(diagnosis, chance, name)(ax)
     return svg(axes)
 
 
-def _noise_panel(diagnosis: Diagnosis, chance: Chance, name: str) -> Callable[[Axes], Axes]:
-    """Choose the panel that shows an effect on the noise; the spread by level where it has none of its own."""
+def _noise_panel(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
+    """Choose the panel that shows a noise effect; spread by level by default."""
     recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
     unit = unit_name(recording.plan.instrumentation.unit)
     found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
-    if "share" in found and "value" in found:  # lost readings say nothing of the others' noise
+    if "share" in found and "value" in found:  # lost readings carry no information on the noise of the others
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * float(chance.sd.mean()))
         lost &= np.abs(residuals) > _LOST * float(chance.sd.mean())
         residuals[lost] = np.nan

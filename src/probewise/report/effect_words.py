@@ -1,4 +1,4 @@
-"""Effects and hypotheses as a headline names them: in words that need no vocabulary."""
+"""Names of effects and hypotheses for headlines, in plain words."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
         "slow_sinking": "a sensor that slowly rises or sinks",
     }
 )
-"""A noun phrase for each effect, to stand behind "the model leaves out"."""
+"""A noun phrase for each effect, to follow "the model leaves out"."""
 
 
 FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
@@ -92,17 +92,17 @@ FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
         "limit": "a bound of {0}",
     }
 )
-"""A noun phrase for each effect on a person's simulator, with its targets."""
+"""A noun phrase for each effect on a user's simulator, with placeholders for its targets."""
 
 
 def is_in_words(name: str) -> bool:
-    """Tell whether an effect has a name in words."""
+    """Return whether an effect has a name in words."""
     kind = public_name(name).partition(":")[0]
     return name in EFFECTS_IN_WORDS or kind in FORMS_IN_WORDS or name.startswith(PROPOSAL)
 
 
 def effect_in_words(name: str) -> str:
-    """Name an effect; one of a user's own goes by its own name."""
+    """Name an effect in words; a user's own effect keeps its name."""
     kind, *targets = public_name(name).split(":")
     if name.startswith(PROPOSAL):
         return f"a term {targets[-1]} in {'the rate of ' if targets[0] == 'rate' else ''}{targets[1]}"
@@ -112,7 +112,7 @@ def effect_in_words(name: str) -> str:
 
 
 def hypothesis_in_words(effects: Sequence[str]) -> str:
-    """Name a hypothesis: a set of effects, () for clean, ("unknown",) for what has no name."""
+    """Name a hypothesis: a set of effects, () for clean, ("unknown",) for an effect out of vocabulary."""
     if not effects:
         return "nothing is missing"
     return "something without a name" if tuple(effects) == ("unknown",) else listed(map(effect_in_words, effects))

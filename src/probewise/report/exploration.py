@@ -1,4 +1,4 @@
-"""The page of an autonomous run: what the robot found, and its view at every step."""
+"""The page of an autonomous run: the shape found, and the robot's view at every step."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 MODEL_NAMES = {"ssf": "SSF"}
-_LEAST_SHOWN = 1e-3  # probability of what the sensor model may leave out, in the table
+_LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
 _MOST_SHOWN = 6
 
 
@@ -55,15 +55,15 @@ def view(
     Parameters
     ----------
     step, experiment
-        What is believed, of which shape.
+        Posterior after the step, and the experiment it belongs to.
     readings
         x_mm, y_mm and value of the readings up to this step.
     levels
         Readings over black and white.
     truth_mm
-        Outline of what lies there, shape (n_vertices, 2), where it is known.
+        Outline of the true shape, (n_vertices, 2), where known.
     title
-        Title; the number of readings without.
+        Title; by default the number of readings.
     ax
         Axes to draw on; a new figure without.
     """
@@ -94,7 +94,7 @@ def frame(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the picture of one step, with its key, as a PNG."""
+    """Draw the picture of one step, with its legend, as a PNG."""
     ax = view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
     explain_field(ax)
     return png(ax, dpi=90, tight=False)
@@ -107,7 +107,7 @@ def frame_of_both(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw what several sensor models make of the same readings, one below the other (the paper's panels) as a PNG.
+    """Draw the posteriors of several sensor models from the same readings, one below the other, as a PNG.
 
     Each view is a title, a step and the experiment it belongs to; the rest is as in `view`.
     """
@@ -120,9 +120,9 @@ def frame_of_both(
 
 
 def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0) -> str:
-    """Write the page that shows a run while it works: it loads itself anew every second until the run is over.
+    """Write the page that shows a running exploration: it reloads every second until the run ends.
 
-    Where the sensor is trusted less than wholly, beliefs about it follow the picture, of the `earlier` steps too.
+    Where `trust` in the sensor is below 1, the probabilities of sensor faults after every step follow the picture.
     """
     state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
@@ -133,11 +133,11 @@ def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust
 
 
 def _doubt(steps: Sequence[Step], trust: float) -> Section:
-    """Show what the robot believes about its sensor after each reading, and say it of the last."""
+    """Show the probabilities of the sensor's possible faults after each reading."""
     doubted = left_out_of(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
     changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
-    dashed = " A dashed line: another became the most probable." if changed else ""
+    dashed = " A dashed line marks a change of the most probable one." if changed else ""
     named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN]
     return Section(
         "What the sensor model leaves out",
@@ -145,7 +145,7 @@ def _doubt(steps: Sequence[Step], trust: float) -> Section:
             paragraph(doubted.sentence),
             figure(
                 png(belief_in_the_sensor(beliefs)),
-                f"What the robot believes about its sensor after each reading.{dashed}",
+                f"Probabilities of the sensor's possible faults after each reading.{dashed}",
             ),
             table(
                 ("left out", "probability"),
@@ -166,18 +166,18 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
 
 
 def answer(run: Exploration) -> str:
-    """Say in one sentence what was found."""
+    """Summarise the result in one sentence."""
     found = found_shape(run)
     several = f" (probability {probability(found.probability)})" if run.last.shapes else ""
     known = ", ".join(f"{without_unit(p.name)} {with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters)
     if not run.reached:
         taken = count(len(run.steps), "reading")
-        return f"Not found to the precision asked for in {taken}; so far {_a(found.name)}{several} with {known}."
+        return f"Not found to the target precision in {taken}; so far {_a(found.name)}{several} with {known}."
     return f"Found in {count(len(run.steps), 'reading')}: {_a(found.name)}{several} with {known}."
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
-    """Build the table of the shape's parameters with their errors, and beside them the truth where it is known."""
+    """Build the table of the shape's parameters with their sds, and the truth where known."""
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm is not None else ()
@@ -238,7 +238,7 @@ def write_page(
     seed, model
         Seed of the run and name of the sensor model.
     truth
-        Parameters of what lay there, by name, where it is known.
+        Parameters of the true shape by name, where known.
     beside
         What other sensor models made of the same readings, step by step, by name of the model.
     unit
@@ -256,7 +256,7 @@ def write_page(
         ("cost", spent),
         ("information", gained),
         ("the paper's count", f"{number(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"),
-        (f"chance that a length is off by over {OFF_MM:g} mm", off),
+        (f"probability that a length is off by over {OFF_MM:g} mm", off),
         ("fit of the best hypothesis", _fit(run.last.p_value)),
         ("seed", str(seed)),
     ]
@@ -290,7 +290,7 @@ def write_page(
                             target_mm=run.experiment.stop_sd_mm,
                         )
                     ),
-                    "Widest posterior sd of a length after each reading; dashed: the precision asked for.",
+                    "Widest posterior sd of a length after each reading; dashed: the target precision.",
                 ),
                 figure(
                     png(information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()})),
@@ -308,23 +308,23 @@ def write_page(
         ),
     ]
     caption = (
-        "The robot's view of the field after the last reading: the lighter a place, the more a reading there tells."
+        "The robot's view of the field after the last reading: at lighter places, a reading carries more information."
     )
     if beside:
         caption += (
-            f" The {said[model]} chose the readings; the other panel shows what the other model makes of them, and "
-            "where it would read next."
+            f" The {said[model]} chose the readings; the other panel shows the other model's posterior from the same "
+            f"readings, and where it would read next."
         )
     return page("The robot's search", answer=answer(run), key_figure=figure(frames[-1], caption), sections=sections)
 
 
 def _fit(p_value: float) -> str:
-    """Write the p-value of the fit with what it means."""
-    return f"p = {p_value:.2g}: if it is right, {100 * p_value:.0f} of 100 runs fit it no better"
+    """Write the p-value of the fit with its meaning."""
+    return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
 
 
 def _own(step: Step, name: str) -> str:
-    """Leave out the shape before the name of its parameter."""
+    """Drop the shape's name in front of a parameter name."""
     return name.removeprefix(f"{step.likely_shape}.")
 
 

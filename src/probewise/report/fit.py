@@ -1,4 +1,4 @@
-"""The page of a fit: predicted against recorded, the posterior, the evidence, what is left."""
+"""The page of a fit: predicted against recorded, posterior, evidence, residuals."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from probewise.systems import RunTable
 __all__ = ["answer", "figures", "write_page"]
 
 _MOST_COLUMNS = 6
-_LEAST_VALUES = 8  # of a column, for a running mean along it
+_LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 
 def answer(fit: SystemFit) -> str:
-    """Say in one sentence how well the simulator fits."""
+    """Summarise in one sentence how well the simulator fits."""
     unit = unit_name(fit.recording.plan.instrumentation.unit)
     n = int(fit.recording.usable.sum())
     return f"The simulator fits {n} readings with residuals of {fit.rms:.3g} {unit} (rms)."
 
 
 def figures(fit: SystemFit) -> dict[str, bytes]:
-    """Draw predicted against recorded, and the residuals along time, level and every column that varies."""
+    """Draw predicted against recorded, and residuals against time, level and every column that varies."""
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
     drawn = svg(predicted_and_recorded(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
@@ -72,7 +72,7 @@ def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
                 "Residuals",
                 (
                     figure(drawn["residuals.svg"], "Recorded minus predicted reading, with running means."),
-                    paragraph("What stands out in them, and which physics would explain it: probewise diagnose."),
+                    paragraph("probewise diagnose tests them and names the physics that would explain them."),
                 ),
             ),
             Section("This run", (definition_list(run), *(paragraph(f"Note: {note}.") for note in fit.recording.notes))),

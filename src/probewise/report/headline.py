@@ -1,4 +1,4 @@
-"""The verdict in twenty words at most, for somebody who is not of the field."""
+"""The verdict in twenty words at most, for a reader from outside the field."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ __all__ = ["MOST_WORDS", "headline"]
 
 MOST_WORDS = 20
 _SURE = 0.5
-_RIVAL = 0.1  # probability from which a hypothesis is spoken of as a rival
+_RIVAL = 0.1  # probability from which a hypothesis is named as a rival
 _MOST_RIVALS = 3
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Say the verdict: the first of what could be said, the fullest first, that is short enough."""
+    """Return the verdict in words: the most complete version that is short enough."""
     return next(said for said in _sayings(diagnosis) if len(said.split()) <= MOST_WORDS)
 
 
 def _sayings(diagnosis: Diagnosis) -> list[str]:
-    """List what could be said, the fullest first; the last is short whatever the diagnosis holds."""
+    """List versions of the verdict, the most complete first; the last is always short enough."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.judged.too_little:
         return [_too_little(diagnosis, n)]
@@ -40,7 +40,7 @@ def _sayings(diagnosis: Diagnosis) -> list[str]:
         case "cannot_tell":
             return _undecided(diagnosis)
         case "noise":
-            return _left_out(diagnosis, "The predicted mean is right, but the noise is not plain:")
+            return _left_out(diagnosis, "The predicted mean is right, but the noise is not white:")
         case "named":
             more = ["Something more is missing."] if diagnosis.improvement.p_value_after < ALARM else []
             said = _left_out(diagnosis, "The model leaves out")
@@ -76,9 +76,9 @@ def _unknown(diagnosis: Diagnosis) -> list[str]:
     if top in UNNAMED:
         said = [f"{plain}; it looks most like {effect_in_words(top)}."]
     elif top.endswith(", far out"):
-        said = [f"Outlying readings lie together by {covariate}: something without a name is missing there."]
+        said = [f"Outlying readings cluster in {covariate}: something is missing there that no known effect explains."]
     else:
-        said = [f"{plain}; it varies most with the {covariate}."] if top else []
+        said = [f"{plain}; it depends most on the {covariate}."] if top else []
     return [*said, f"{plain}.", f"{short}."]
 
 
@@ -98,7 +98,7 @@ def _undecided(diagnosis: Diagnosis) -> list[str]:
 
 
 def _either(rivals: Sequence[tuple[str, ...]]) -> str:
-    """Join hypotheses by what they do not have in common."""
+    """Join hypotheses by the effects in which they differ."""
     shared = frozenset.intersection(*map(frozenset, rivals))
     *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)
     return f"{', '.join(others)} or {last}" if others else last

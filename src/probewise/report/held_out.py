@@ -12,7 +12,7 @@ __all__ = ["most_gained"]
 
 
 def most_gained(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
-    """Find the held-out part with the largest gain: its name, the gain in nats per reading, its rows, (n_rows,).
+    """Return the held-out part with the largest gain: name, gain in nats per reading, row numbers, (n_rows,).
 
     None where nothing was repaired, or nothing could be held out.
     """

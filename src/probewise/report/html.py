@@ -1,4 +1,4 @@
-"""Self-contained pages: escaped elements, embedded figures, one style sheet, nothing from outside."""
+"""Self-contained HTML pages: escaped elements, embedded figures, one style sheet, no external files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Section:
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
-    """Build one element; of an attribute's name a trailing underscore is dropped (`class_`), others are hyphens."""
+    """Build one element; attribute names lose a trailing underscore (`class_`), other underscores become hyphens."""
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
     )
@@ -62,7 +62,7 @@ def paragraph(*children: str, class_: str = "") -> Markup:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "") -> Markup:
-    """Build a table; cells that look like numbers are set in figures of one width.
+    """Build a table; numeric cells use digits of equal width.
 
     On a narrow screen a table of more than three columns is shown row by row, each cell under its heading.
     """
@@ -87,7 +87,7 @@ def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
 
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
-    """Embed a PNG or an SVG; the caption is the text for those who cannot see it unless `alt` is given."""
+    """Embed a PNG or an SVG; `alt`, by default the caption, is its alternative text."""
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
     size = "" if kind == "svg+xml" else _least_width(image)
@@ -96,14 +96,14 @@ def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
 
 
 def _least_width(png: bytes) -> str:
-    """Say how wide a PNG must be shown at least for its type to be read: nine tenths of what it was drawn for."""
+    """Return the least width at which a PNG's type is legible: nine tenths of the width it was drawn for."""
     with Image.open(io.BytesIO(png)) as picture:
         dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
         return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
-    """Embed pictures of which a slider shows one; without scripts the last one is shown.
+    """Embed pictures with a slider that selects one; without scripts the last one is shown.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def _section(section: Section, number: str, level: int) -> Markup:
 
 
 def _contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
-    """List the sections and their parts, with links, where they are many."""
+    """Build a table of contents with links, where there are many sections."""
     if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
         return ()
     entries = (_entry(s, str(k)) for k, s in enumerate(sections, start=1))
@@ -183,7 +183,7 @@ def _address(number: str) -> str:
     return f"part-{number.replace('.', '-')}"
 
 
-# The slider is hidden until this has run: where scripts are off the last slide stands alone.
+# The slider is hidden until this has run: without scripts only the last slide is shown.
 _SLIDER = """
 for (const show of document.querySelectorAll("div.slideshow")) {
   const slides = show.querySelectorAll("div.slide"), label = show.querySelector("label");

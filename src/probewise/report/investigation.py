@@ -1,4 +1,4 @@
-"""The page of an investigation: what was thought after each round, why the next readings were taken, what came out."""
+"""The page of an investigation: the diagnosis after each round, the reason for the next readings, the result."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def believed(found: Investigation) -> Markup:
     """Draw the probability of each explanation after each round."""
     return figure(
         png(beliefs_by_round({_title(each): _beliefs(each) for each in found.rounds})),
-        "What was believed after each round: the probability of each explanation, given all readings so far.",
+        "Probability of each explanation after each round, given all readings so far.",
     )
 
 
 def answer(found: Investigation) -> str:
-    """Say what came out, and after how many readings."""
+    """Return the verdict and the number of readings it took."""
     extra = found.extra_readings
     taken = f"{count(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
     came = "settled it" if found.last.settled else "did not settle it"
@@ -52,13 +52,13 @@ def write_page(
     found
         All rounds.
     drawn
-        The figures of the last diagnosis, by file name.
+        Figures of the last diagnosis, by file name.
     source
-        Where the readings came from, in words.
+        Source of the readings, in words.
     seed
         Of the run.
     concealed
-        What a simulated world concealed, told at the end; None for a real arm.
+        Effect that a simulated world concealed, stated at the end; None for a real arm.
     """
     last = found.last
     bars = believed(found)
@@ -99,25 +99,23 @@ def _beliefs(each: Round) -> dict[str, float]:
 
 
 def _told(each: Round) -> Section:
-    """Tell one round: what was read and why, what was believed then, what follows."""
+    """Describe one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
-    why = "as the first plan has them" if each.number == 1 else f"as was asked for: {each.asked}"
+    why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.asked}"
     likely = [(name, p) for name, p in _beliefs(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
     asked = diagnosis.next_measurement
     between = (
         "" if asked is None or len(asked.between) < 2 else f", which tell {asked.between[0]} from {asked.between[1]}"
     )
     if each.stop_reason is not None:
-        then = f"Here it ends: {each.stop_reason}."
+        then = f"The investigation ends: {each.stop_reason}."
     elif asked is None:
         then = ""
     else:
-        then = f"So the next readings are: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
+        then = f"Next readings: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
     said: tuple[Markup, ...] = (
         paragraph(readable(f"{count(len(each.recording), 'reading').capitalize()} were taken, {why}.")),
-        paragraph(
-            readable(f"All readings so far: {p_in_words(diagnosis.p_value)} that nothing is missing from the mean.")
-        ),
+        paragraph(readable(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}.")),
         table(("explanation", "probability"), ((name, probability(p)) for name, p in likely)),
         paragraph(readable(then)),
     )

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: a line of text, a picture, a table where it helps."""
+"""Notebook representations of results: a line of text, a picture, sometimes a table."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _(value: Prediction) -> str:
 def _(value: PlanAudit) -> str:
     drawn = png(audit_report.picture(value), dpi=DPI)
     text = _text(value.summary())
-    return _card(paragraph(audit_report.answer(value)), figure(drawn, "What the plan sees and tells apart"), text)
+    return _card(paragraph(audit_report.answer(value)), figure(drawn, "Detectability of effects, and aliases"), text)
 
 
 @render_html.register

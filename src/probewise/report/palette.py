@@ -1,4 +1,4 @@
-"""The colours of all figures: Okabe and Ito's, told apart with any common colour vision."""
+"""The colours of all figures: Okabe and Ito's palette, distinct for the colour-blind."""
 
 from __future__ import annotations
 

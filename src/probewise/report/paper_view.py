@@ -1,4 +1,4 @@
-"""The paper's picture of the robot's mind: the entropy map of the circles that are drawn on it."""
+"""The paper's figure of a search: the entropy map of the sampled circles, with the circles drawn on it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from probewise.scene import outlines
 
 __all__ = ["fine_map", "paper_view", "window_mm"]
 
-_FINER = 2  # times as many places a side as the robot looks at: an edge is narrower than its grid
+_FINER = 2  # times as many places per side as the robot's grid, which is coarser than an edge is wide
 _MARGIN_MM = 30.0
 _OUTLINE = 0.45
 
 
 def fine_map(run: Exploration, number: int) -> UtilityMap:
-    """Value every place of a grid twice as fine by the circles drawn after a reading (paper, figures 2 and 8).
+    """Compute the entropy map of the circles sampled after a reading, on a grid twice as fine (paper, figures 2 and 8).
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def paper_view(
     title: str = "",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw what the robot thinks after a reading, as the paper does: cells of even entropy, or bright edges.
+    """Draw the entropy map after a reading as the paper does: cells of uniform entropy, or bright edges.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ def paper_view(
     levels
         Readings over black and white.
     truth_mm
-        Outline of what lies there, (n_vertices, 2).
+        Outline of the true shape, (n_vertices, 2).
     window_mm
-        Part of the field that is shown: left, right, lower and upper end.
+        Limits of the part shown: left, right, lower, upper.
     title
-        Title; the number of readings without.
+        Title; by default the number of readings.
     ax
         Axes to draw on; a new figure without.
     """
@@ -90,7 +90,7 @@ def paper_view(
 
 
 def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
-    """Part of the field that holds every circle drawn after the first few readings, and every reading.
+    """Return the limits of a window that holds all readings and all circles sampled after the first few readings.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, fl
 
 
 def _nearest(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:
-    """Reach at the places of a finer grid: that of the nearest place of the robot's own, (n_places,)."""
+    """Interpolate reachability to the finer grid from the nearest place of the robot's grid, (n_places,)."""
     rows = np.rint(np.linspace(0, coarse.n_y - 1, fine.n_y)).astype(np.int64)
     columns = np.rint(np.linspace(0, coarse.n_x - 1, fine.n_x)).astype(np.int64)
     return np.asarray(reachable.reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel())

@@ -1,4 +1,4 @@
-"""Means of residuals in steps of a covariate, with the band that chance alone would fill."""
+"""Binned means of residuals along a covariate, with the 95 % band of chance."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _STEPS = 24
 _MOST_STEPS = 60
 _LEAST_ROWS = 4
 _FEW_STEPS = 6
-_NEVER_LESS = 0.05  # of the variance of a mean: a band has some width however much the fit takes up
+_NEVER_LESS = 0.05  # of the variance of a mean: the least width of the band, however much the fit absorbs
 
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """One mean a step, all (n_steps,).
+    """Mean residuals per bin, all arrays (n_steps,).
 
-    `at` is the covariate's mean, or 0, 1, 2 ... where its values have names; `before` and `after` are the mean
+    `at` is the covariate's mean, or 0, 1, 2 ... for a categorical covariate; `before` and `after` are the mean
     residuals of the calibrated and of the repaired model (`after` None: nothing was repaired); `chance` is
     half the width of the 95 % band; `size` is the number of readings.
     """
@@ -36,7 +36,7 @@ class Means:
 
     @property
     def stands_out(self) -> float:
-        """Largest mean of the calibrated model's residuals, in sds of chance."""
+        """Largest mean of the calibrated model's residuals, in sds."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
 
@@ -52,23 +52,23 @@ def mean_residuals(
     window: tuple[float, float] | None = None,
     absorbed: FloatArray | None = None,
 ) -> Means:
-    """Average residuals in steps of a covariate.
+    """Average residuals in bins of a covariate.
 
     Parameters
     ----------
     covariate, before, after
-        Shape (n_points,): the covariate, and recorded minus predicted reading by both models; NaN where there is none.
+        Shape (n_points,): the covariate, and the residuals of both models; NaN where there is no reading.
     sd
-        Noise of one reading, one for all or (n_points,).
+        Noise sd of one reading, a number or (n_points,).
     rho, scan
-        Correlation of its noise with that of the reading before it in the same scan; the scan of each, (n_points,).
+        Correlation of the noise of successive readings in a scan; scan numbers, (n_points,).
     names
-        Names of the values of a covariate without a scale: each is a step.
+        Names of the values of a categorical covariate: each is a bin.
     window
-        Part of the covariate that is a step of its own, or several, so that no step mixes it with the rest.
+        Interval of the covariate that has bins of its own: no bin straddles its ends.
     absorbed
-        Posterior samples of the predictions, (n_samples, n_points): their variance is what the fit absorbs of the
-        noise, and the band is narrower by it.
+        Posterior samples of the predictions, (n_samples, n_points): the fit absorbs their variance from the noise,
+        which narrows the band.
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]
@@ -95,7 +95,7 @@ def _by_value(values: FloatArray) -> list[IntArray]:
 
 
 def _in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
-    """Group rows in even steps of the covariate, neighbours with too few joined, a window apart from the rest."""
+    """Group rows in equal steps of the covariate; join small neighbouring groups, but keep the window separate."""
     if values.size == 0:
         return []
     if window is None:
@@ -113,7 +113,7 @@ def _even(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
     groups = _joined(_steps(mine, rows, n), least)
     if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
         return groups
-    # Most readings share a few values: as many in each step show more than steps of one width.
+    # Where most readings share a few values, groups of equal size show more than bins of equal width.
     return np.array_split(rows[np.argsort(mine, kind="stable")], min(n, rows.size // least))
 
 
@@ -134,7 +134,7 @@ def _joined(parts: Sequence[IntArray], least: int) -> list[IntArray]:
 
 
 def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float) -> float:
-    """Give the variance of the mean of readings, each of which remembers the one before it (AR(1))."""
+    """Return the variance of the mean of readings with AR(1) noise."""
     own = np.zeros(len(scan))
     own[rows] = sd[rows]
     variance = float(own @ own)
@@ -144,5 +144,5 @@ def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float
 
 
 def _longest_memory(rho: float) -> int:
-    """Count the readings over which a correlation falls below a hundredth."""
+    """Return the lag at which an AR(1) correlation falls below a hundredth."""
     return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0

@@ -1,4 +1,4 @@
-"""Sheets to print and lay under the arm: what lies on each, and how a large one is cut into pages."""
+"""Sheets to print and lay under the arm: their content, and how large ones are split into pages."""
 
 from __future__ import annotations
 
@@ -22,38 +22,38 @@ PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": 
 """Width and height of the papers, upright."""
 
 LEFT_MM, RIGHT_MM, TOP_MM, BOTTOM_MM = 16.0, 12.0, 10.5, 20.0
-"""Margins of a page: printers leave some 6 mm blank, and what is said stands in the rest."""
+"""Margins of a page: printers leave some 6 mm blank; the rest holds text."""
 
 OVERLAP_MM = 6.0
-"""So much of the next page is printed beyond the cut, for the next page to be glued on."""
+"""Width of the strip printed beyond the cut, on which the next page is glued."""
 
-AROUND_MM = 40.0  # beyond the outermost reading: what the sensor sees there still counts
+AROUND_MM = 40.0  # margin beyond the outermost reading, which the sensor still sees
 _MOST_PAGES = 400
 _ROUND_MM = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A rectangle of the lab frame with what is printed on it.
+    """A rectangle of the lab frame, to be printed.
 
     Parameters
     ----------
     name
-        The pattern's, as prompts call it.
+        Name of the pattern, as prompts call it.
     pattern
-        What is printed: albedo 0 black, 1 white.
+        The pattern printed: albedo 0 is black, 1 white.
     low_mm, high_mm
         Lower left and upper right corner, in the pattern's frame.
     lines
-        What a person is told of it.
+        Instructions for the user.
     outline_mm
-        A line to cut along, (n, 2); None: none.
+        Line to cut along, (n, 2), or None.
     crosses_mm
         Crosses to bring the sensor to, (n, 2).
     frame
-        Where x and y are counted from.
+        Origin of x and y, in words.
     orientations_rad
-        How the sensor stands over it.
+        Orientations of the sensor over it.
     """
 
     name: str
@@ -74,18 +74,18 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Tile:
-    """The part of a sheet that one page shows.
+    """The part of a sheet on one page.
 
     Parameters
     ----------
     column, row
-        From 0, from the lower left.
+        Counted from 0 at the lower left.
     low_mm, high_mm
-        Its corners in the sheet's frame: the cut.
+        Its corners in the sheet's frame, where the page is cut.
     page_mm
         Width and height of the page.
     beyond_mm
-        How much is printed beyond the cut on the right and at the top, for the neighbour to lie on.
+        Width of the strips printed beyond the cut on the right and at the top, on which the neighbours are glued.
     """
 
     column: int
@@ -96,21 +96,21 @@ class Tile:
     beyond_mm: tuple[float, float]
 
     def on_page_mm(self, points_mm: FloatArray) -> FloatArray:
-        """Move points, (n, 2), from the sheet's frame to the page's, whose lower left corner is the origin."""
+        """Convert points, (n, 2), from the sheet's frame to the page's, whose origin is its lower left corner."""
         return np.asarray(points_mm - np.array(self.low_mm) + [LEFT_MM, BOTTOM_MM])
 
 
 def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
-    """Cut a sheet into pages, upright or lying, whichever needs fewer.
+    """Split a sheet into pages, portrait or landscape, whichever needs fewer.
 
     Returns
     -------
-    Row by row from below, each from the left.
+    The tiles row by row from below, each row from the left.
 
     Raises
     ------
     ParameterError
-        If it needs hundreds of pages, or there is no such paper.
+        If it needs hundreds of pages, or the paper size is unknown.
     """
     if paper not in PAPERS_MM:
         raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
@@ -139,14 +139,14 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
 
 
 def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
-    """Make a sheet of every pattern: as large as the plan's readings over it need.
+    """Make one sheet per pattern, as large as the plan's readings need.
 
     Parameters
     ----------
     patterns
         By name.
     plan
-        Whose readings they are laid for; patterns that it does not use are left out. None: as large as usual.
+        The plan; patterns that it does not use are left out. None: sheets of default size.
     """
     sheets = []
     for name, pattern in patterns.items():
@@ -167,14 +167,14 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
 
 
 def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
-    """Make the black field, with a white target of some outline, (n, 2), at its place."""
+    """Make the sheet of the black field with a white target of the given outline, (n, 2), in place."""
     pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_corners(outline_mm))
     said = "all black" if outline_mm is None else "black, the target white at its place"
     return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
 
 
 def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
-    """Make a white target of some outline, (n, 2), to cut out and lay on a black field."""
+    """Make a white target of the given outline, (n, 2), to cut out and lay on a black field."""
     low = np.floor((outline_mm.min(axis=0) - _ROUND_MM) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((outline_mm.max(axis=0) + _ROUND_MM) / _ROUND_MM) * _ROUND_MM
     lines = ("white: cut it out along the line and lay it on the black field",)
@@ -190,7 +190,7 @@ def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
 
 
 def marks_sheet(geometry: Geometry) -> Sheet:
-    """Make the sheet of crosses that `arm fit-geometry` brings the sensor to."""
+    """Make the sheet of crosses that `arm fit-geometry` uses."""
     marks = marks_of(geometry)
     lines = (
         f"{len(marks)} crosses for `probewise arm fit-geometry`, numbered",
@@ -211,7 +211,7 @@ def _count(length_mm: float, room_mm: float) -> int:
 
 
 def _features(pattern: Pattern) -> FloatArray:
-    """Give the places that a sheet must show where no plan says it, (n, 2)."""
+    """Return places that a sheet must show when there is no plan, (n, 2)."""
     match pattern:
         case Disc((x, y), radius):
             return np.array([[x - radius, y - radius], [x + radius, y + radius]])

@@ -1,4 +1,4 @@
-"""Pictures of two runs side by side, step by step, small enough for a page that holds them all."""
+"""Pictures of two runs side by side, one per step, compressed to fit in one page."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _COLOURS = 256
 
 
 def side_by_side(left: Sequence[bytes], right: Sequence[bytes]) -> list[bytes]:
-    """Join the pictures of two runs step by step; the run that ended first stays at its last picture.
+    """Join the pictures of two runs step by step; the shorter run keeps its last picture.
 
     Parameters
     ----------
     left, right
-        One PNG or more each.
+        One or more PNGs each.
 
     Returns
     -------
-    PNG in few colours, as many as the longer run has.
+    PNGs with a small palette, as many as the longer run has.
     """
     pairs = zip_longest(left, right)
     return [_joined(a if a is not None else left[-1], b if b is not None else right[-1]) for a, b in pairs]
@@ -35,7 +35,7 @@ def _joined(left: bytes, right: bytes) -> bytes:
     sheet.paste(pictures[0], (0, 0))
     sheet.paste(pictures[1], (pictures[0].width, 0))
     out = io.BytesIO()
-    # An octree keeps a colour that few pixels have: the median cut turned the green place of the next reading blue.
+    # An octree keeps rare colours: the median cut turned the green place of the next reading blue.
     few = sheet.quantize(_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     few.save(out, "PNG", optimize=True)
     return out.getvalue()

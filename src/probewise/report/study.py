@@ -1,4 +1,4 @@
-"""The page of a study: how many measurements each way of looking needs."""
+"""The page of a study: how many readings each configuration needs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _INTERVALS = (
 
 
 def answer(study: Study) -> str:
-    """Say in one sentence what the first row needs."""
+    """Summarise in one sentence how many readings the first row needs."""
     row, found = next(iter(study.table().items()))
     share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
     return (
@@ -44,7 +44,7 @@ def answer(study: Study) -> str:
 
 
 def table_of_rows(study: Study) -> Markup:
-    """Build the tables, one line a row: how many readings, and how much they tell and cost."""
+    """Build the tables, one line per row: readings needed, information, errors and cost."""
     readings = (
         "row",
         "runs",
@@ -66,14 +66,15 @@ def table_of_rows(study: Study) -> Markup:
     lines = [(_needed(row, found), _told(row, found)) for row, found in study.table().items()]
     return fragment(
         table(readings, (first for first, _ in lines), caption=_INTERVALS),
-        table(worth, (second for _, second in lines), caption="What readings tell, how right the runs are, the cost."),
+        table(worth, (second for _, second in lines), caption="Information per reading, errors of the runs, and cost."),
     )
 
 
 def table_of_bounds(study: Study) -> Markup | None:
-    """Build the table of the fewest readings that any strategy could do with on average, beside what was measured.
+    """Build the table of a lower bound on the mean number of readings of any strategy, with the measured mean.
 
-    None where the study has no row that it is worked out for: a robot that knows its sensor, the reference otherwise.
+    None where the study has no row to which the bound applies: a robot with the correct sensor model, otherwise
+    default.
     """
     lines = []
     for row, found in study.table().items():
@@ -93,7 +94,7 @@ def table_of_bounds(study: Study) -> Markup | None:
 
 
 def table_csv(study: Study) -> str:
-    """Write the table as CSV: every estimate with its bounds; processor times are left out, since no two runs agree."""
+    """Write the table as CSV: every estimate with its bounds; processor times, which vary, are left out."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
@@ -125,26 +126,28 @@ def write_page(study: Study, *, command: str) -> str:
     if curves:
         drawn = figure(
             png(widths_of_runs(curves)),
-            "Widest posterior sd of a length against the number of readings; a run that has ended stays where it was.",
+            "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
+            "width.",
         )
         sections.insert(0, Section("How fast", (drawn,)))
     least = table_of_bounds(study)
     if least is not None:
         bounds = paragraph(
-            "Bits needed over the most that a reading can carry. Until the first reading on white that is a yes or no, "
-            "yes as often as the best place is covered; from there to the precision asked for, the sensor's capacity."
+            "Bits needed over the capacity of a reading in bits. Up to the first reading on white, a reading answers "
+            "yes or no, with the largest probability of yes that any place has; after that, the capacity is the "
+            "sensor's."
         )
-        sections.append(Section("The least that any strategy needs", (least, bounds)))
+        sections.append(Section("Lower bound for any strategy", (least, bounds)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
     return page("How many measurements?", answer=answer(study), key_figure=needed, sections=sections)
 
 
 def _legend() -> Markup:
     return paragraph(
-        "After ± stands the standard error. Every row looks for the same circles and meets the same noise. On white: "
+        "± is the standard error. Every row uses the same circles and the same noise. On white: "
         "a reading at least a tenth of the way from dark to bright. Error: of the worst length, median over the runs "
-        "that reached the end. Sure and wrong: stopped with a length off by more than 12 mm, beside the number that "
-        "the runs' own posteriors expect and the one that chance exceeds in one study of a hundred."
+        "that reached the target precision. Sure and wrong: stopped with a length off by more than 12 mm, with the "
+        "number that the runs' own posteriors predict and the number that chance exceeds in one study in a hundred."
     )
 
 

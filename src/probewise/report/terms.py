@@ -1,4 +1,4 @@
-"""Terms that a reader may not know, each explained in the section that uses it first."""
+"""Technical terms, each explained in the section that first uses it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "sd": (r"\bsds?\b", "standard deviation"),
         "rms": (r"\brms\b", "root of the mean square"),
         "nat": (r"\bnats?\b", "unit of evidence, a natural logarithm: 3 nats are odds of 20 to 1"),
-        "held-out": (r"\bheld-out\b", "kept for testing: the fit has not seen it"),
-        "λ": (r"λ|\blambda\b", "size of an effect: what is left of it after a full refit without it, in noise sds"),
+        "held-out": (r"\bheld-out\b", "kept for testing: not used in the fit"),
+        "λ": (
+            r"λ|\blambda\b",
+            "size of an effect: norm of its change in the readings after a full refit without it, in noise sds",
+        ),
         "aliased": (
             r"(?i)\balias(es|ed)?\b",
             "two effects that change these readings in the same way, so that the readings cannot tell which it is",
@@ -33,11 +36,11 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "unknown": (r"\bunknown\b", "an effect for which this program has no formula"),
     }
 )
-"""Term: the pattern by which its use is found in a text, and its explanation."""
+"""For each term: a pattern that finds its uses in a text, and its explanation."""
 
 
 def terms_of(content: str, known: set[str]) -> tuple[Markup, ...]:
-    """Explain the terms that some HTML uses and that are not `known` yet; they are from now on."""
+    """Explain the terms that some HTML uses and that are not yet in `known`, and add them to it."""
     text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
     new: list[str] = []
     while text:  # an explanation may use a term itself
@@ -50,5 +53,5 @@ def terms_of(content: str, known: set[str]) -> tuple[Markup, ...]:
 
 
 def explained(sections: Sequence[Section], known: set[str]) -> list[Section]:
-    """Add to each section the explanations of the terms that it is the first to use."""
+    """Add to each section the explanations of the terms that it uses first."""
     return [replace(s, body=(*s.body, *terms_of(" ".join((s.heading, *s.body)), known))) for s in sections]

@@ -1,4 +1,4 @@
-"""Numbers as people read them."""
+"""Formatting of numbers, units and counts for reports."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float, digits: int) -> str:
-    """Write with a fixed number of decimals and a true minus sign; a dash where there is no number."""
+    """Write a number with fixed decimals and a true minus sign; a dash for NaN."""
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
 
 
 def with_error(value: float, error: float, unit: str = "") -> str:
-    """Write a value with its error, both to the error's second figure, so that no error shows as zero."""
+    """Write a value with its error, both to the error's second significant digit, so that no error shows as zero."""
     if not math.isfinite(value):
         return "–"
     if not (math.isfinite(error) and error > 0):
@@ -42,7 +42,7 @@ def with_error(value: float, error: float, unit: str = "") -> str:
 
 
 def interval(low: float, high: float) -> str:
-    """Write the ends of an interval to the third figure of its width."""
+    """Write the ends of an interval to the third significant digit of its width."""
     width = high - low
     if not (math.isfinite(width) and width > 0):
         return "–" if not math.isfinite(low) else f"{low:.6g}"
@@ -51,31 +51,31 @@ def interval(low: float, high: float) -> str:
 
 
 def within(value: float, low: float, high: float) -> tuple[str, str]:
-    """Write a value and its interval to the same decimals, the third figure of the interval's width."""
+    """Write a value and its interval to the same decimals: the third significant digit of the interval's width."""
     ends = interval(low, high)
     decimals = len(ends.partition(" ")[0].partition(".")[2])
     return (signed(value, decimals) if high > low else f"{value:.6g}"), ends
 
 
 def unit_of(name: str) -> str:
-    """Take the unit that ends a parameter's name, "" where none does."""
+    """Return the unit at the end of a parameter's name, or ""."""
     stem, _, suffix = name.rpartition("_")
     return _UNITS.get(suffix, "") if stem else ""
 
 
 def without_unit(name: str) -> str:
-    """Write a parameter's name as words, without the unit that ends it."""
+    """Write a parameter's name as words, without its unit."""
     stem = name.rpartition("_")[0] if unit_of(name) else name
     return stem.replace("_", " ").replace(".", " ")
 
 
 def signed(value: float, digits: int) -> str:
-    """Write a coordinate; what rounds to zero has no sign."""
+    """Write a signed number; one that rounds to zero has no sign."""
     return number(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
 
 
 def readable(text: str) -> str:
-    """Write the numbers of a text as people do: 2 × 10⁻⁷ for 2e-07, a true minus sign, "p = 0.2" on one line."""
+    """Typeset the numbers of a text: 2 × 10⁻⁷ for 2e-07, a true minus sign, "p = 0.2" on one line."""
 
     def power(found: re.Match[str]) -> str:
         return f"{found[1]}\u00a0×\u00a010{str(int(found[2])).translate(_RAISED)}"
@@ -85,17 +85,17 @@ def readable(text: str) -> str:
 
 
 def count(n: int, noun: str) -> str:
-    """Write a count with its noun, plural where it must be."""
+    """Write a count with its noun, in the plural if needed."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def unit_name(unit: str) -> str:
-    """Name a unit behind a number: the LEGO brick's are "LEGO units", every other stands for itself."""
+    """Write a unit after a number: the LEGO brick's are "LEGO units", all others are unchanged."""
     return "LEGO units" if unit == "LEGO" else unit
 
 
 def probability(p: float) -> str:
-    """Write a probability; near 0 and 1 say so rather than round to them."""
+    """Write a probability, as a bound rather than rounded to 0 or 1."""
     if p < 0.001:
         return "< 0.001"
     return "> 0.999" if p > 0.999 else f"{p:.3f}"

@@ -82,7 +82,7 @@ def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
         if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.sd:
             root = np.zeros((len(z), len(z)))  # of that size, and no other
             root[: len(found.z), : len(found.z)] = _root_of(null)
-            return Rival(f"{spoken_name(name)} too weak to be felt so far", model, z, root, 0.0)
+            return Rival(f"{spoken_name(name)} too weak to be detected so far", model, z, root, 0.0)
         setting[amplitudes] /= 4
     return None
 

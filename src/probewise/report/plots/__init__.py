@@ -1,13 +1,12 @@
-"""The paper's figures, one function each: data first, then the axes to draw on.
+"""The paper's figures and others, one function each: data first, then the axes to draw on.
 
-Without axes a function opens a figure of pyplot, as large as its drawing needs, so that `plt.savefig` and `plt.show`
-find it; no global style is set.
+Without axes, a function opens a pyplot figure of suitable size, so that `plt.savefig` and `plt.show` find it; no global
+style is set.
 
 The arm and its sensor (figure 1 of the paper), the sensor's orientations and the quadrant patterns (figures 3 and 4),
 data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
 predicted against recorded (figure 7), the entropy map with its hypotheses (figures 2 and 8);
-beside them progress towards the precision asked for, what a diagnosis found, and what judges a
-run of nested sampling.
+and also: progress towards the target precision, results of a diagnosis, and diagnostics of nested sampling.
 """
 
 from probewise.report.plots.apparatus import arm_and_sensor

@@ -1,4 +1,4 @@
-"""The apparatus: the arm over its field, and the face of its sensor (figure 1 of the paper)."""
+"""The apparatus: the arm over its field, and its sensor seen from below (figure 1 of the paper)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from probewise.report.plots.canvas import (
 
 __all__ = ["arm_and_sensor", "arm_lengths", "draw_sensor_face"]
 
-_ROD_MM = 26.0  # between the two rods of each parallelogram, as drawn
+_ROD_MM = 26.0  # distance between the two rods of each parallelogram, as drawn
 _ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
 _LABEL: dict[str, Any] = {"fontsize": SMALL_PT, "textcoords": "offset points", "arrowprops": _ARROW}
 
@@ -43,7 +43,7 @@ def arm_and_sensor(
     place_mm
         Place of the sensor on the field.
     outline_mm
-        Outline of what lies on the field, (n_vertices, 2).
+        Outline of the target on the field, (n_vertices, 2).
 
     Returns
     -------
@@ -73,7 +73,7 @@ def arm_and_sensor(
 
 
 def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the arm from the side with every length of its geometry, to build or to measure it by.
+    """Draw the arm from the side with every length of its geometry, for building or measuring it.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | 
 
 
 def _measure(ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above") -> None:
-    """Draw a length with its arrow, away from what it measures."""
+    """Draw a dimension line with its arrow and text, offset from the part."""
     a, b = begin + away, end + away
     for here, there in ((begin, a), (end, b)):
         ax.plot([here[0], there[0]], [here[1], there[1]], color=GREY, linewidth=0.6, zorder=1)

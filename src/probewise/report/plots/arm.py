@@ -1,4 +1,4 @@
-"""Where an arm can put its sensor, and how the sensor then stands."""
+"""An arm's reach, and the sensor's orientation at each place."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from probewise.report.words import number
 
 __all__ = ["reach_map"]
 
-_LINES_DEG = 15.0  # between lines of equal orientation
+_LINES_DEG = 15.0  # step between contours of equal orientation
 
 
 def reach_map(
@@ -37,7 +37,7 @@ def reach_map(
     x_mm, y_mm
         Places of the columns and rows, shapes (n_x,) and (n_y,).
     axis_mm
-        Where the arm stands.
+        Place of the arm's axis.
     ax
         Axes to draw on; a new figure without.
     """
@@ -75,14 +75,14 @@ def reach_map(
 
 
 def _unwrapped(degrees: FloatArray) -> FloatArray:
-    """Write angles about their mean direction, so that 179 and -179 degrees are neighbours on the colour scale."""
+    """Unwrap angles about their mean direction, so that 179 and -179 degrees are neighbours on the colour scale."""
     known = np.radians(degrees[np.isfinite(degrees)])
     middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
     return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
 
 
 def _lines_within(degrees: FloatArray) -> FloatArray:
-    """Give the angles at which lines are drawn, (n_lines,)."""
+    """Return the angles at which contours are drawn, (n_lines,)."""
     known = degrees[np.isfinite(degrees)]
     if not known.size:
         return known

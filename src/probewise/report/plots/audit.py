@@ -1,4 +1,4 @@
-"""What a plan sees of every effect, and what it cannot tell apart."""
+"""Detectability of every effect under a plan, and the matrix of aliases."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ __all__ = ["audit_matrix"]
 COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
 
 _NOT_COMPARED = "#e8e8e8"
-_MOST_NAMES = 36  # that stand side by side under the columns; of more their numbers do
+_MOST_NAMES = 36  # columns labelled with names; if there are more, they are numbered
 
 
 def audit_matrix(
-    names: Sequence[str], sights: Sequence[str], cosines: FloatArray, *, alias: float, axes: AxesGrid | None = None
+    names: Sequence[str], statuses: Sequence[str], cosines: FloatArray, *, alias: float, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw how much of each effect is detectable, and beside it how well each is imitated by each other.
+    """Draw the detectable share of each effect, and how well every other effect imitates it.
 
-    The matrix is not symmetric: the row stands for the effect that is there, at a typical setting, the column for the
-    one that it is taken for, at its best.
+    The matrix is not symmetric: the row is the effect that is present, at typical parameters; the column is the effect
+    it may be mistaken for, at its best-fitting parameters.
 
     Parameters
     ----------
-    names, sights
-        Effects, and whether each is "fine", "aliased" or "invisible".
+    names, statuses
+       Names of the effects, and whether each is "fine", "aliased" or "invisible".
     cosines
-        Row imitated by column, (n_effects, n_effects), 0 where not compared; the detectable share on the diagonal.
+        Cosine of the row's change with the column's best imitation, (n_effects, n_effects), 0 where not compared; the
+        detectable share on the diagonal.
     alias
-        Cosine from which two are not told apart: marked.
+        Cosine from which two effects are aliased, and marked.
     axes
         Axes to draw on, (1, 2), with one y axis; a new figure without.
 
@@ -52,18 +53,18 @@ def audit_matrix(
     -------
     The two axes, shape (1, 2).
     """
-    order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(sights[k]), -cosines[k, k]))
+    order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(statuses[k]), -cosines[k, k]))
     labels = [spoken_name(names[k]) for k in order]
     at = np.arange(len(order))
     own = axes is None
     axes = axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
     bars, matrix = axes[0]
-    bars.barh(at, np.diag(cosines)[order], color=[COLOUR[sights[k]] for k in order], height=0.7)
+    bars.barh(at, np.diag(cosines)[order], color=[COLOUR[statuses[k]] for k in order], height=0.7)
     bars.set_yticks(at, labels)
     bars.invert_yaxis()
     bars.set_xlim(0, 1)
     for sight, colour in COLOUR.items():
-        if sight in sights:
+        if sight in statuses:
             bars.barh([np.nan], [0], color=colour, label=sight)
     tidy(bars, x="detectable share (no unit)", y="")
     numbered = len(order) > _MOST_NAMES
@@ -90,4 +91,4 @@ def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) 
     ax.tick_params(left=False)
     bar = ax.figure.colorbar(image, ax=ax, label="cosine (no unit); circles from the line on", shrink=0.7)
     bar.ax.axhline(alias, color="black", linewidth=1.2)
-    tidy(ax, x="effect that it may be taken for", y="", title="row: the effect that is there; grey: not compared")
+    tidy(ax, x="effect it may be mistaken for", y="", title="row: the effect present; grey: not compared")

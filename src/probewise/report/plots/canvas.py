@@ -1,7 +1,7 @@
-"""Sheets to draw on, the palette, and the way from a drawing to a PNG.
+"""Figures and axes, the palette, legends, and rendering to PNG and SVG.
 
-Without axes to draw on, a plot function opens a figure of pyplot, so that `plt.savefig` and `plt.show` find it;
-`png` closes those again, so that a page of many pictures leaves none open.
+Without axes, a plot function opens a pyplot figure, so that `plt.savefig` and `plt.show` find it; `png` closes it
+again, so that a page of many pictures leaves none open.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPL
 __all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "axes_or_new", "grid_of_axes"]
 __all__ += ["key_below", "legend_above", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg", "tidy"]
 
-_LETTERS_PER_IN = 16.2  # of a legend, about
+_LETTERS_PER_IN = 16.2  # letters per inch of a legend, about
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
-_LEAST_IN_FULL = 1e-5  # length of an axis whose labels are written without a power of ten
+_LEAST_IN_FULL = 1e-5  # of an axis' length: shorter ones have labels with a power of ten
 
 AxesGrid: TypeAlias = NDArray[Any]
 
 PAGE_IN = 9.6
-"""Width of a report's column: a wider drawing is shrunk, and its type with it."""
+"""Width of a report's column: a wider drawing is shrunk, and its text with it."""
 
 SMALL_PT = 9.0
-"""The smallest type of any drawing: 8.5 pt or more on a page."""
+"""The smallest font size of any drawing: 8.5 pt or more on a page."""
 
 OUT_OF_REACH = "#d9d9d9"
-"""Where the arm cannot put its sensor, in every drawing of the field."""
+"""Colour of places out of the arm's reach, in every drawing of the field."""
 
 _OPENED: WeakSet[Figure] = WeakSet()  # figures that plot functions opened: `png` closes them, and no others
 
-# The paper's copper tones. They start above black, so that black squares and blue outlines
-# stay legible, and lightness rises evenly, so that the map also reads in grey.
+# The paper's copper tones. They start above black, so that black squares and blue outlines stay visible, and lightness
+# rises evenly, so that the map can be read in grey too.
 COPPER: Colormap = LinearSegmentedColormap.from_list(
     "probewise_copper", ["#2a1a12", "#6b3f26", "#a9673f", "#dd9a64", "#ffd9a8"]
 )
@@ -61,7 +61,7 @@ def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -
     Raises
     ------
     ParameterError
-        If something else than axes is given: a figure is the usual mistake.
+        If something other than axes is given; a figure is the usual mistake.
     """
     if ax is not None:
         require_kind("ax", ax, Axes, _AXES)
@@ -99,7 +99,7 @@ def axes_or_grid(
 
 
 def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
-    """Open a figure of pyplot, which `png` closes."""
+    """Open a pyplot figure, which `png` closes."""
     sheet = plt.figure(figsize=size_in, layout=layout)
     _OPENED.add(sheet)
     return sheet
@@ -115,7 +115,7 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
     dpi
         Dots per inch.
     tight
-        Cut off empty margins; without, pictures of figures of one size have one size, as a moving picture needs.
+        Crop empty margins. Without it, figures of equal size give PNGs of equal size, as an animation needs.
     """
     if isinstance(drawing, Figure):
         sheet = drawing
@@ -130,14 +130,14 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
 
 
 def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
-    """Open a figure of axes one above another, shape (n_axes,); `svg` finds their margins in one pass."""
+    """Open a figure of stacked axes, shape (n_axes,); `svg` computes their margins in one pass."""
     sheet = new_figure((width_in, sum(heights_in)))
     axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
     return np.asarray(axes[:, 0], dtype=np.object_)
 
 
 def svg(drawing: Axes | AxesGrid) -> bytes:
-    """Render the figure that holds a drawing as SVG, the same bytes for the same drawing; see `png` on closing it."""
+    """Render the figure of a drawing as SVG, reproducible byte for byte; it is closed as by `png`."""
     ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
     sheet = cast(Figure, ax.figure)
     sheet.tight_layout(pad=0.4, h_pad=0.9)
@@ -153,7 +153,7 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
 
 
 def legend_above(ax: Axes, *, title: str = "") -> None:
-    """Set the legend above the axes, in as many columns as fit: it never lies over data."""
+    """Place the legend above the axes, in as many columns as fit, so that it never covers data."""
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
         return
@@ -176,12 +176,12 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
 
 
 def _legend_width(labels: Sequence[str], n_columns: int) -> int:
-    """Count the letters across a legend, whose first columns hold one label more; each sample is as wide as five."""
+    """Estimate a legend's width in letters; its first columns hold one label more, a line sample counts as five."""
     return sum(max(map(len, column)) + 6 for column in np.array_split(np.array(labels, dtype=np.object_), n_columns))
 
 
 def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
-    """Write tick labels in full: no factor or offset stands apart from them."""
+    """Write tick labels in full, without a separate factor or offset."""
     for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
         low, high = axis.get_view_interval()
         if high - low > _LEAST_IN_FULL:
@@ -194,7 +194,7 @@ def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
 
 
 def key_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
-    """Explain everything that is drawn once, below all axes: a key there hides nothing.
+    """Draw one legend for all axes below them, where it covers nothing.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def key_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none"
 
 
 def tidy(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
-    """Label axes with their units, drop the frame that carries nothing."""
+    """Label axes, and drop the upper and right spines."""
     ax.set_xlabel(x)
     ax.set_ylabel(y)
     if title:

@@ -1,4 +1,4 @@
-"""Many diagnoses at once: are their probabilities honest, and what is taken for what."""
+"""Many diagnoses at once: reliability diagram and confusion matrix."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["confusion_matrix", "reliability_diagram"]
 
 
 def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
-    """Draw the share that was right against the probability stated, with Wilson's intervals and numbers of cases.
+    """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
     ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
     stated = np.array([b.stated for b in bins])
     value, low, high = (np.array([getattr(b.right, end) for b in bins]) for end in ("value", "low", "high"))
-    # Rounding may put an end a hair inside the value.
+    # Rounding may put an end of the interval slightly inside the value.
     whiskers = np.maximum([value - low, high - value], 0.0)
     ax.errorbar(stated, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
     for b in bins:
@@ -41,7 +41,7 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
 
 
 def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray, *, ax: Axes | None = None) -> Axes:
-    """Draw what was said of each truth: the number of cases in each cell, shaded by its share of the row.
+    """Draw the confusion matrix: the number of cases in each cell, shaded by its share of the row.
 
     Parameters
     ----------

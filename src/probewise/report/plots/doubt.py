@@ -1,4 +1,4 @@
-"""What a robot believes about its sensor, reading by reading."""
+"""Probabilities of effects that the sensor model leaves out, reading by reading."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from probewise.report.plots.canvas import axes_or_new, legend_above, tidy
 
 __all__ = ["belief_in_the_sensor"]
 
-_MOST = 5  # things told apart by colour; the rest together
+_MOST = 5  # effects with a colour of their own; the others share one
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _CLEAN, _REST = "#D9D9D9", "#7F7F7F"
 
 
 def belief_in_the_sensor(left_out: Sequence[Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
-    """Draw a stacked bar a reading: how probable each thing is that the sensor model may leave out.
+    """Draw one stacked bar per reading: the probability of each effect that the sensor model may leave out.
 
-    A dashed line marks each reading after which another is the most probable.
+    A dashed line marks each reading after which the most probable effect changes.
 
     Parameters
     ----------
     left_out
-        Probability by name after each reading; "clean" is nothing.
+        Probability by name after each reading; "clean": nothing is left out.
     ax
         Axes to draw on; a new figure without.
     """

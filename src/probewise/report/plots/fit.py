@@ -14,12 +14,12 @@ __all__ = ["predicted_and_recorded"]
 def predicted_and_recorded(
     readings: FloatArray, predicted: FloatArray, sd: FloatArray, *, label: str, unit: str, ax: Axes | None = None
 ) -> Axes:
-    """Draw each reading against what is predicted of it, with one sd of a new reading.
+    """Draw each reading against its prediction, with one sd of a new reading.
 
     Parameters
     ----------
     readings, predicted, sd
-        Shape (n_points,); readings NaN where there is none.
+        Shape (n_points,); missing readings are NaN.
     label, unit
         Of the readings.
     ax

@@ -1,4 +1,4 @@
-"""What judges a run of nested sampling, and its posterior: trace, corner, insertion ranks, course of the run."""
+"""Diagnostics and posterior of a nested-sampling run: trace, corner, insertion ranks, course of the run."""
 
 from __future__ import annotations
 
@@ -38,31 +38,31 @@ __all__ = ["corner_plot", "insertion_plot", "run_plot", "trace_plot"]
 
 Posterior: TypeAlias = NestedResult | Weighted
 
-# Darker is heavier: on white, the points that count are seen; lightness falls evenly, so that it reads in grey.
+# Darker points have more weight, so that they show on white; lightness falls evenly, so that it can be read in grey.
 _WEIGHT: Colormap = LinearSegmentedColormap.from_list("probewise_weight", ["#dcdcdc", "#8fbbdb", BLUE, "#00233b"])
-_SSF_UNITS = {"u": "mm", "v": "mm", "A": "mm⁻²", "B": "mm⁻²", "C": "mm⁻²"}  # of the paper's symbols
+_SSF_UNITS = {"u": "mm", "v": "mm", "A": "mm⁻²", "B": "mm⁻²", "C": "mm⁻²"}  # units of the paper's symbols
 _MASSES = (0.68, 0.95)
-_SHADES = ("#aecfe6", "#4d9bcb")  # of the larger mass, of the smaller
+_SHADES = ("#aecfe6", "#4d9bcb")  # colours of the larger and of the smaller mass
 _MOST_POINTS = 4000
-_LEFT_IN, _BOTTOM_IN, _TOP_IN, _RIGHT_IN, _GAP_IN = 0.9, 0.9, 0.65, 0.2, 0.06  # of a corner plot
-_DEPTH = "−ln X (X: share of the prior)"
-_FEW = 6  # parameters up to which a corner plot fits a page, with numbers
+_LEFT_IN, _BOTTOM_IN, _TOP_IN, _RIGHT_IN, _GAP_IN = 0.9, 0.9, 0.65, 0.2, 0.06  # points in a panel of a corner plot
+_DEPTH = "−ln X (X: prior mass left)"
+_FEW = 6  # parameters up to which a corner plot fits a page and has numbers
 
 
 def trace_plot(
     result: NestedResult, *, parameters: Sequence[str] | None = None, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw each parameter of the dead points against the log volume left, darker where the posterior is.
+    """Draw each parameter of the dead points against the remaining log volume, darker where the posterior mass is.
 
-    On top, the posterior mass for each nat of volume; to the right of each trace, the posterior
-    of the parameter on a scale of its own.
+    On top: posterior mass per nat of log volume. To the right of each trace: the parameter's marginal posterior, on a
+    scale of its own.
 
     Parameters
     ----------
     result
         The run.
     parameters
-        Names of those to draw, in this order; all of them where not given.
+        Names of the parameters to draw, in this order; default: all.
     axes
         Axes to draw on, of the shape returned; a new figure without.
 
@@ -133,19 +133,19 @@ def trace_plot(
 def corner_plot(
     result: Posterior, *, parameters: Sequence[str] | None = None, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw the posterior of each parameter, and of each pair the regions that hold 68 % and 95 % of it.
+    """Draw the marginal posterior of each parameter, and 68 % and 95 % regions of each pair.
 
     Intervals of single parameters are central ones; up to six parameters also have their median and 95 % interval
     written above. Regions of pairs are those of highest density, from a histogram of the weighted samples
-    smoothed by a kernel that narrows as the effective number of samples grows. Up to six parameters fit the
-    width of a page; the drawing of more grows, its type does not shrink.
+    smoothed by a kernel that narrows as the effective sample size grows. Up to six parameters fit the width of a page;
+    with more, the figure grows and its text does not shrink.
 
     Parameters
     ----------
     result
         The run.
     parameters
-        Names of those to draw, in this order; all of them where not given.
+        Names of the parameters to draw, in this order; default: all.
     axes
         Axes to draw on, (n, n); those above the diagonal are hidden. A new figure without.
 
@@ -204,7 +204,7 @@ def corner_plot(
 
 
 def _cells(n: int, side_in: float) -> AxesGrid:
-    """Lay out square axes on and below the diagonal and, for the key, at the upper right: (n, n), None elsewhere."""
+    """Lay out square axes on and below the diagonal and, for the legend, at the upper right: (n, n), None elsewhere."""
     width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
     sheet = new_figure((width, height))
     cells = np.full((n, n), None, dtype=np.object_)
@@ -217,11 +217,11 @@ def _cells(n: int, side_in: float) -> AxesGrid:
 
 
 def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
-    """Draw where new points were inserted among the live ones, with the band that a right sampler fills.
+    """Draw the histogram of insertion ranks of new points, with the band expected of a correct sampler.
 
-    Every new point is equally likely to take any rank (Fowlie, Handley & Su 2020). Too many low
-    ranks mean chains too short to leave the bound; too many high ones that a region was lost. The band
-    holds all bars at once in 99 of 100 right runs (binomial, Šidák's correction for the number of bars).
+    Every new point is equally likely to take any rank (Fowlie, Handley & Su 2020). Too many low ranks mean that chains
+    are too short to leave the likelihood bound; too many high ranks mean that a region was lost. The band holds all
+    bars at once in 99 of 100 correct runs (binomial, Šidák's correction for the number of bars).
 
     Parameters
     ----------
@@ -251,17 +251,17 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
         edgecolor="white",
         linewidth=0.6,
     )
-    ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="99 % of right samplers")
+    ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="99 % of correct runs")
     ax.axhline(n / n_bars, color=BLACK, linewidth=0.9, label="uniform")
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1.3 * max(high, counts.max()))
-    ax.legend(frameon=False, fontsize=SMALL_PT, loc="upper right", ncols=2)  # above every bar
+    ax.legend(frameon=False, fontsize=SMALL_PT, loc="upper right", ncols=2)  # leaves room for the text above every bar
     title = f"{n} new points, p = {result.insertion_p_value:.2g}"
     return tidy(ax, x="rank among the live points (0: worst, 1: best)", y="new points", title=title)
 
 
 def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
-    """Draw the course of a run: likelihood, posterior mass, live points and evidence so far against the log volume.
+    """Draw the course of a run: likelihood, posterior mass, live points and cumulative evidence against log volume.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
 
     Returns
     -------
-    Axes, (4, 1). The likelihood's lower end is cut off where nothing of the posterior lies.
+    Axes, (4, 1). The likelihood's axis starts where posterior mass begins.
     """
     require_kind("result", result, NestedResult, "a NestedResult, as nested.run returns it")
     axes = axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
@@ -320,7 +320,7 @@ def _columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
 
 
 def _label(name: str) -> str:
-    """Write a parameter's name as a label: its unit in brackets, a symbol's index lowered."""
+    """Write a parameter's name as an axis label: unit in brackets, index as a subscript."""
     unit = unit_of(name)
     if unit:
         return f"{without_unit(name)} ({unit})"
@@ -333,7 +333,7 @@ def _label(name: str) -> str:
 
 
 def _mass_per_nat(result: NestedResult) -> FloatArray:
-    """Posterior mass for each nat of log volume, (n_dead,): a death shrinks the volume by 1 / n nats."""
+    """Return posterior mass per nat of log volume, (n_dead,): each death shrinks the log volume by 1 / n nats."""
     return result.weight * result.n_at_death
 
 
@@ -342,7 +342,7 @@ def _thinned(n: int) -> IntArray:
 
 
 def _span(result: Posterior, column: int) -> tuple[float, float]:
-    """Limits that hold 99 % of the posterior with a margin, within the dead points, which fill the prior."""
+    """Return limits that hold 99 % of the posterior with a margin, within the range of the dead points."""
     values = result.theta[:, column]
     order = np.argsort(values)
     ladder = np.cumsum(result.weight[order])
@@ -358,9 +358,9 @@ def _span(result: Posterior, column: int) -> tuple[float, float]:
 def _marginal(
     values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Smooth density on the middles of 80 bins, reflected at the ends, where the prior's edge may be.
+    """Smooth the density at the middles of 80 bins, reflected at the ends, where the prior may be cut off.
 
-    The kernel is three quarters of Silverman's, since posteriors may have several modes.
+    The kernel has three quarters of Silverman's width, since posteriors may have several modes.
     """
     density, edges = np.histogram(values, bins=80, range=span, weights=weight)
     centres = (edges[:-1] + edges[1:]) / 2
@@ -411,7 +411,7 @@ def _draw_pair(
 
 
 def _spread_ranks(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:
-    """Count new points a bar, (n_bars,), a rank of m + 1 being spread evenly over its share of the axis."""
+    """Count new points per bar, (n_bars,); each of the m + 1 ranks is spread evenly over its part of the axis."""
     low, high = rank / (n_ranked + 1.0), (rank + 1.0) / (n_ranked + 1.0)
     below = np.array([np.clip((edge - low) / (high - low), 0.0, 1.0).sum() for edge in edges])
     return np.asarray(np.diff(below))

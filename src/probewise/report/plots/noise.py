@@ -1,4 +1,4 @@
-"""What the noise looks like beside plain noise: correlation of neighbours, spread by level, tails, lattice."""
+"""Tests of the noise against white noise: autocorrelation, spread by level, tails, rounding."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ __all__ = ["correlation_of_neighbours", "lattice_of_readings", "lost_readings", 
 
 _MOST_LAGS = 12
 _STEPS = 12
-_PLAIN = "95 % of plain noise"
+_PLAIN = "95 % of white noise"
 
 
 def correlation_of_neighbours(
     residuals: FloatArray, scan: IntArray, *, rho: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the correlation of residuals of one scan with those so many readings before, and the band of plain noise.
+    """Draw the autocorrelation of residuals within scans by lag, with the 95 % band of white noise.
 
     Parameters
     ----------
     residuals, scan
-        Shape (n_points,): residuals, NaN where there is no usable reading, and the number of the scan of each.
+        Shape (n_points,): residuals, NaN where there is no usable reading, and scan numbers.
     rho
-        Correlation of neighbours found: its powers are drawn beside.
+        Estimated correlation of successive readings; its powers are drawn too.
     ax
         Axes to draw on; a new figure without.
     """
@@ -68,7 +68,7 @@ def spread_by_level(
     model_sd: FloatArray | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the rms of residuals in steps of the predicted reading, and the band in which one sd for all would lie.
+    """Draw the rms of residuals in bins of the predicted reading, with the band expected for constant noise.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def spread_by_level(
     unit
         Of the readings.
     model_sd
-        Noise sd of each reading by the noise model found, (n_points,).
+        Noise sd of each reading under the noise model found, (n_points,).
     ax
         Axes to draw on; a new figure without.
     """
@@ -103,14 +103,14 @@ def spread_by_level(
 
 
 def tails(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
-    """Draw how many residuals lie how far out, beside a normal distribution of the noise's sd.
+    """Draw a histogram of residuals, with a normal distribution of the noise's sd.
 
     Parameters
     ----------
     residuals
         Shape (n_points,), NaN where there is no usable reading.
     sd
-        Of the noise without its tail.
+        Sd of the noise without its tail.
     ax
         Axes to draw on; a new figure without.
     """
@@ -134,7 +134,7 @@ def tails(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
 def lost_readings(
     predicted: FloatArray, readings: FloatArray, lost: BoolArray, *, unit: str, ax: Axes | None = None
 ) -> Axes:
-    """Draw recorded against predicted readings, those that are lost marked; all arrays (n_points,)."""
+    """Draw recorded against predicted readings, with the lost ones marked; all arrays (n_points,)."""
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     ax.plot(predicted[~lost], readings[~lost], "o", color=GREY, markersize=3, label="reading")
     ax.plot(predicted[lost], readings[lost], "X", color=VERMILLION, markersize=7, label="lost reading")
@@ -146,7 +146,7 @@ def lost_readings(
 
 
 def lattice_of_readings(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
-    """Draw where between two multiples of a step the readings lie, (n_points,): rounded ones lie at one place."""
+    """Draw a histogram of readings, (n_points,), modulo a step: rounded ones fall in one bin."""
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     finite = readings[np.isfinite(readings)]
     counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, 41, (-0.5, 0.5))

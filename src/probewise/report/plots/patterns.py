@@ -1,4 +1,4 @@
-"""How a recording was taken: the sensor's orientations over the boundary, the quadrants (paper, figures 3 and 4)."""
+"""How a recording was taken: sensor orientations over the boundary, and the quadrants (paper, figures 3 and 4)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
     Parameters
     ----------
     recording
-        Its scans over half-planes are shown, an orientation each, under the symbol that `readings_by_orientation`
-        gives them.
+        Its scans over half-planes are shown, one per orientation, with the symbols of `readings_by_orientation`.
     ax
         Axes to draw on; a new figure without.
 
@@ -74,21 +73,21 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
 
 
 def quadrant_patterns(recording: Recording) -> AxesGrid:
-    """Draw each quadrant pattern with its corner and the reading taken at its middle (paper, figure 4).
+    """Draw each quadrant pattern with its corner and the reading taken there (paper, figure 4).
 
     Parameters
     ----------
     recording
-        One with readings over quadrants; of several over one, the mean is shown.
+        A recording with readings over quadrants; several over one quadrant are averaged.
 
     Returns
     -------
-    Axes, two a row.
+    Axes, two per row.
 
     Raises
     ------
     ParameterError
-        If it has none.
+        If it has no readings over quadrants.
     """
     require_recording(recording)
     plan = recording.plan

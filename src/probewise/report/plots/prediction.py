@@ -1,4 +1,4 @@
-"""What the sensor model predicts against what was recorded."""
+"""Predicted and recorded readings, and their residuals."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ MAX_PANELS = 8
 def predicted_against_recorded(
     recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw recorded and predicted readings, with a band for 95 % of new ones, a panel each scan (paper, figure 7).
+    """Draw recorded and predicted readings with the 95 % band of new readings, one panel per scan (paper, figure 7).
 
     Parameters
     ----------
     recording
-        What was recorded.
+        The recording.
     mean, sd
         Predicted reading of each row and the sd of one new reading, shape (n_points,).
     axes
@@ -79,7 +79,7 @@ def predicted_against_recorded(
 
 
 def _spread(n: int, most: int) -> IntArray:
-    """Pick at most `most` indices out of n, evenly spread."""
+    """Choose at most `most` of n indices, evenly spaced."""
     return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).round().astype(np.int64))[:n]
 
 
@@ -106,7 +106,7 @@ def _draw_alone(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray
 
 
 def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
-    """Draw standardised residuals in the order they were taken; 95 % should lie between the dashed lines.
+    """Draw standardised residuals in order of time; 95 % should lie between the dashed lines.
 
     Parameters
     ----------
@@ -141,9 +141,9 @@ def residuals_against(
     covariate, before, after
         Shape (n_points,): the covariate, and recorded minus predicted reading by the null and the repaired model.
     label, unit
-        What the covariate is, with its unit; the unit of a reading.
+        The covariate with its unit; the unit of a reading.
     span
-        Where the mismatch was found, shaded.
+        Interval of the covariate in which the mismatch was found, shaded.
     ax
         Axes to draw on; a new figure without.
     """
@@ -161,7 +161,7 @@ def residuals_against(
 
 
 def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of groups of about one twentieth of the points, neighbours in x."""
+    """Average groups of neighbours in x, each about one twentieth of the points."""
     if x.size == 0:
         return x, y
     order = np.argsort(x, kind="stable")

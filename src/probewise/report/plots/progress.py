@@ -1,4 +1,4 @@
-"""How fast the robot learns: parameter sd and information against the number of readings."""
+"""Progress of a run: posterior sd and information against the number of readings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["information_gained", "posterior_widths", "towards_target"]
 
 
 def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
-    """Draw the widest parameter's posterior sd after each reading, and the precision asked for.
+    """Draw the largest posterior sd of a parameter after each reading, and the target precision.
 
     Parameters
     ----------
@@ -36,10 +36,10 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
 
 
 def towards_target(ax: Axes, target_mm: float) -> Axes:
-    """Lay out axes for posterior sds against the number of readings, with a line at the precision asked for."""
+    """Set up axes for posterior sds against the number of readings, with a line at the target precision."""
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(
-        f"{target_mm:g} mm,\nasked for",
+        f"{target_mm:g} mm,\ntarget",
         (1.0, target_mm),
         xycoords=("axes fraction", "data"),
         xytext=(4, 0),
@@ -56,7 +56,7 @@ def towards_target(ax: Axes, target_mm: float) -> Axes:
 
 
 def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
-    """Draw bits gained so far after each reading.
+    """Draw the cumulative information in bits after each reading.
 
     Parameters
     ----------

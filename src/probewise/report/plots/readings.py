@@ -1,4 +1,4 @@
-"""Readings as they were taken: the paper's figure of four orientations, for any recording."""
+"""The readings of a recording along its scans: the paper's figure of four orientations."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from probewise.report.words import unit_name
 __all__ = ["Track", "readings_by_orientation", "tracks"]
 
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
-MAX_NAMED = 8  # more tracks than that are drawn without a legend
+MAX_NAMED = 8  # tracks in the legend; with more there is none
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Rows of a plan that lie along one line over one pattern: what a curve can be drawn through.
+    """Rows of a plan along one line over one pattern, which a curve may join.
 
-    `along_mm`, shape (n_rows,): signed distance from a half-plane's edge, else the way along
-    the scan from its middle.
+    `along_mm`, shape (n_rows,): signed distance from a half-plane's edge, or else position along the scan from its
+    middle.
     """
 
     label: str
@@ -36,11 +36,11 @@ class Track:
 
 
 def tracks(plan: Plan) -> tuple[list[Track], IntArray]:
-    """Split a plan into lines that can be drawn, and the rows that stand alone.
+    """Split a plan into tracks and single rows.
 
     Returns
     -------
-    The tracks, one a scan and pattern with at least three places; and the other row numbers.
+    The tracks, one per scan and pattern with at least three places; and the numbers of the other rows.
     """
     found: list[Track] = []
     single: list[IntArray] = []
@@ -67,7 +67,7 @@ def _along(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
     if isinstance(pattern, HalfPlane):
         return np.asarray(x * np.cos(pattern.normal_rad) + y * np.sin(pattern.normal_rad) - pattern.offset_mm)
     dx, dy = x - x.mean(), y - y.mean()
-    angle = 0.5 * np.arctan2(2 * (dx @ dy), dx @ dx - dy @ dy)  # the line the places scatter along
+    angle = 0.5 * np.arctan2(2 * (dx @ dy), dx @ dx - dy @ dy)  # principal direction of the places
     return np.asarray(dx * np.cos(angle) + dy * np.sin(angle))
 
 
@@ -82,7 +82,7 @@ def _label(plan: Plan, rows: IntArray) -> str:
 
 
 def along_label(found: Sequence[Track]) -> str:
-    """Say what the tracks' horizontal axis is."""
+    """Return the label of the tracks' horizontal axis."""
     if all(t.from_edge for t in found):
         return "distance from the edge, white side positive (mm)"
     return "place along the scan (mm)"
@@ -94,8 +94,8 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     Parameters
     ----------
     recording
-        Rows over half-planes are drawn by signed distance from the edge, others by their way along the scan.
-        Rows that stand alone (the quadrants) are drawn by `predicted_against_recorded` only.
+        Rows over half-planes are drawn by signed distance from the edge, others by position along the scan. Single rows
+        (the quadrants) are drawn by `predicted_against_recorded` only.
     ax
         Axes to draw on; a new figure without.
     """

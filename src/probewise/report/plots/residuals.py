@@ -40,10 +40,10 @@ __all__ = [
 ]
 
 BEFORE, AFTER = "as calibrated", "repaired"
-_CROWDED = 500  # dots from which they are drawn paler
-_MANY = 1500  # dots from which they are drawn as an image inside the SVG
-_ASIDE = 0.15  # of the place of a value with a name: how far the means before and after stand from its middle
-_LEAST_SHADE = 0.008  # of the width of the axes
+_CROWDED = 500  # number of dots from which they are paler
+_MANY = 1500  # number of dots from which they are an image inside the SVG
+_ASIDE = 0.15  # offset of the means before and after from a categorical value's position
+_LEAST_SHADE = 0.008  # least width of a shaded interval, as a share of the axes' width
 _MOST_SCANS = 12
 
 
@@ -57,20 +57,20 @@ def mean_residuals_along(
     names: Sequence[str] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw mean residuals against a covariate, the 95 % band of chance, and the part of it that stands out.
+    """Draw mean residuals against a covariate, the 95 % band of chance, and the interval that is significant.
 
     Parameters
     ----------
     means
         From `mean_residuals`.
     label, unit
-        Of the covariate with its unit; of the readings.
+        Label of the covariate with its unit; unit of the readings.
     each
         Covariate and residual of every reading, (n_points,) each, drawn as dots behind.
     window
-        Ends of what stands out, shaded.
+        Ends of the significant interval, shaded.
     names
-        Names of the values 0, 1, 2 ... of a covariate without a scale.
+        Names of the values 0, 1, 2 ... of a categorical covariate.
     ax
         Axes to draw on; a new figure without.
     """
@@ -113,18 +113,18 @@ def one_scan(
     label: str,
     unit: str,
 ) -> AxesGrid:
-    """Draw the readings of one scan with what each model predicts, and below the residuals of each.
+    """Draw the readings of one scan with each model's predictions, and below them the residuals.
 
     Parameters
     ----------
     along, readings
-        Place or time, and reading, (n_rows,); NaN where there is no usable reading.
+        Position or time, and readings, (n_rows,); NaN where there is no usable reading.
     models
         Name and predicted readings, (n_rows,), the calibrated model first.
     joined
-        Whether the rows are places along a line, which a curve may join.
+        Whether the rows lie along a line, so that a curve may join them.
     label, unit
-        Of the x axis with its unit; of the readings.
+        Label of the x axis with its unit; unit of the readings.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def one_scan(
 
 
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
-    """Draw readings in the order they were taken: all that there is to see of a few."""
+    """Draw readings in order of time, for recordings too short for any other figure."""
     require_recording(recording)
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
@@ -165,7 +165,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
 def residual_clouds(
     covariates: Sequence[tuple[str, FloatArray]], models: Sequence[tuple[str, FloatArray]], *, unit: str
 ) -> AxesGrid:
-    """Draw all residuals against each covariate, with running means, a panel a covariate.
+    """Draw all residuals against each covariate, with running means, one panel per covariate.
 
     Parameters
     ----------
@@ -201,16 +201,16 @@ def residual_clouds(
 def gain_by_scan(
     scans: Sequence[tuple[str, float]], mean: float, sd: float, *, part: str = "scan", ax: Axes | None = None
 ) -> Axes:
-    """Draw the gain on each held-out scan, nats per reading, and the mean of all with its standard error.
+    """Draw the gain on each held-out scan in nats per reading, and the mean over all with its standard error.
 
     Parameters
     ----------
     scans
-        Name and gain of each. Of more than twelve those of largest and least gain are drawn.
+        Name and gain of each. Of more than twelve, those with the largest and smallest gains are drawn.
     mean, sd
-        Over all held-out readings, with the standard error.
+        Mean over all held-out readings, and its standard error.
     part
-        What is held out.
+        Name of the held-out unit, such as "scan".
     ax
         Axes to draw on; a new figure without.
     """
@@ -227,18 +227,18 @@ def gain_by_scan(
     ax.axvline(0, color=BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
-    tidy(ax, x=f"gain on a {part} that the fit has not seen (nats per reading)", y=f"held-out {part}")
+    tidy(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}")
     plain_numbers(ax, y=False)
     legend_above(ax)
     return ax
 
 
-_CHANCE = "95 % of chance alone"
+_CHANCE = "95 % by chance alone"
 _STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
 
 
 def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
-    """Draw dots, the smaller and paler the more there are."""
+    """Draw dots, smaller and paler if there are many."""
     ok = np.isfinite(x) & np.isfinite(y)
     n = max(int(ok.sum()), 1)
     size, alpha = float(np.clip(4000 / n, 4, 16)), 0.35 if n > _CROWDED else 0.7
@@ -246,7 +246,7 @@ def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> No
 
 
 def _names_on_x(ax: Axes, names: Sequence[str]) -> None:
-    """Set names below their values, slanted and thinned where they do not fit side by side."""
+    """Label values by name, slanted and thinned where they do not fit side by side."""
     width_in = cast(Figure, ax.figure).get_figwidth()  # none of our figures has subfigures
     fits = sum(len(name) + 2 for name in names) < 12 * width_in
     skip = max(1, round(len(names) / (4 * width_in)))
@@ -257,7 +257,7 @@ def _names_on_x(ax: Axes, names: Sequence[str]) -> None:
 
 
 def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average groups of about one twentieth of the points, neighbours in x."""
+    """Average groups of neighbours in x, each about one twentieth of the points."""
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]
     if x.size == 0:

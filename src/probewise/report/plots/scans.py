@@ -1,4 +1,4 @@
-"""One recording by two models: a panel a scan, and one scan from close by."""
+"""Residuals of two models: one panel per scan, and one scan in detail."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from probewise.report.words import unit_name
 
 __all__ = ["before_and_after", "residuals_by_scan"]
 
-_MOST_GROUPS, _LEAST_ROWS = 18, 5  # of neighbours that a running mean is made of
-_TELLING = 0.3  # share of the largest change by the repair, beyond which a curve is worth looking at
+_MOST_GROUPS, _LEAST_ROWS = 18, 5  # number of groups of neighbours in a running mean
+_TELLING = 0.3  # share of the repair's largest change: the figure shows where the change exceeds it
 _BEFORE, _AFTER = "calibrated model", "repaired model"
 _ALONG = "distance from the edge (mm)"
 _ALONG_OTHERS = "place along the scan (mm)"
@@ -27,18 +27,18 @@ _ALONG_OTHERS = "place along the scan (mm)"
 def residuals_by_scan(
     recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
 ) -> AxesGrid:
-    """Draw recorded minus predicted along each scan by two models, all panels on the same axes.
+    """Draw the residuals of two models along each scan, all panels on the same axes.
 
     Parameters
     ----------
     recording
-        What was recorded.
+        The recording.
     before, after
         Predicted readings by the calibrated and by the repaired model, (n_points,).
     most
-        How many scans are drawn: those that the repair changes most, in the order they were taken.
+        Number of scans drawn: those that the repair changes most, in order of time.
     columns
-        How many stand side by side.
+        Panels per row.
 
     Returns
     -------
@@ -70,14 +70,14 @@ def residuals_by_scan(
 def before_and_after(
     recording: Recording, rows: IntArray, before: FloatArray, after: FloatArray, *, name: str = ""
 ) -> AxesGrid:
-    """Draw readings with the curves of two models, and below what each leaves, about where the two differ.
+    """Draw readings with the curves of two models, and below them the residuals, around where the models differ.
 
     Parameters
     ----------
     recording
-        What was recorded.
+        The recording.
     rows
-        Which of its readings, (n_rows,): one scan, or several over one pattern in one orientation.
+        Row numbers, (n_rows,): one scan, or several over one pattern in one orientation.
     before, after
         Predicted readings by the calibrated and by the repaired model, (n_points,).
     name
@@ -123,7 +123,7 @@ def before_and_after(
 
 
 def _telling(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
-    """Give the ends of the way along which two models differ, with as much again on either side."""
+    """Return the ends of the interval in which two models differ, widened by its length on either side."""
     along = np.concatenate([track.along_mm for track in found])
     by_place = np.concatenate([change[rows[track.rows]] for track in found])
     differs = along[by_place >= _TELLING * max(float(by_place.max()), 1e-300)]
@@ -140,7 +140,7 @@ def _residuals(recording: Recording, track: Track, predicted: FloatArray) -> tup
 
 
 def _means(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of neighbours along the scan: groups of even width, for readings are dense where a scan is slow."""
+    """Average neighbours along the scan in groups of equal width, since readings are dense where a scan is slow."""
     if along.size == 0:
         return along, residual
     edges = np.linspace(along.min(), along.max(), min(_MOST_GROUPS, max(along.size // _LEAST_ROWS, 1)) + 1)

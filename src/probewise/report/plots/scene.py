@@ -19,11 +19,11 @@ from probewise.report.plots.canvas import BLACK, COPPER, OUT_OF_REACH, SMALL_PT,
 __all__ = ["bar_beside", "explain_field", "out_of_reach", "playing_field"]
 
 LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
-NEXT_GREEN = "#00e08a"  # the palette's green, lighter: the next place must stand out on copper
+NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
 CARD_YELLOW = "#ffd54a"
-OUTLINE_BLUE = "#3fa7ff"  # likewise; the paper's hypotheses are blue
-DARK_EDGE = "#c8c8c8"  # of a square whose reading was dark
-GROUND = "#2a1a12"  # of the key, the map's darkest: on it all that is drawn on the map is seen
+OUTLINE_BLUE = "#3fa7ff"  # likewise; hypotheses are blue, as in the paper
+DARK_EDGE = "#c8c8c8"  # edge of a square whose reading was dark
+GROUND = "#2a1a12"  # background of the legend, as dark as the map at its darkest: everything on the map shows on it
 
 
 def playing_field(
@@ -44,7 +44,7 @@ def playing_field(
     lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the field as the machine learning system sees it (paper, figures of the entropy map).
+    """Draw the field with the utility map, hypotheses and readings (paper, figures of the entropy map).
 
     Parameters
     ----------
@@ -55,21 +55,21 @@ def playing_field(
     outlines_mm
         Outline of each sampled hypothesis, shape (n_vertices, 2) each.
     places_mm, readings
-        Where readings were taken, shape (n_readings, 2), and what they were, (n_readings,).
+        Places of the readings, shape (n_readings, 2), and their values, (n_readings,).
     levels
         Reading of black and of white, for the brightness of the squares.
     next_mm
         The place chosen next.
     truth_mm
-        Outline of what really lies there, drawn dashed; left out where nobody knows.
+        Outline of the true target, drawn dashed; None if unknown.
     cards_mm
         Corners of each card whose place and albedo are known, (4, 2).
     title, utility_label
         Text of the figure and of its colour bar.
     utility_max
-        Upper end of the colour scale, so that figures can be compared; the map's own maximum without.
+        Upper end of the colour scale, for comparable figures; default: the map's maximum.
     lego_scale
-        Whether the paper's coordinates, LEGO distance units, stand on top.
+        Whether to add the paper's coordinates, LEGO distance units, at the top.
     ax
         Axes to draw on; a new figure without.
     """
@@ -93,7 +93,7 @@ def playing_field(
         ax.plot([], [], color=OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
     if truth_mm is not None:
         dashes = (0, (5, 3))
-        label = "what really lies there"
+        label = "the true target"
         ax.plot(truth_mm[:, 0], truth_mm[:, 1], color="white", linewidth=1.4, linestyle=dashes, label=label)
     for n, corners in enumerate(cards_mm):
         label = "" if n else "known card"
@@ -126,18 +126,18 @@ def playing_field(
 
 
 def explain_field(axes: Axes | AxesGrid) -> None:
-    """Explain lines and squares of one or several playing fields in one figure, below them."""
+    """Draw one legend for all playing fields of a figure, below them."""
     key_below(axes, n_columns=3, ground=GROUND, ink="white")
 
 
 def out_of_reach(ax: Axes) -> None:
-    """Show what is not drawn over as out of the arm's reach: the same grey on every drawing of the field."""
+    """Paint the background grey: whatever the map does not cover is out of the arm's reach."""
     ax.set_facecolor(OUT_OF_REACH)
     ax.add_patch(Rectangle((0.0, 0.0), 0.0, 0.0, facecolor=OUT_OF_REACH, label="out of the arm's reach"))
 
 
 def bar_beside(ax: Axes, image: ScalarMappable, label: str) -> None:
-    """Stand a colour bar beside axes, as tall as they are."""
+    """Add a colour bar beside axes, of the same height."""
     ax.figure.colorbar(image, cax=ax.inset_axes((1.015, 0.0, 0.022, 1.0)))
     bar = ax.child_axes[-1]
     bar.set_ylabel("\n".join(textwrap.wrap(label, 32)), fontsize=SMALL_PT)

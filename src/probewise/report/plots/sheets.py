@@ -1,4 +1,4 @@
-"""Sheets as pages of a PDF at true scale: one unit of the drawing is one millimetre of the paper."""
+"""Printable sheets as a PDF at true scale: one drawing unit is one millimetre on paper."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ __all__ = ["sheets_pdf"]
 
 _MM_PER_IN = 25.4
 _RULER_MM = 100
-_PIXEL_MM = 0.25  # of patterns that no outline draws
+_PIXEL_MM = 0.25  # pixel size for patterns that have no outline
 _ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
 _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
 _THUMB_MM = 38.0
-_CROSS_MM = 15.0  # its ends stand out from below a block of two LEGO studs
+_CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
-    """Draw a page that explains, then every sheet at true scale, page after page.
+    """Draw a cover page with instructions, then every sheet at true scale.
 
     Parameters
     ----------
     sheets
-        What to print.
+        Sheets to print.
     paper
         "a4" or "letter".
     title
-        What all of them are for.
+        Title of the document.
 
     Returns
     -------
-    The PDF, the same bytes for the same sheets.
+    The PDF, reproducible byte for byte.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def _batches(items: Sequence[Any]) -> list[Sequence[Any]]:
 
 
 def _paper(page_mm: tuple[float, float]) -> Axes:
-    """Open a page whose drawing has the millimetre for unit, its lower left corner for origin."""
+    """Open a page with coordinates in mm from its lower left corner."""
     figure = Figure(figsize=(page_mm[0] / _MM_PER_IN, page_mm[1] / _MM_PER_IN), facecolor="none")
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(0.0, page_mm[0]), ylim=(0.0, page_mm[1]))
@@ -127,7 +127,7 @@ def _grid(tiles: Sequence[Tile]) -> str:
 
 
 def _thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float, float]) -> None:
-    """Draw a sheet small, with its pages, its origin and the sensor at orientation 0."""
+    """Draw a small overview of a sheet: its pages, its origin, and the sensor at orientation 0."""
     width, height = sheet.size_mm
     scale = min(66.0 / width, (_THUMB_MM - 2.0) / height)
     low = np.array(sheet.low_mm)
@@ -195,7 +195,7 @@ def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: s
 
 
 def _joins(tiles: Sequence[Tile], tile: Tile, first: int) -> str:
-    """Say which pages lie on this one's strips."""
+    """Name the pages to be glued on this page's strips."""
     at = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
     right, above = at.get((tile.column + 1, tile.row)), at.get((tile.column, tile.row + 1))
     said = [f"right strip: page {right}"] if right else []
@@ -212,7 +212,7 @@ def _ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
 
 
 def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True) -> None:
-    """Print what lies between two corners of the sheet's frame; `place` moves points, (n, 2), onto the page."""
+    """Paint the part of the sheet between two corners; `place` maps points, (n, 2), from sheet to page."""
     for corners, albedo in _areas(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))
         patch = ax.add_patch(Outline(place(corners), closed=True, fc=ink, ec="none", lw=0, zorder=1))
@@ -235,7 +235,7 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
 
 
 def _areas(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
-    """Give outlines (n, 2) with the albedo inside, in the order of painting."""
+    """Return outlines (n, 2) with the albedo inside, in the order of painting."""
     (x0, y0), (x1, y1) = low_mm, high_mm
     whole = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     match pattern:
@@ -264,7 +264,7 @@ def _areas(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray
 
 
 def _beyond(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
-    """Cut a convex outline, (n, 2): what lies beyond a line."""
+    """Clip a convex outline, (n, 2), to the half-plane beyond a line."""
     if not len(corners_mm):
         return corners_mm
     away = corners_mm @ [np.cos(normal_rad), np.sin(normal_rad)] - offset_mm

@@ -1,4 +1,4 @@
-"""The spatial sensitivity function seen from above, and the evidence for each number of Gaussians."""
+"""The spatial sensitivity function (SSF) seen from above, and the evidence for each number of Gaussians."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["log_evidences", "spatial_sensitivity", "ssf_by_order"]
 
 
 def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str = "") -> Axes:
-    """Draw an SSF in the sensor frame: shade, and the lines at 1/2 and 1/10 of its peak.
+    """Draw an SSF in the sensor frame, with contours at 1/2 and 1/10 of its peak.
 
-    The cross marks the mechanical origin of the sensor package.
+    The cross marks the centre of the sensor package.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     values = np.asarray(field.values)
     x, y = field.u_mm, field.v_mm
     half = field.pixel_mm / 2
-    ax.set_facecolor(colormaps["cividis"](0.0))  # beyond the field's pixels there is nothing
+    ax.set_facecolor(colormaps["cividis"](0.0))  # beyond the field's pixels the SSF is zero
     peak = float(values.max())
     image = ax.imshow(
         values / peak,
@@ -60,7 +60,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
 
 
 def _reach(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
-    """Half width of a square about the origin that holds all that matters, rounded up to a half of its decade."""
+    """Return the half width of a square about the origin that holds the visible SSF, rounded up to half a decade."""
     matters = values > 0.01 * values.max()
     far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
     unit = 0.5 * 10 ** np.floor(np.log10(far))
@@ -104,7 +104,7 @@ def ssf_by_order(
 def log_evidences(
     orders: Sequence[int], log_z: Sequence[float], log_z_error: Sequence[float], *, ax: Axes | None = None
 ) -> Axes:
-    """Draw log-evidence below the best model's, with its error, for each number of Gaussians."""
+    """Draw the log evidence relative to the best model, with its error, for each number of Gaussians."""
     ax = axes_or_new(ax, size_in=(4.6, 3.4))
     below = np.asarray(log_z) - np.max(log_z)
     colours = [BLUE if b == 0 else GREY for b in below]

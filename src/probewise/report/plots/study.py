@@ -1,4 +1,4 @@
-"""Many runs at once: how fast they learn, and what each row of a study needs."""
+"""Many runs at once: posterior widths by reading, and readings needed in each row of a study."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _BAND = (0.16, 0.84)
 def widths_of_runs(
     runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw the widest posterior sd against the number of readings: median and middle 68 % of many runs, a panel each.
+    """Draw the widest posterior sd by reading: median and middle 68 % of the runs, one panel per row.
 
-    The other panels' medians are thin lines, to compare with. A run that has ended stays at its last width.
+    Thin lines are the medians of the other panels. A run that has ended keeps its last width.
 
     Parameters
     ----------
     runs
-        By name: of each run the widest posterior sd after each reading, (n_readings,), mm.
+        For each row, by name: the widest posterior sd after each reading of every run, (n_readings,), mm.
     target_mm
-        The precision asked for.
+        Target precision.
     axes
         Axes to draw on, of the shape returned; a new figure without.
 
@@ -77,7 +77,7 @@ def widths_of_runs(
 
 
 def _ended(widths: Sequence[FloatArray]) -> FloatArray:
-    """Let every run stay at its last width until the longest has ended: (n_runs, n_readings)."""
+    """Extend every run at its last width to the length of the longest: (n_runs, n_readings)."""
     longest = max(len(w) for w in widths)
     return np.array([np.pad(w, (0, longest - len(w)), mode="edge") for w in widths])
 
@@ -87,7 +87,7 @@ def _numbers(table: FloatArray) -> FloatArray:
 
 
 def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None) -> AxesGrid:
-    """Draw what each row of a study needs: mean and median in all, and after the first reading on white.
+    """Draw mean and median readings needed in each row of a study, in all and after the first reading on white.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
         ax.grid(axis="x", color=GREY, alpha=0.25)
         ax.set_yticks(y, names)
         tidy(ax, x="number of readings", y="", title=title)
-    # Half a row of room at either end, for one row too.
+    # Half a row of margin at either end, also for a single row.
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
     if own:
         key_below(axes)

@@ -1,4 +1,4 @@
-"""What a diagnosis believes, and how that moves from round to round, as bars."""
+"""Probabilities of hypotheses as bars: of one diagnosis, and from round to round."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def hypothesis_probabilities(
     Parameters
     ----------
     names, probabilities
-        One a hypothesis; probabilities sum to one over all.
+        One per hypothesis; the probabilities sum to one.
     most
-        How many are drawn; the others are added up in one last bar.
+        Number of bars; one more adds up the other hypotheses.
     ax
         Axes to draw on; a new figure without.
     """
@@ -46,19 +46,19 @@ def hypothesis_probabilities(
     ax.spines["left"].set_visible(False)
     ax.set_xlim(0, 1.08)
     ax.set_xticks(np.linspace(0.0, 1.0, 6))
-    # Room for three bars at least, so that one alone is no wall.
+    # Room for at least three bars, so that a single bar is not too thick.
     ax.set_ylim(min(at[-1], -2.0) - 0.5, 0.5)
     return tidy(ax, x="probability", y="")
 
 
 def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
-    """Draw the probabilities of the hypotheses after each round, as one bar a round.
+    """Draw the probabilities of the hypotheses after each round, one stacked bar per round.
 
     Parameters
     ----------
     beliefs
-        By name of the round, the first on top: the probability of each hypothesis by its name. The six with the
-        highest probability in any round have colours of their own, the others share a grey.
+        Probability of each hypothesis by name, for each round by name, the first on top. The six hypotheses that are
+        the most probable in any round have colours, the others share a grey.
     ax
         Axes to draw on; a new figure without.
     """

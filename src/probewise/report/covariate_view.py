@@ -1,4 +1,4 @@
-"""Along what the residuals are drawn: the covariate of each place, and the one that shows the verdict best."""
+"""Covariates to draw residuals against: one for each place, and the one that shows the verdict best."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from probewise.report.residual_means import Means, mean_residuals
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
-__all__ = ["Chance", "Witness", "along_scan", "is_line", "of_place", "seen_first", "telling"]
+__all__ = ["CovariateView", "ResidualNoise", "along_scan", "is_line", "of_place", "seen_first", "telling"]
 
-_SEEN = 2.3  # sds of chance from which a mean is seen to stand out
-_N_SAMPLES = 200  # of the posterior, for what the fit absorbs
-_ASTRAY = 0.01  # of its length, by which a scan may leave its line
-_LEAST_PLACES = 3  # that make a line
-_LEAST_PERIODS = 3.0  # within a recording, for folding it
+_SEEN = 2.3  # sds beyond which a mean visibly leaves the band
+_N_SAMPLES = 200  # posterior samples for the variance that the fit absorbs
+_ASTRAY = 0.01  # largest deviation of a scan from its line, as a share of its length
+_LEAST_PLACES = 3  # least number of places in a line
+_LEAST_PERIODS = 3.0  # least number of periods in a recording for folding it
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
-    """A covariate as it is drawn: each row's value (n_points,), NaN where it has none, its label with unit.
+class CovariateView:
+    """A covariate to draw residuals against: values (n_points,), NaN where there is none, and a label with unit.
 
-    `names` are those of its values where it has no scale; `window` is what stands out, in the covariate's unit or,
-    with names, in steps; `place` is the place that it shows, if any.
+    `names` name the values of a categorical covariate; `window` is the significant interval, in the covariate's unit
+    or, with names, in positions; `place` is the place that it shows, if any.
     """
 
     at: FloatArray
@@ -41,21 +41,21 @@ class Witness:
 
     @property
     def shown_names(self) -> list[str] | None:
-        """Names in the order in which they stand."""
+        """Names in the order in which they are drawn."""
         return None if self.names is None else [self.names[v] for v in _values(self.at)]
 
 
 @dataclass(frozen=True, eq=False)
-class Chance:
-    """The noise of each reading, (n_points,), its memory, and posterior samples of the calibrated predictions."""
+class ResidualNoise:
+    """What chance means of residuals depend on: noise sds (n_points,), AR(1) correlation, posterior predictions."""
 
     sd: FloatArray
     rho: float
     absorbed: FloatArray | None
 
     @classmethod
-    def of(cls, diagnosis: Diagnosis) -> Chance:
-        """Take the noise model of a diagnosis."""
+    def of(cls, diagnosis: Diagnosis) -> ResidualNoise:
+        """Build from the noise model of a diagnosis."""
         found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
         sd = np.full(len(diagnosis.recording), float(diagnosis.repaired.noise_sd.mean()))
         if "ratio" in found:
@@ -66,8 +66,8 @@ class Chance:
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
 
-    def means(self, diagnosis: Diagnosis, witness: Witness, *, after: bool) -> Means:
-        """Average the residuals of a diagnosis along a witness."""
+    def means(self, diagnosis: Diagnosis, witness: CovariateView, *, after: bool) -> Means:
+        """Average the residuals of a diagnosis along a covariate."""
         return mean_residuals(
             witness.at,
             diagnosis.repair.before.residuals,
@@ -81,11 +81,11 @@ class Chance:
         )
 
 
-def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
-    """Choose what the first figure is drawn along: the first that is seen to stand out, else the one that does most.
+def telling(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
+    """Choose the first figure's covariate: the first whose means leave the band of chance, else the nearest to it.
 
-    What is named comes first: a wave folded at its period, then the places in their order. What is unknown comes by the
-    covariate in which it is most likely. Last comes the change that the repair makes.
+    Candidates in order: a named wave, folded at its period; the places; for an unknown effect, its most likely
+    covariate; last, the change that the repair makes.
     """
     values = covariate_values(diagnosis)
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
@@ -96,15 +96,15 @@ def telling(diagnosis: Diagnosis, chance: Chance) -> Witness:
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_by_change(diagnosis))
     if not found:
-        return Witness(np.array(diagnosis.repair.before.readings), label_of(diagnosis, "level"))
+        return CovariateView(np.array(diagnosis.repair.before.readings), label_of(diagnosis, "level"))
     sizes = [chance.means(diagnosis, witness, after=False).stands_out for witness in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
 
-def seen_first(diagnosis: Diagnosis, chance: Chance) -> list[tuple[Place, bool]]:
-    """Order the places as a reader looks for them, each with whether a mean is seen to leave the band of chance.
+def seen_first(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
+    """Order the places for the report, each with whether a mean leaves the band of chance.
 
-    First comes what the unknown varies with, of which the headline speaks; then what is seen; then what is not.
+    First the covariate of the unknown effect, which the headline names; then visible places; then the others.
     """
     values, seen = covariate_values(diagnosis), {}
     for place in diagnosis.where:
@@ -112,57 +112,57 @@ def seen_first(diagnosis: Diagnosis, chance: Chance) -> list[tuple[Place, bool]]
         seen[place.witness] = any(chance.means(diagnosis, w, after=False).stands_out >= _SEEN for w in views)
     ordered = sorted(diagnosis.where, key=lambda p: (-_likeness(diagnosis, p), not seen[p.witness]))
     shown: list[Place] = []
-    for place in ordered:  # where there is one scan, a place in all scans and one in that scan are the same
+    for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
         if not any(_is_same(values, place, other) for other in shown):
             shown.append(place)
     return [(place, seen[place.witness]) for place in shown]
 
 
 def _is_same(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
-    """Tell whether two places are one window of one covariate."""
+    """Return whether two places are the same interval of the same covariate."""
     ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
     own, others = values[place.witness], values[other.witness]
     return ends and place.start is not None and np.array_equal(own, others, equal_nan=True)
 
 
-def _views(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[Witness]:
-    """Show a place by its covariate, (n_points,); a scan along its way first."""
+def _views(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
+    """List views of a place by its covariate, (n_points,); a scan also along its path, which comes first."""
     by_covariate = of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
     return [along_scan(diagnosis, place.scan, place), by_covariate]
 
 
-def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> Witness:
-    """Show a place along its covariate, (n_points,)."""
+def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
+    """Build the view of a place along its covariate, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
     label = label_of(diagnosis, place.covariate, place.scan)
     if place.without_effect:
         label = f"reading to be expected without it ({unit_name(unit)})"
     names = category_names(diagnosis, place)
-    return Witness(at, label, names, _window(place, at, names), place)
+    return CovariateView(at, label, names, _window(place, at, names), place)
 
 
-def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> Witness:
-    """Show one scan along its way: a residual that changes its sign leaves no mean by scan."""
+def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
+    """Build the view of one scan along its path: residuals that change sign average to zero over a scan."""
     plan = diagnosis.recording.plan
     rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
     if isinstance(plan, RunTable):
         at = np.full(len(plan), np.nan)
         at[rows] = plan.time_s[rows]
         whole = scan if plan.run is not None else None
-        return Witness(at, label_of(diagnosis, "time" if plan.has_time else "row", whole), place=place)
+        return CovariateView(at, label_of(diagnosis, "time" if plan.has_time else "row", whole), place=place)
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
     if not is_line(plan, rows):
         along, label = plan.time_s[rows], "time (s)"
     at = np.full(len(plan), np.nan)
     at[rows] = along
-    return Witness(at, f"{label}, scan {scan}", place=place)
+    return CovariateView(at, f"{label}, scan {scan}", place=place)
 
 
 def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
-    """Tell whether rows of one scan were taken along a line, at three places or more; those of a table, in time."""
+    """Return whether rows of one scan lie along a line, at three or more places; rows of a table, along time."""
     if isinstance(plan, RunTable):
         return True
     places = np.stack([plan.x_mm[rows], plan.y_mm[rows]])
@@ -173,7 +173,7 @@ def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
 
 
 def _likeness(diagnosis: Diagnosis, place: Place) -> float:
-    """Give the share of the unknown that depends on a place's covariate; 0 where something has a name."""
+    """Return the probability that the unknown effect depends on a place's covariate; 0 where the effect is named."""
     shares = diagnosis.judged.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
         return 0.0
@@ -181,8 +181,8 @@ def _likeness(diagnosis: Diagnosis, place: Place) -> float:
     return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)
 
 
-def _folded(diagnosis: Diagnosis) -> list[Witness]:
-    """Fold time, or X, at the period of a wave that is named."""
+def _folded(diagnosis: Diagnosis) -> list[CovariateView]:
+    """Fold time, or X, at the period of a named wave."""
     plan, out = diagnosis.recording.plan, []
     for effect in diagnosis.effects:
         found = {p.name: p.mean for p in effect.parameters}
@@ -196,7 +196,7 @@ def _folded(diagnosis: Diagnosis) -> list[Witness]:
         if found.get("period_mm", 0.0) > 0:
             out.append((plan.x_mm, found["period_mm"], "X", "mm"))
     return [
-        Witness(
+        CovariateView(
             np.mod(values, period), f"{name} within one period of {period:.4g} {unit}" + (f" ({unit})" if unit else "")
         )
         for values, period, name, unit in out
@@ -214,15 +214,15 @@ def _waves_of_table(
     return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 
 
-def _by_change(diagnosis: Diagnosis) -> Witness:
+def _by_change(diagnosis: Diagnosis) -> CovariateView:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
-    return Witness(
+    return CovariateView(
         diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})"
     )
 
 
 def _window(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
-    """Say what to shade: from start to end, or about the scan, direction or orientation named."""
+    """Return the interval to shade: from start to end, or around the scan, direction or orientation."""
     ends = None if place.start is None or place.end is None else (place.start, place.end)
     if not names:
         return ends

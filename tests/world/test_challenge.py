@@ -25,14 +25,14 @@ from probewise.world.challenge import (
     draw_case,
     draw_plan,
     draw_sensor,
-    kept_back,
-    kept_back_plans,
+    held_out,
+    held_out_plans,
     stratum_of,
 )
-from probewise.world.challenge.candidates import Setting
+from probewise.world.challenge.candidates import CleanSetup
 from probewise.world.challenge.regions import Region, region_of
 from probewise.world.challenge.sensors import draw_spot
-from probewise.world.challenge.sizing import Ruler
+from probewise.world.challenge.sizing import EffectSizer
 
 
 def left_by_levels(clean, changed):
@@ -53,7 +53,7 @@ def number_of(kind, *, skip=0, **wanted):
 
 
 def draw(number, seed=11):
-    return draw_case(seed, number, surviving=left_by_levels)
+    return draw_case(seed, number, norm_after_refit=left_by_levels)
 
 
 case = functools.cache(draw)
@@ -86,8 +86,8 @@ def test_seed_and_number_alone_make_the_case(number):
     assert fingerprint(first.recording) == fingerprint(again.recording)
     assert first.truth.to_json() == again.truth.to_json()
     assert fingerprint(first.recording) != fingerprint(other.recording)
-    once, twice = kept_back(first), kept_back(first)
-    for name, recording in kept_back(again).items():
+    once, twice = held_out(first), held_out(first)
+    for name, recording in held_out(again).items():
         np.testing.assert_array_equal(recording.readings, once[name].readings)
         np.testing.assert_array_equal(recording.readings, twice[name].readings)
 
@@ -164,7 +164,7 @@ def test_an_effect_outside_the_vocabulary_is_unknown_and_one_gaussian_more_is_cl
 
 def test_no_null_model_sees_what_cannot_be_seen():
     with pytest.raises(NotConvergedError):
-        draw_case(1, number_of("single"), surviving=lambda clean, changed: 0.0)
+        draw_case(1, number_of("single"), norm_after_refit=lambda clean, changed: 0.0)
 
 
 def test_the_truth_is_strict_json_and_the_recording_does_not_tell(tmp_path):
@@ -195,7 +195,7 @@ def test_what_belongs_to_a_scan_is_not_in_the_readings_kept_back():
 @pytest.mark.parametrize("name", PLANS)
 def test_kept_back_are_a_new_angle_a_new_pattern_and_another_direction(name):
     plan = draw_plan(name, rng=np.random.default_rng(1))
-    tests = kept_back_plans(plan, rng=np.random.default_rng(2))
+    tests = held_out_plans(plan, rng=np.random.default_rng(2))
     assert list(tests) == ["angle", "pattern", "direction"]
     angles = np.unique(plan.orientation_rad)
     assert np.abs(np.sin(2 * (tests["angle"].orientation_rad[0] - angles))).min() > 0.5
@@ -228,33 +228,33 @@ def test_every_ssf_is_about_as_large_as_a_lego_sensors(ssf):
 
 
 @pytest.fixture(scope="module", params=list(PLANS))
-def setting(request):
+def setup(request):
     rng = np.random.default_rng(5)
-    return Setting(draw_plan(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng))
+    return CleanSetup(draw_plan(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng))
 
 
-def test_every_candidate_makes_effects_of_its_name(setting):
+def test_every_candidate_makes_effects_of_its_name(setup):
     for name, candidate in {**INSIDE, **OUTSIDE}.items():
-        of_amplitude = candidate.draw(setting, np.random.default_rng(6))
+        of_amplitude = candidate.draw(setup, np.random.default_rng(6))
         for amplitude in (candidate.first, candidate.limit):
             assert of_amplitude(amplitude).name == name
-        assert of_amplitude(candidate.first) == candidate.draw(setting, np.random.default_rng(6))(candidate.first)
+        assert of_amplitude(candidate.first) == candidate.draw(setup, np.random.default_rng(6))(candidate.first)
 
 
-def test_scans_can_be_drawn_that_cross_an_edge_and_their_mounting(setting):
-    assert "edge_0" in setting.scans or "edge_0_out" in setting.scans
-    assert not any(name.startswith(("white", "black", "quadrants")) for name in setting.scans)
-    mounting = setting.mounting_of(next(name for name in setting.scans if "90" in name))
+def test_scans_can_be_drawn_that_cross_an_edge_and_their_mounting(setup):
+    assert "edge_0" in setup.scans or "edge_0_out" in setup.scans
+    assert not any(name.startswith(("white", "black", "quadrants")) for name in setup.scans)
+    mounting = setup.mounting_of(next(name for name in setup.scans if "90" in name))
     assert all("90" in name for name in mounting)
 
 
-def test_a_local_effect_is_found_where_it_is(setting):
-    ruler = Ruler(setting, left_by_levels)
+def test_a_local_effect_is_found_where_it_is(setup):
+    sizer = EffectSizer(setup, left_by_levels)
 
     def region(name, amplitude):
-        return region_of(INSIDE[name].draw(setting, np.random.default_rng(8))(amplitude), ruler)
+        return region_of(INSIDE[name].draw(setup, np.random.default_rng(8))(amplitude), sizer)
 
-    glint = INSIDE["glint"].draw(setting, np.random.default_rng(8))(2.0)
+    glint = INSIDE["glint"].draw(setup, np.random.default_rng(8))(2.0)
     found = region("glint", 2.0)
     # Half as strong at 1.18 sd, seen along y = 0, to the millimetre of the plan.
     half = glint.r * np.sqrt(2 * np.log(2))
@@ -262,7 +262,7 @@ def test_a_local_effect_is_found_where_it_is(setting):
     assert found.low == pytest.approx(glint.x - half, abs=1.01)
     assert found.high == pytest.approx(glint.x + half, abs=1.01)
     step = region("ambient_step", 1.0)
-    assert (step.covariate, step.high) == ("time", setting.plan.time_s[-1])
+    assert (step.covariate, step.high) == ("time", setup.plan.time_s[-1])
     assert region("scan_misplacement", 1.0).scans
     assert region("backlash", 1.0) is None
     assert isinstance(region("saturation", 0.1), Region)

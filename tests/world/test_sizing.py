@@ -7,8 +7,8 @@ import pytest
 
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.world import World, gaussian_spot
-from probewise.world.challenge import Ruler, amplitude_of_size
-from probewise.world.challenge.candidates import Setting
+from probewise.world.challenge import EffectSizer, amplitude_of_size
+from probewise.world.challenge.candidates import CleanSetup
 from probewise.world.challenge.sizing import noise_size
 from probewise.world.concealed import (
     AmbientGradient,
@@ -32,8 +32,8 @@ def left_by_levels(clean, changed):
 
 
 @pytest.fixture(scope="module")
-def ruler(plan):
-    return Ruler(Setting(plan, World(SPOT, noise_sd=0.5)), left_by_levels)
+def sizer(plan):
+    return EffectSizer(CleanSetup(plan, World(SPOT, noise_sd=0.5)), left_by_levels)
 
 
 CURVES = {
@@ -79,30 +79,30 @@ def test_an_effect_that_is_too_small_at_its_limit_is_refused():
     [lambda a: AmbientGradient(a, 0.3 * a), lambda a: Saturation(60 - 50 * a), lambda a: GainDrift(a, 60.0)],
     ids=["ambient_gradient", "saturation", "gain_drift"],
 )
-def test_the_ruler_measures_what_survives_the_refit(of, ruler, plan):
-    amplitude = amplitude_of_size(lambda a: ruler.size(of(a)), 12.0, first=0.05, limit=1.0)
+def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
+    amplitude = amplitude_of_size(lambda a: sizer.size(of(a)), 12.0, first=0.05, limit=1.0)
     clean, changed = (World(SPOT, concealed=c).expected(plan) for c in ((), (of(amplitude),)))
     design = np.stack([np.ones(len(plan)), clean], axis=-1)
     rest = changed - design @ np.linalg.lstsq(design, changed, rcond=None)[0]
     assert np.linalg.norm(rest) / 0.5 == pytest.approx(12, rel=0.02)
 
 
-def test_the_cosine_is_that_of_the_surviving_parts(ruler, plan):
+def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
     one, other = AmbientGradient(0.1, 0.0), GainDrift(0.1, 60.0)
-    clean = ruler.clean.readings
+    clean = sizer.clean.readings
     design = np.stack([np.ones(len(plan)), clean], axis=-1)
     rests = [
-        ruler.recording(e).readings - design @ np.linalg.lstsq(design, ruler.recording(e).readings, rcond=None)[0]
+        sizer.recording(e).readings - design @ np.linalg.lstsq(design, sizer.recording(e).readings, rcond=None)[0]
         for e in (one, other)
     ]
     expected = rests[0] @ rests[1] / np.linalg.norm(rests[0]) / np.linalg.norm(rests[1])
-    assert ruler.cosine(one, other) == pytest.approx(expected, abs=1e-6)
+    assert sizer.cosine(one, other) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
     "effect", [CorrelatedNoise(0.5), SignalDependentNoise(3.0), Outliers(0.04, 8.0)], ids=lambda e: e.name
 )
-def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, plan, ruler):
+def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, plan, sizer):
     """Second route: simulate, and take the mean of the log ratio of the two densities."""
     look = World(SPOT).look(plan)
     rng, n, rows = np.random.default_rng(4), len(plan), look.rows
@@ -122,12 +122,12 @@ def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, pl
         wide = np.exp(log_normal(z, 1 + effect.size**2))
         true = np.log((1 - effect.share) * np.exp(log_normal(z, 1.0)) + effect.share * wide)
     gained = (true - even).sum(axis=1)
-    assert abs(ruler.size(effect) ** 2 / 2 - gained.mean()) < 4 * gained.std() / math.sqrt(3000) + 0.02
+    assert abs(sizer.size(effect) ** 2 / 2 - gained.mean()) < 4 * gained.std() / math.sqrt(3000) + 0.02
 
 
-def test_lost_readings_count_by_how_far_off_they_are(plan, ruler):
-    clean = ruler.clean.readings
-    assert ruler.size(Dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
+def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
+    clean = sizer.clean.readings
+    assert sizer.size(Dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
 
 
 def test_noise_without_a_name_has_no_size(plan):

@@ -1,16 +1,16 @@
-"""Does the diagnosis keep its promises? Recordings that conceal something, diagnosed blind and scored.
+"""Challenges: simulated recordings with concealed effects, diagnosed blind and scored.
 
 The paper judges a sensor model by the inferences made with it (section "Efficacy of Sensor Model"); a diagnosis is
-judged here the same way, on recordings of another simulator whose truth it never sees.
+judged here the same way, on recordings of an independent simulator whose truth it never sees.
 """
 
 from probewise.challenge.case import Investigated, Task, run_case
 from probewise.challenge.confusion import confusion
 from probewise.challenge.estimates import Estimate
+from probewise.challenge.null_refit import NullRefit
 from probewise.challenge.reliability import Bin, calibration_error, reliability
 from probewise.challenge.rounds import score_rounds
 from probewise.challenge.run import run_challenge
-from probewise.challenge.surviving import NullRefit
 from probewise.challenge.table import Decision, Row, by_effect, score
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""One case of a challenge: drawn, diagnosed blind, held against the truth."""
+"""One case of a challenge: drawn, diagnosed blind, compared with the truth."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from probewise.challenge.aliasing import cosines, residual_with_one_named
 from probewise.challenge.covering import parameters_within, place_overlap, sensor_within
 from probewise.challenge.held_out import log_densities
-from probewise.challenge.likeness import cosines, left_beside
-from probewise.challenge.surviving import NullRefit
+from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.investigation import investigate
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.challenge import Case, Hidden, Ruler, draw_case, stratum_of
-from probewise.world.challenge.candidates import Setting
+from probewise.world.challenge import Case, EffectSizer, Hidden, draw_case, stratum_of
+from probewise.world.challenge.candidates import CleanSetup
 from probewise.world.concealed import Disturbs, Quantisation
 
 __all__ = ["Investigated", "Task", "run_case", "said"]
 
-_OWN = 1_000  # child of the case's seed sequence that the drawing has no use for
+_OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 _LEAST_PROBABILITY = 1e-3
 _LEAST_COSINE = 0.5
 
@@ -45,20 +45,20 @@ class Task:
 
 @dataclass(frozen=True)
 class Investigated:
-    """Does a case in rounds: recording, diagnosis, the readings that it asks for, until settled.
+    """Run a case in rounds: recording, diagnosis, the readings that it advises, until settled.
 
-    A value instead of a closure, so that it can be sent to another process.
+    A dataclass instead of a closure, so that it can be pickled for another process.
     """
 
     rounds: int
 
     def __call__(self, task: Task) -> dict[str, Any]:
-        """Return what `run_case` does, and for "rounds" what was said after each, with its number of readings."""
+        """Return the result of `run_case` and, under "rounds", each round's diagnosis and number of readings."""
         return _run(task, partial(_investigated, rounds=self.rounds))
 
 
 def run_case(task: Task) -> dict[str, Any]:
-    """Draw a case, diagnose it from its recording alone, and say what was stated and what is true.
+    """Draw a case, diagnose it from its recording alone, and return the diagnosis and the truth.
 
     Returns
     -------
@@ -74,13 +74,13 @@ def _run(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[
     refit = NullRefit()
     at = "drawing"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what is doubtful is scored like the rest
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
         try:
-            case = draw_case(task.seed, task.number, surviving=refit)
+            case = draw_case(task.seed, task.number, norm_after_refit=refit)
             result |= _truth(case, refit)
             at = "diagnosis"
             result |= diagnosed(case, task)
-        # A campaign of thousands outlives the case that breaks the diagnosis, and tells of it.
+        # A campaign of thousands survives a case that breaks the diagnosis, and reports it.
         except (ProbewiseError, ArithmeticError, LookupError, ValueError) as error:
             result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
     return result
@@ -89,7 +89,7 @@ def _run(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[
 def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
     truth = case.truth
     plain = replace(case.world, concealed=(), step=None)
-    ruler = Ruler(Setting(case.recording.plan, plain), refit)
+    sizer = EffectSizer(CleanSetup(case.recording.plan, plain), refit)
     return {
         "plan": truth.plan,
         "ssf": truth.ssf,
@@ -97,28 +97,28 @@ def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
         "noise_model": truth.noise_model,
         "readings": len(case.recording),
         "truth": list(truth.combination),
-        "hidden": _hidden(truth.hidden, ruler, refit),
+        "hidden": _hidden(truth.hidden, sizer, refit),
         "alias": None if truth.alias is None else truth.alias.effect.name,
         "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
     }
 
 
-def _hidden(hidden: Sequence[Hidden], ruler: Ruler, refit: NullRefit) -> list[dict[str, Any]]:
-    """Tell of the effects; of two, "size_beside": how large each still is where the other is named."""
-    each = [_effect(one, ruler, refit) for one in hidden]
+def _hidden(hidden: Sequence[Hidden], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
+    """Describe the effects; for a pair also "size_beside", the size of each when the other is in the model."""
+    each = [_effect(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
-        both = ruler.recording(*(one.effect for one in hidden))
-        left = left_beside(refit, ruler.clean, both, [one.name for one in hidden])
+        both = sizer.recording(*(one.effect for one in hidden))
+        left = residual_with_one_named(refit, sizer.clean, both, [one.name for one in hidden])
         for own, other in zip(each, reversed(each), strict=True):
-            own["size_beside"] = left[other["name"]] / ruler.setting.world.noise_sd
+            own["size_beside"] = left[other["name"]] / sizer.setup.world.noise_sd
     return each
 
 
-def _effect(hidden: Hidden, ruler: Ruler, refit: NullRefit) -> dict[str, Any]:
-    """Tell of one effect; "cosines": what else looks like it in this plan, and how much."""
-    # Rounding is no noise of the world's, but what a diagnosis says of it is said of the noise.
+def _effect(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
+    """Describe one effect; "cosines": its aliases in this plan with their cosines."""
+    # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
-    like = {} if on_noise else cosines(refit, ruler.clean, ruler.recording(hidden.effect))
+    like = {} if on_noise else cosines(refit, sizer.clean, sizer.recording(hidden.effect))
     return {
         "name": hidden.name,
         "size_lambda": hidden.size_lambda,
@@ -170,7 +170,7 @@ def _investigated(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
 
 
 def said(diagnosis: Diagnosis) -> dict[str, Any]:
-    """List what a diagnosis states, as scoring asks for it."""
+    """Return the statements of a diagnosis that are scored."""
     return {
         "verdict": diagnosis.verdict,
         "p_value": diagnosis.p_value,
@@ -183,7 +183,7 @@ def said(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _settled(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
-    """Take the readings that the diagnosis asked for and diagnose all of them together."""
+    """Take the readings that the diagnosis advises and diagnose all readings together."""
     asked = diagnosis.next_measurement
     if asked is None:
         return None

@@ -1,4 +1,4 @@
-"""What is taken for what."""
+"""The confusion matrix."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ OUTSIDE, SEVERAL = "outside", "several"
 def confusion(
     results: Sequence[Mapping[str, Any]], *, label: Callable[[str], str] = str
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
-    """Count what was said where nothing, one effect, or something outside the vocabulary was concealed.
+    """Count answers by truth, for cases that conceal nothing, one effect, or one outside the vocabulary.
 
-    An alias of the truth counts as the truth. Only names that occur have a row or a column; `label` may put several
-    into one.
+    An alias of the truth counts as the truth. Only names that occur have a row or a column; `label` may merge several
+    names.
 
     Returns
     -------
-    Truths, in the order of the vocabulary; what was said; the counts, (n_truths, n_said).
+    Truths, in the order of the vocabulary; answers; counts, (n_truths, n_said).
     """
     counts: Counter[tuple[str, str]] = Counter()
     for result in results:

@@ -1,4 +1,4 @@
-"""Do the intervals stated hold the truth? An effect's parameters, the sensor's, and the place of a local effect."""
+"""Coverage of the stated intervals: effect parameters, sensor parameters, and the place of a local effect."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from probewise.world.world import World
 
 __all__ = ["parameters_within", "place_overlap", "sensor_within"]
 
-_NOT_STATED = frozenset({"softness"})  # the vocabulary leaves it open
+_NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
 def parameters_within(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
     """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
 
-    An angle counts by its nearest turn. What is no single number is left out: values of runs, which share one prior.
+    Angles are compared modulo a turn. Parameters with one value per run, which share a prior, are left out.
     """
     out = {}
     for stated in found.parameters:
@@ -37,9 +37,9 @@ def parameters_within(parameters: Mapping[str, Any], found: EffectFound) -> dict
 
 
 def sensor_within(world: World, samples: ModelSamples) -> dict[str, list[float]]:
-    """Pair the truth of the footprint's moments and of the levels with their 95 % intervals.
+    """Pair the true second moments of the footprint and the levels with their 95 % intervals.
 
-    Moments, because they mean the same whatever the number of Gaussians: mean (mm), variances and covariance (mm^2).
+    Moments do not depend on the number of Gaussians: mean (mm), variances and covariance (mm^2).
     """
     mean, covariance = world.spot.moments()
     n_ssf = 6 * samples.n_gaussians
@@ -79,11 +79,11 @@ def _moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def place_overlap(region: Region, places: Sequence[Place]) -> float:
-    """Return intersection over union of where an effect is and the strongest place of that covariate; 0 without one."""
+    """Return intersection over union of an effect's region and the strongest place in that covariate; 0 if none."""
     place = next((p for p in places if p.covariate == region.covariate), None)
     if place is None:
         return 0.0
-    if region.scans:  # an effect that is bound to several is told one by one, each as strong as it is
+    if region.scans:  # an effect with several scans is located in each by itself, with its own strength
         own = {p.scan for p in places if (p.covariate, p.p_value, p.z) == ("scan", place.p_value, place.z)}
         return len(own & {*region.scans}) / len(own | {*region.scans})
     if region.low is None or region.high is None or place.start is None or place.end is None:

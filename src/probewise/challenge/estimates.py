@@ -1,4 +1,4 @@
-"""Numbers with 95 % intervals."""
+"""Estimates with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DRAWS = 400
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number, the ends of its 95 % interval, and of how many it was made; NaN of none."""
+    """An estimate, the ends of its 95 % interval, and the sample size; NaN for an empty sample."""
 
     value: float
     low: float
@@ -30,7 +30,7 @@ _NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
 def share(hits: list[bool]) -> Estimate:
-    """Estimate a share, with Wilson's interval (Wilson 1927)."""
+    """Estimate a proportion, with Wilson's interval (Wilson 1927)."""
     if not hits:
         return _NOTHING
     found = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
@@ -49,10 +49,10 @@ def mean(values: list[float]) -> Estimate:
 
 
 def resampled(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
-    """Estimate a statistic of rows (n, ...), with the basic interval of a bootstrap, the same each time.
+    """Estimate a statistic of rows (n, ...), with the basic bootstrap interval from fixed random draws.
 
-    The basic interval mirrors the draws about the value, so that a statistic that is biased by few rows is not
-    taken at its word (Davison and Hinkley 1997, section 5.2).
+    The basic interval reflects the draws about the estimate, which corrects the bias of small samples (Davison and
+    Hinkley 1997, section 5.2).
     """
     if not len(rows):
         return _NOTHING

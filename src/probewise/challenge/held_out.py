@@ -1,4 +1,4 @@
-"""What null, repaired and true model make of readings that a diagnosis never saw."""
+"""Log predictive densities of held-out readings under the null, repaired, right and true models."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from probewise.diagnosis import Diagnosis, model_with
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
-from probewise.world.challenge import NO_PHYSICS, Case, kept_back
+from probewise.world.challenge import NO_PHYSICS, Case, held_out
 
 __all__ = ["log_densities"]
 
 
 def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator) -> dict[str, dict[str, float]]:
-    """Sum the log predictive densities of each scan kept back, in nats.
+    """Sum the log predictive densities of each held-out scan, in nats.
 
-    "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", where all that is concealed
-    is in the vocabulary and can show in this plan, is the model with just these effects, fitted to the same
-    readings: nobody could have named better. "true" is beyond reach, since it knows the noise-free reading and
-    the sd of the noise's normal part; it is the truth where the noise is white.
+    "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", if all concealed effects are in the
+    vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the same readings: the
+    best that naming can achieve. "true" is an upper limit: it knows the noise-free reading and the sd of the noise's
+    Gaussian core, and is exact for white noise.
 
     Returns
     -------
-    By name of the scan, then of the model.
+    Values by name of the scan, then of the model.
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
@@ -35,12 +35,12 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     names = [h.name for h in case.truth.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
     if showing and len(showing) == len(case.truth.hidden):
-        with suppress(ParameterError):  # readings are lost at times, and of these none was
+        with suppress(ParameterError):  # under a model with dropouts, none of these readings was lost
             models["right"] = model_with(case.recording, showing, rng=fitting)
-    scans = kept_back(case)
+    scans = held_out(case)
     scores: dict[str, dict[str, float]] = {}
     for (name, samples), child in zip(models.items(), drawing, strict=False):
-        if name == "repaired" and samples is diagnosis.null:  # nothing was left out
+        if name == "repaired" and samples is diagnosis.null:  # nothing is concealed: the right model is the null
             scores[name] = scores["null"]
             continue
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)

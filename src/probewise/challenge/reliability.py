@@ -1,4 +1,4 @@
-"""Compare stated probabilities with the truth: of what is stated with 0.8, eight of ten cases should be right."""
+"""Calibration of stated probabilities: of the answers stated with 0.8, eight in ten should be right."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _EDGES = np.linspace(0, 1, 11)
 
 @dataclass(frozen=True)
 class Bin:
-    """Cases of about one stated probability: its mean, and the share that was right."""
+    """Cases of similar stated probability: its mean, and the share of right answers."""
 
     stated: float
     right: Estimate
 
 
 def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
-    """Sort cases by the probability of their leading hypothesis into ten bins, those without a case left out."""
+    """Bin cases by the probability of their leading hypothesis into ten bins; empty bins are left out."""
     said = [stated(result) for result in results]
     of_case = _bins_of(np.array([p for p, _ in said]))
     return tuple(
@@ -45,7 +45,7 @@ def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
 
 
 def _error(said: FloatArray) -> float:
-    """Average over rows of probability and right or not, (n, 2)."""
+    """Return the calibration error of rows (probability, right or not), (n, 2)."""
     off = np.bincount(_bins_of(said[:, 0]), said[:, 0] - said[:, 1])
     return float(np.abs(off).sum()) / len(said)
 

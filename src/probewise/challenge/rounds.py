@@ -1,4 +1,4 @@
-"""The table of a challenge in rounds: what the readings that a diagnosis asks for are worth."""
+"""The table of a challenge in rounds: the gain from the readings that a diagnosis advises."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BOOTSTRAPS = 2000
 
 
 def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
-    """Score the results of `Investigated`: each target after the last round, below it the same after the first."""
+    """Score the results of `Investigated`: each target after the last round and, below it, after the first."""
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (
@@ -88,7 +88,7 @@ def _physics_on_clean(results: list[Result]) -> Estimate:
 
 
 def _extra(results: list[Result]) -> Estimate:
-    """Estimate the median number of readings after the first round, of the cases that took any, with its interval."""
+    """Estimate the median number of readings after the first round, over cases that took any, with its interval."""
     extra = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in results], dtype=np.float64)
     extra = extra[extra > 0]
     if not extra.size:

@@ -1,4 +1,4 @@
-"""A challenge: its cases, done as a campaign that can be stopped at any moment."""
+"""Run the cases of a challenge as a campaign that can be interrupted at any time."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ def run_challenge(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> tuple[Mapping[str, Any], ...]:
-    """Run the first cases of a challenge, or go on with one that was stopped.
+    """Run the first cases of a challenge, or resume an interrupted one.
 
     Parameters
     ----------
     n_cases
-        How many, from case 0 on. More may be asked for later: what the file holds is not done again.
+        Number of cases, from case 0. It may be raised later: cases in the file are not run again.
     seed
-        The sealed seed: with the number of a case it decides all about it.
+        The sealed seed: with its number, it determines a case.
     work
-        What does a case.
+        Function that runs a case.
     of
-        What the cases are of, where it is no light sensor: campaigns of different things do not mix.
+        Name of the apparatus, if not the light sensor: campaigns on different apparatus do not mix.
     path
         The campaign's file.
     executor
         Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
     progress
-        Told how many cases have ended.
+        Called with the number of finished cases.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Was what a diagnosis said right? One case at a time, from the result of `run_case`."""
+"""Score one case at a time from the result of `run_case`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation", "random_walk", "noise
 """Effects on the noise."""
 
 HONEST_NATS = 3.0
-"""Two effects that are less apart cannot be told apart (diagnosis, section 3)."""
+"""Two effects that differ by less are aliased (diagnosis, section 3)."""
 
 _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
 
@@ -37,7 +37,7 @@ Result = Mapping[str, Any]
 
 
 def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:
-    """Name all that is right for one concealed effect, its aliases merged."""
+    """Return all right names of one concealed effect: its own and its aliases."""
     cosines: Mapping[str, float] = hidden["cosines"]
     if hidden["in_vocabulary"]:
         squared = hidden["size_lambda"] ** 2 / 2
@@ -46,16 +46,16 @@ def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:
 
 
 def answers(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
-    """List what has to be named, one set of right names for each thing.
+    """List the effects that have to be named, as one set of right names each.
 
     Parameters
     ----------
     result
         A case.
     merged
-        Whether an effect's aliases are right too; those of what has no name are always.
+        Whether aliases of an effect are right too; for effects outside the vocabulary they always are.
     noise
-        Whether what is wrong with the noise has to be named.
+        Whether noise effects have to be named.
     """
     physics = [h for h in result["hidden"] if not h["on_noise"] and h["name"] not in NO_PHYSICS]
     mean = [accepted(h) if merged or not h["in_vocabulary"] else frozenset({h["name"]}) for h in physics]
@@ -63,7 +63,7 @@ def answers(result: Result, *, merged: bool, noise: bool = True) -> list[frozens
 
 
 def fits(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
-    """Tell whether names stand one to one for what is wanted; what is no physics need not be named."""
+    """Return whether names match the wanted effects one to one; effects that are no physics may be unnamed."""
     needed = [right for right in wanted if not right & NO_PHYSICS]
     optional = [right for right in wanted if right & NO_PHYSICS]
     n_more = len(names) - len(needed)
@@ -75,7 +75,7 @@ def fits(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
 
 
 def extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
-    """Count the names that stand for nothing that is wanted."""
+    """Count the names that match no wanted effect."""
     most = max(
         sum(name in right for name, right in zip(order, wanted, strict=False))
         for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
@@ -84,31 +84,31 @@ def extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
 
 
 def is_physics(result: Result) -> bool:
-    """Tell whether something is concealed that is no mere Gaussian more of the SSF, as far as so many readings tell."""
+    """Return whether a concealed effect can be told from one more Gaussian in the SSF with this many readings."""
     return any(not right & NO_PHYSICS for right in answers(result, merged=True))
 
 
 def is_outside(result: Result) -> bool:
-    """Tell whether something is concealed that no name of the vocabulary stands for, not even as an alias."""
+    """Return whether a concealed effect is outside the vocabulary and has no alias in it."""
     return frozenset({"unknown"}) in answers(result, merged=True)
 
 
 def on_mean(result: Result) -> bool:
-    """Tell whether all that is concealed, if anything, changes the mean of the readings."""
+    """Return whether every concealed effect, if any, changes the mean of the readings."""
     return not any(h["on_noise"] for h in result["hidden"])
 
 
 def leading(result: Result, *, clean: bool) -> tuple[Names, float]:
-    """Return the most probable hypothesis and its probability, `clean` among them or not."""
+    """Return the most probable hypothesis and its probability; `clean`: whether the clean one is included."""
     options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
     return max(options, key=lambda option: option[1], default=((), 0.0))
 
 
 def leading_name_right(result: Result) -> bool:
-    """Tell whether the right names come first of all that are not clean, aliases merged.
+    """Return whether the right names rank first among hypotheses that are not clean, with aliases merged.
 
-    Where the mean is changed, what is said of the noise beside it is left out. Where one Gaussian more takes all of it
-    up, clean is right too.
+    If the mean is changed, names of noise effects are ignored. If one more Gaussian in the SSF absorbs the effect,
+    clean is right too.
     """
     if not on_mean(result):
         return fits(leading(result, clean=False)[0], answers(result, merged=True))
@@ -123,11 +123,11 @@ def leading_name_right(result: Result) -> bool:
 
 
 def stated(result: Result) -> tuple[float, bool]:
-    """Return the probability of the most probable hypothesis, clean among them, and whether it is exactly the truth."""
+    """Return the probability of the most probable hypothesis, clean included, and whether it is exactly the truth."""
     names, probability = leading(result, clean=True)
     return probability, fits(names, answers(result, merged=False))
 
 
 def names_of(label: str) -> Names:
-    """Take a label of a credible set apart."""
+    """Split a label of a credible set into names."""
     return () if label == "clean" else tuple(label.split("+"))

@@ -1,4 +1,4 @@
-"""The table of a challenge: each row what was aimed at, what was found, and whether that decides it."""
+"""The table of a challenge: target, estimate and decision in each row."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.challenge.estimates import Estimate, mean, resampled, share
+from probewise.challenge.oracle_baseline import (
+    oracle_covariate_rate,
+    oracle_name_rate,
+    oracle_set_size,
+    readings_by_repeating,
+)
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     NOISE,
@@ -25,12 +31,6 @@ from probewise.challenge.scoring import (
     names_of,
     on_mean,
     stated,
-)
-from probewise.challenge.yardstick import (
-    covariate_by_likeness,
-    name_by_likeness,
-    readings_by_repeating,
-    set_size_by_likeness,
 )
 
 __all__ = [
@@ -50,22 +50,22 @@ Decision: TypeAlias = Literal["met", "missed", "open"]
 Result: TypeAlias = Mapping[str, Any]
 
 _GAUSSIAN = ("gaussian", "two_lobes")  # SSFs that are mixtures of Gaussians
-_BESIDE = 0.8  # of an effect's size, where another is named: sqrt(1 - 0.5^2) at the largest cosine, and some tolerance
+_BESIDE = 0.8  # least share of an effect's size given the other: sqrt(1 - 0.5^2), less some tolerance
 _SCANS = ("angle", "pattern", "direction")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row.
+    """One row of the table.
 
     Parameters
     ----------
     name
-        What was measured.
+        Quantity measured.
     found
-        The number with its 95 % interval.
+        Estimate with its 95 % interval.
     least, most
-        The target's bounds; no bound, no target.
+        Bounds of the target; without any, there is no target.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Row:
 
     @property
     def decision(self) -> Decision | None:
-        """Whether the target is met: decided only where the whole interval is on one side; None without a target."""
+        """Whether the target is met: decided only if the whole interval is on one side; None without a target."""
         if math.isinf(self.least) and math.isinf(self.most):
             return None
         if self.found.low >= self.least and self.found.high <= self.most:
@@ -103,7 +103,7 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
 
 
 def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
-    """Tell of each single effect of a size how often it was detected at alpha .01, and named first."""
+    """Estimate for each single effect of a size how often it was detected at alpha .01, and named first."""
     singles = singles_of([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
@@ -146,7 +146,7 @@ def _naming(done: list[Result]) -> list[Row]:
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
     for size, least in targets.items():
-        like = [name_by_likeness(r["hidden"][0]) for r in singles_of(done, size)]
+        like = [oracle_name_rate(r["hidden"][0]) for r in singles_of(done, size)]
         rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
         rows.append(Row(f"  by likeness to the hardest rival, lambda {size:g}", mean(like)))
     return [
@@ -156,7 +156,7 @@ def _naming(done: list[Result]) -> list[Row]:
 
 
 def _fall(before: Estimate, after: Estimate) -> Estimate:
-    """Subtract two shares, with Newcombe's interval."""
+    """Return the difference of two proportions, with Newcombe's interval."""
     fall = before.value - after.value
     down = math.hypot(before.value - before.low, after.high - after.value)
     up = math.hypot(before.high - before.value, after.value - after.low)
@@ -168,7 +168,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
         singles = singles_of(done, size)
-        like = [set_size_by_likeness(r["hidden"][0]) for r in singles]
+        like = [oracle_set_size(r["hidden"][0]) for r in singles]
         rows += [
             Row(
                 f"size of the credible set, lambda {size:g}",
@@ -187,7 +187,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
 
 
 def merged_size(result: Result) -> float:
-    """Count the hypotheses of a credible set, the right one and what so many readings cannot tell from it as one."""
+    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
     right = sum(fits(names_of(label), answers(result, merged=True)) for label in result["credible_set"])
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
@@ -200,7 +200,7 @@ def _places(done: list[Result]) -> list[Row]:
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
         Row("right covariate first, lambda 8", share(first), 0.98),
-        Row("  by likeness to the hardest rival", mean([covariate_by_likeness(r["hidden"][0]) for r in shown])),
+        Row("  by likeness to the hardest rival", mean([oracle_covariate_rate(r["hidden"][0]) for r in shown])),
     ]
 
 
@@ -216,7 +216,7 @@ def _intervals(done: list[Result]) -> list[Row]:
 
 
 def covering(intervals: list[list[float]]) -> Estimate:
-    """Estimate how often intervals [truth, low, high] hold the truth."""
+    """Estimate how often intervals [truth, low, high] cover the truth."""
     return share([low <= truth <= high for truth, low, high in intervals])
 
 
@@ -232,7 +232,7 @@ def _held_out(done: list[Result]) -> list[Row]:
         Row("  share of what the truth itself would gain", resampled(_gains_of(white, "true"), _ratio)),
         Row("  the same, outside the vocabulary", resampled(_gains_of(outside, "true"), _ratio)),
         Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
-        # What noise alone makes of the best that these readings allow.
+        # The scatter that noise alone causes in the best gain possible with these readings.
         Row(
             "  of the right model, fitted to the same", share([bool(own < -1.0) for own in gains[:, :, 1].sum(axis=1)])
         ),
@@ -240,7 +240,7 @@ def _held_out(done: list[Result]) -> list[Row]:
 
 
 def _gains_of(results: Sequence[Result], best: str) -> FloatArray:
-    """List what the repaired and the best model gain over the null, (n_cases, n_scans, 2)."""
+    """Return the gains of the repaired and the best model over the null, (n_cases, n_scans, 2)."""
     gains = [[_gains(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
 
@@ -268,7 +268,7 @@ def _pairs(done: list[Result]) -> list[Row]:
 
 
 def _each_shows(result: Result) -> bool:
-    """Tell whether each of two effects is about as large beside the other as their cosine promises."""
+    """Return whether each of two effects has about the size given the other that their cosine implies."""
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
@@ -322,22 +322,22 @@ def singles_of(done: Sequence[Result], size: float) -> list[Result]:
 
 
 def _seen_as_physics(results: Sequence[Result]) -> list[Result]:
-    """Keep what an alarm is due on: not what one Gaussian more of the SSF takes up."""
+    """Keep the cases that should raise an alarm: those that one more Gaussian in the SSF cannot absorb."""
     return [r for r in _on_mean(results) if is_physics(r)]
 
 
 def _on_mean(results: Sequence[Result]) -> list[Result]:
-    """Keep what the p-value speaks of: that nothing is missing from the mean."""
+    """Keep the cases that the p-value tests: effects on the mean."""
     return [r for r in results if on_mean(r)]
 
 
 def alarms(results: Sequence[Result], alpha: float) -> Estimate:
-    """Estimate how often the mean is said to lack something at a level."""
+    """Estimate how often the test of the mean rejects at a significance level."""
     return share([r["p_value"] <= alpha for r in results])
 
 
 def names_physics(result: Result) -> bool:
-    """Tell whether an effect on the mean is named."""
+    """Return whether an effect on the mean is named."""
     return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
@@ -346,7 +346,7 @@ def _mean_names(result: Result) -> list[str]:
 
 
 def surely_wrong(result: Result) -> bool:
-    """Tell whether something else than the truth is stated above .9, `clean` and `unknown` left out."""
+    """Return whether a wrong effect is stated above .9; `clean` and `unknown` do not count."""
     probability, right = stated(result)
     names = leading(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

@@ -1,7 +1,7 @@
-"""The independent brute-force world, pixels and rays, that conceals effects (paper, eq. RwithSSF, by summing light).
+"""An independent brute-force simulator with concealed effects: pixels and rays (paper, eq. RwithSSF, by summing light).
 
-It shares the file formats with the rest of the package and nothing else: data made by the code
-that explains them prove nothing.
+It shares only the file formats with the rest of the package: data simulated by the model's own code would prove nothing
+about the model.
 """
 
 from probewise.world.concealed import (

@@ -1,4 +1,4 @@
-"""Where a surface's edges run: how far away the nearest is, and which way is across."""
+"""Edges of a surface: the distance to the nearest, and the direction across."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from probewise.world.painting import Covered, Oval, Surface
 
 __all__ = ["across_edge", "edge_distance"]
 
-_N_RIM = 720  # places on the rim of an oval among which the nearest is looked for
+_N_RIM = 720  # points on an oval's outline among which the nearest is searched
 
 
 def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the distance in mm to the nearest printed edge, (n_points,); infinite where there is none.
 
-    A picture's edges are nobody's knowledge: it counts as having none.
+    Images count as having no edges, since they are not described.
     """
     match surface:
         case Covered():
@@ -35,7 +35,7 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
         case Quadrant():
             (cx, cy), (dx, dy) = surface.corner_mm, surface.direction
             right, up = (x_mm - cx) * dx, (y_mm - cy) * dy
-            # Two half-lines leave the corner; behind it, it is the corner itself that is nearest.
+            # Two half-lines leave the corner; behind it, the corner itself is nearest.
             return np.minimum(np.hypot(up, np.minimum(right, 0.0)), np.hypot(right, np.minimum(up, 0.0)))
         case Disc():
             (cx, cy), r = surface.center_mm, surface.radius_mm
@@ -51,7 +51,7 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
 
 
 def across_edge(surface: Surface) -> tuple[float, float]:
-    """Return the unit vector across the edge of a pattern that has one direction; along X for any other."""
+    """Return the unit vector across the edge of a pattern with a single straight edge; along X for others."""
     match surface:
         case HalfPlane() | Stripes() | Ramp():
             return math.cos(surface.normal_rad), math.sin(surface.normal_rad)
@@ -64,7 +64,7 @@ def _along(normal_rad: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
 
 
 def _to_outline(corners: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Take the least of the distances to the sides, corners (n, 2) in order."""
+    """Return the smallest distance to the sides of a polygon, corners (n, 2) in order."""
     sides = np.roll(corners, -1, axis=0) - corners
     lengths = np.hypot(*sides.T)
     from_start = np.stack([x_mm, y_mm], axis=-1)[:, None, :] - corners

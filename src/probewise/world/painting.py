@@ -1,4 +1,4 @@
-"""What a ray finds where it lands: the albedo of a pattern at a point."""
+"""The albedo of a surface at a point."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["Covered", "Oval", "Surface", "paint"]
 
 @dataclass(frozen=True)
 class Oval:
-    """Inside an ellipse, which the file format has no kind for: half axes in mm, the first at `angle_rad` to X."""
+    """An ellipse, which the file format lacks: half axes in mm, the first at `angle_rad` to X."""
 
     center_mm: tuple[float, float]
     half_axes_mm: tuple[float, float]
@@ -38,7 +38,7 @@ class Oval:
 
 @dataclass(frozen=True)
 class Covered:
-    """A surface with cards on it, each a polygon of its own albedo inside; the last lies on top."""
+    """A surface with cards on it, each a polygon with an albedo; the last is on top."""
 
     below: Pattern | Oval
     cards: tuple[Polygon, ...]
@@ -48,12 +48,12 @@ Surface: TypeAlias = Pattern | Oval | Covered
 
 
 def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Return the albedo where rays land, arrays of one shape in, the same shape out.
+    """Return the albedo at points; all arrays of one shape.
 
     Raises
     ------
     ParameterError
-        If the surface is of no known kind.
+        If the type of surface is unknown.
     """
     match surface:
         case Covered():
@@ -93,7 +93,7 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
 
 
 def _within_polygon(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
-    """Count the sides that a ray towards +x crosses; odd is inside."""
+    """Return whether points are inside: a ray towards +x crosses an odd number of sides."""
     odd = np.zeros(x_mm.shape, dtype=np.bool_)
     corners = polygon.vertices_mm
     for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True):

@@ -1,4 +1,4 @@
-"""How bright a spot sees a surface: pixels where it is plain, many rays where an edge runs through."""
+"""Integrate albedo over the footprint: by pixels on uniform surface, by many rays in pixels with an edge."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from probewise.world.spots import Spot
 __all__ = ["Retouch", "seen_white"]
 
 Retouch: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""(albedo, x_mm, y_mm), places in the lab frame, to albedo; arrays of one shape."""
+"""(albedo, x_mm, y_mm), places in the lab frame, to changed albedo; arrays of one shape."""
 
-_BLOCK = 50_000  # pixels or rays at a time: what a processor's cache holds
+_BLOCK = 50_000  # pixels or rays at a time, to fit a processor's cache
 # Additive steps of a two-dimensional Kronecker sequence: 1/g and 1/g^2, g the root of g^3 = g + 1.
 _STEP_U, _STEP_V = 0.7548776662466927, 0.5698402909980532
 
@@ -36,37 +36,37 @@ def seen_white(
     retouch: Retouch | None = None,
     n_rays: int = 64,
 ) -> FloatArray:
-    """Sum weight times albedo over the spot for each pose, (n_points,) in, (n_points,) out.
+    """Sum weight times albedo over the footprint for each pose, (n_points,) in, (n_points,) out.
 
-    A pixel whose four corners find the same albedo counts as plain; every other one is sampled by
-    `n_rays` rays of a low-discrepancy sequence, shifted from pixel to pixel so that the errors of
-    neighbours along an edge do not add up. Features finer than a pixel of the spot need a finer spot.
-    With the default 0.25 mm and 64 rays the result is within 1e-3 (tests/world refines both).
+    A pixel whose four corners have the same albedo counts as uniform; every other one is sampled by `n_rays` rays of a
+    low-discrepancy sequence, shifted from pixel to pixel so that errors of neighbours along an edge do not add up.
+    Features finer than a pixel need a footprint with smaller pixels. With the default 0.25 mm and 64 rays the result is
+    within 1e-3 (tests/world refines both).
 
     Parameters
     ----------
     surface, spot
-        What is seen, and by what.
+        The surface, and the footprint.
     x_mm, y_mm, orientation_rad
-        Where the sensor frame stands, (n_points,).
+        Pose of the sensor frame, (n_points,).
     scale
-        How many times as large as drawn the spot is, about the sensor frame's origin, (n_points,) or one.
+        Factor by which the footprint is enlarged about the sensor frame's origin, (n_points,) or scalar.
     pattern_mm
-        How far the surface lies from where it is described, (n_points, 2) or (2,).
+        Displacement of the surface from its description, (n_points, 2) or (2,).
     retouch
-        What became of the albedo at a place, pixel by pixel: to be smooth over a pixel.
+        Change of the albedo, applied pixel by pixel; must be smooth over a pixel.
     n_rays
-        Rays for a pixel with an edge in it.
+        Rays per pixel that contains an edge.
     """
     n_points = len(x_mm)
     moved = np.broadcast_to(np.asarray(pattern_mm, dtype=np.float64), (n_points, 2)).T
-    # A scan out and back stands twice at each place.
+    # A scan out and back visits each place twice.
     stands = np.stack([x_mm, y_mm, orientation_rad, np.broadcast_to(scale, n_points), *moved])
     poses, again = np.unique(stands, axis=1, return_inverse=True)
     seen = paint(surface, poses[0] - poses[4], poses[1] - poses[5])
     rest = np.arange(len(seen))
     if retouch is None and not isinstance(surface, Ramp | Image):
-        # No edge within the reach of the spot: what its origin sees, all of it sees.
+        # No edge within the footprint: the albedo at its origin applies to all of it.
         u, v = spot.edges_mm()
         reach = np.hypot(np.abs(u).max(), np.abs(v).max()) * poses[3]
         rest = np.flatnonzero(edge_distance(surface, poses[0] - poses[4], poses[1] - poses[5]) <= reach)
@@ -81,7 +81,7 @@ def _block(surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | N
     x_mm, y_mm, turn, scale, pattern_x, pattern_y = poses[:, :, None, None]
     cos, sin = scale * np.cos(turn), scale * np.sin(turn)
     u, v = spot.edges_mm()
-    # The surface is described where it does not lie: seen from there, the sensor has moved the other way.
+    # A displaced surface is equivalent to a sensor displaced the other way.
     origin_x, origin_y = x_mm - pattern_x, y_mm - pattern_y
     # Corners of all pixels, (n_points, n_v + 1, n_u + 1).
     corners_x, corners_y = cos * u - sin * v[:, None], sin * u + cos * v[:, None]
@@ -109,6 +109,6 @@ def _block(surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | N
 
 
 def _shift(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Start each pixel's rays elsewhere: the same for the same pixel, spread evenly along rows and columns."""
+    """Return each pixel's shift of the ray sequence: fixed per pixel, spread evenly along rows and columns."""
     golden = 0.6180339887498949
     return np.mod(row * golden + column * _STEP_V, 1.0), np.mod(column * golden + row * _STEP_U, 1.0)

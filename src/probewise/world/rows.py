@@ -1,4 +1,4 @@
-"""What the world knows of the readings it takes."""
+"""The world's table of readings: where, when, and over what."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ __all__ = ["Rows"]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """One row per reading, in the order they were taken.
+    """One row per reading, in order of time.
 
     Parameters
     ----------
     place_mm
-        Where the sensor stands, shape (n_points, 2): as commanded, and once the arm has erred, where it really is.
+        Place of the sensor, shape (n_points, 2): commanded, or true once the arm's errors are applied.
     direction
-        Unit vector of the last move, 0 where there was none, shape (n_points, 2).
+        Unit vector of the last motion, 0 where there was none, shape (n_points, 2).
     orientation_rad
-        How it is turned, commanded and then real, shape (n_points,).
+        Orientation, commanded or true, shape (n_points,).
     time_s
-        When, shape (n_points,).
+        Time, shape (n_points,).
     scan
         Number of the scan, shape (n_points,).
     scan_names
         Name of each scan.
     covariates
-        Anything else that was noted down, arrays of shape (n_points,).
+        Other logged columns, arrays of shape (n_points,).
     across
-        Unit vector across the edge of the pattern underneath, (1, 0) where it has no one such, (n_points, 2).
+        Unit vector across the edge of the pattern below, (1, 0) if it has no single edge, (n_points, 2).
     edge_mm
         Distance from the place to the nearest edge of the pattern, infinite where it has none, (n_points,).
     """
@@ -51,7 +51,7 @@ class Rows:
 
     @classmethod
     def of(cls, plan: Plan, across: FloatArray, edge_mm: FloatArray) -> Rows:
-        """Take over a plan as commanded."""
+        """Build from a plan, as commanded."""
         return cls(
             place_mm=np.stack([plan.x_mm, plan.y_mm], axis=-1),
             direction=plan.direction,
@@ -65,10 +65,10 @@ class Rows:
         )
 
     def in_scans(self, names: tuple[str, ...]) -> BoolArray:
-        """Tell which rows belong to the scans of these names, shape (n_points,)."""
+        """Return whether each row belongs to one of these scans, shape (n_points,)."""
         chosen = [k for k, name in enumerate(self.scan_names) if name in names]
         return np.isin(self.scan, chosen)
 
     def starts_scan(self) -> BoolArray:
-        """Tell which rows are the first of their scan, shape (n_points,)."""
+        """Whether each row is the first of its scan, shape (n_points,)."""
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])

@@ -1,7 +1,7 @@
-"""The recordings that ship with the package, made again from their seeds, and the truth behind them.
+"""Regenerate the recordings that ship with the package from their seeds; their truth.
 
 `python -m probewise.world.shipped FOLDER` writes both into a folder, bit for bit as they ship.
-No diagnosis may read this module: it knows the answers.
+No diagnosis may import this module, since it holds the truth.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from probewise.world.world import World
 __all__ = ["BLACK", "BLOB", "CANDIDATES", "NOISE_SD", "SEEDS", "WHITE", "main", "make", "truth"]
 
 BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)
-"""The true SSF of both: one Gaussian, shifted towards the photodiode and wider along x'."""
+"""The true SSF of both recordings: one Gaussian, shifted towards the photodiode and wider along x'."""
 
 BLACK, WHITE, NOISE_SD = 10.0, 60.0, 0.6
 
@@ -52,11 +52,11 @@ CANDIDATES: tuple[Concealed, ...] = (
     Nonlinearity(1.1),
     Saturation(57.5),
 )
-"""What `concealed` may conceal; each at a size lambda of about 20 there (diagnosis, size of an effect)."""
+"""Effects that the recording `concealed` may contain, each at a size lambda of about 20."""
 
 
 def truth(name: str) -> World:
-    """Return the world that a shipped recording comes from, with what it conceals.
+    """Return the world of a shipped recording, with its concealed effect.
 
     Raises
     ------
@@ -71,10 +71,9 @@ def truth(name: str) -> World:
 
 
 def make(name: str) -> Recording:
-    """Make a shipped recording again.
+    """Regenerate a shipped recording.
 
-    Readings are rounded to 0.001, far below the noise, so that the last bits of a computer's
-    arithmetic do not matter.
+    Readings are rounded to 0.001, far below the noise, so that floating-point differences between machines vanish.
 
     Raises
     ------
@@ -89,7 +88,7 @@ def make(name: str) -> Recording:
 
 
 def _streams(name: str) -> list[np.random.Generator]:
-    """Draw what is concealed, the times and the noise from three independent streams."""
+    """Return independent random streams for the concealed effect, the times and the noise."""
     if name not in SHIPPED:
         raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
     return np.random.default_rng(SEEDS[name]).spawn(3)

@@ -1,4 +1,4 @@
-"""Where a world's sensor looks: spatial sensitivities as fine rasters of weights in the sensor frame."""
+"""Footprints of a world's sensor: spatial sensitivities as fine rasters of weights in the sensor frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """Hold the share of the light that each pixel of the footprint contributes.
+    """A footprint: the share of the light that each pixel contributes.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Spot:
     pixel_mm
         Side of a pixel.
     corner_mm
-        Sensor-frame place (u, v) of the outer corner of the first pixel.
+        Outer corner (u, v) of the first pixel in the sensor frame.
     """
 
     weights: FloatArray
@@ -47,7 +47,7 @@ class Spot:
         object.__setattr__(self, "weights", frozen(weights / weights.sum()))
 
     def edges_mm(self) -> tuple[FloatArray, FloatArray]:
-        """Return where the pixels begin and end in u, shape (n_u + 1,), and in v, shape (n_v + 1,)."""
+        """Return the edges of the pixels in u, shape (n_u + 1,), and in v, shape (n_v + 1,)."""
         n_v, n_u = self.weights.shape
         u_mm, v_mm = self.corner_mm
         return u_mm + self.pixel_mm * np.arange(n_u + 1), v_mm + self.pixel_mm * np.arange(n_v + 1)
@@ -59,13 +59,13 @@ class Spot:
         points = np.stack([u.ravel(), v.ravel()])
         mean = points @ self.weights.ravel()
         apart = points - mean[:, None]
-        # Light within a pixel is spread over it: a square adds its own variance.
+        # Light is spread over each pixel, which adds the variance of a square.
         return mean, (apart * self.weights.ravel()) @ apart.T + np.eye(2) * self.pixel_mm**2 / 12
 
 
 @dataclass(frozen=True)
 class Blob:
-    """One Gaussian of a spot: share of the light, centre and standard deviations (mm), correlation of u and v."""
+    """One Gaussian of a footprint: share of the light, centre and sds (mm), correlation of u and v."""
 
     share: float
     center_mm: tuple[float, float]
@@ -76,7 +76,7 @@ class Blob:
 def raster_spot(
     density: Density, half_width_mm: float, *, center_mm: tuple[float, float] = (0.0, 0.0), pixel_mm: float = 0.25
 ) -> Spot:
-    """Lay any density over a square of pixels, rows and columns that carry next to nothing cut off.
+    """Rasterise a density over a square of pixels; rows and columns with negligible weight are cropped.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def raster_spot(
     centers = (np.arange(-n, n) + 0.5) * pixel_mm
     u, v = np.meshgrid(center_mm[0] + centers, center_mm[1] + centers)
     weights = density(u, v)
-    # At most 1e-6 of the light is lost on each side: far below the 1e-3 of the span that is promised.
+    # At most 1e-6 of the light is lost on each side, far below the promised accuracy of 1e-3 of the span.
     rows, columns = (_core(weights.sum(axis=axis)) for axis in (1, 0))
     corner = (center_mm[0] + (columns.start - n) * pixel_mm, center_mm[1] + (rows.start - n) * pixel_mm)
     return Spot(weights[rows, columns], pixel_mm, corner)
@@ -105,7 +105,7 @@ def _core(profile: FloatArray, lost: float = 1e-6) -> slice:
 
 
 def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
-    """Make a spot of one or several Gaussians."""
+    """Make a footprint of one or several Gaussians."""
     low = [min(b.center_mm[k] - 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
     high = [max(b.center_mm[k] + 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
 
@@ -136,7 +136,7 @@ def ridge_spot(
     shadow: float = 0.6,
     pixel_mm: float = 0.25,
 ) -> Spot:
-    """Make a cosine disc with two lobes and the shadow of a ridge across it: no mixture of Gaussians.
+    """Make a cosine disc with two lobes and the shadow of a ridge across it; not a mixture of Gaussians.
 
     The photodiode sees a disc that fades as cos^2 to its rim, stronger along u by `lobes`; the plastic
     ridge between diode and LED takes `shadow` of the light along the line v = centre + `ridge_mm`.
@@ -159,9 +159,9 @@ def tailed_spot(
     skew: float = 0.4,
     pixel_mm: float = 0.25,
 ) -> Spot:
-    """Make a skewed spot with exponential tails, exp(-r) in stretched axes: no mixture of Gaussians.
+    """Make a skewed footprint with exponential tails, exp(-r) in stretched axes; not a mixture of Gaussians.
 
-    `core_mm` are the lengths of decay along u and v; `skew`, 0 to below 1, lengthens the tail towards
+    `core_mm` are the decay lengths along u and v; `skew`, 0 to below 1, lengthens the tail towards
     +u and shortens it towards -u.
     """
     if not 0 <= skew < 1:
@@ -184,7 +184,7 @@ def ring_spot(
     off_axis: float = 0.4,
     pixel_mm: float = 0.25,
 ) -> Spot:
-    """Make a ring, brighter on one side: the LED stands off the axis of the lens. No mixture of Gaussians.
+    """Make a ring, brighter on one side, as of an LED off the lens axis; not a mixture of Gaussians.
 
     The ring is a Gaussian of sd `width_mm` about a circle; `off_axis`, 0 to 1, brightens it towards +v.
     """
@@ -201,8 +201,8 @@ def ring_spot(
 
 
 def blurred(spot: Spot, sd_mm: float) -> Spot:
-    """Smear a spot by a round Gaussian."""
-    # A Gaussian sampled more coarsely than its sd is too narrow: cut the pixels until it is not.
+    """Convolve a footprint with a round Gaussian."""
+    # A Gaussian sampled more coarsely than its sd is too narrow: refine the pixels first.
     cuts = math.ceil(spot.pixel_mm / sd_mm)
     pixel_mm = spot.pixel_mm / cuts
     margin = math.ceil(5 * sd_mm / pixel_mm)

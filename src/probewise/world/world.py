@@ -1,4 +1,4 @@
-"""The world that makes readings: a spot of light over painted surfaces, and what it conceals."""
+"""The simulated world: a footprint over painted surfaces, with concealed effects."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from probewise.world.spots import Spot
 __all__ = ["Look", "World", "simulate"]
 
 _Surfaces = Sequence[tuple[Surface, IntArray]]
-"""Each surface with the rows that are read over it."""
+"""Each surface with the rows read over it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What the sensor looks at, before it answers: the dear half of a reading.
+    """The sensor's view before its response: the costly part of a simulated reading.
 
     Parameters
     ----------
     seen
         Seen white fraction u, shape (n_points,).
     dimming
-        Signal at the real height, as a factor, shape (n_points,).
+        Factor on the signal at the true height, shape (n_points,).
     rows
-        Where the sensor really stands.
+        True poses of the sensor.
     """
 
     seen: FloatArray
@@ -55,22 +55,22 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A sensor and what is wrong with it, free of any model of it.
+    """A simulated sensor with its concealed effects, independent of the sensor models.
 
     Parameters
     ----------
     spot
-        Where the sensor looks.
+        Footprint of the sensor.
     black, white
-        Noise-free readings over plain black and plain white, I_min and I_max of the paper.
+        Noise-free readings over uniform black and white, I_min and I_max of the paper.
     noise_sd
         Standard deviation of the Gaussian noise of one reading.
     step
         Readings are rounded to multiples of it; None: not rounded.
     concealed
-        What a plain model leaves out. Effects act in the order of the stages, those of one stage as they stand.
+        Effects that a plain model leaves out. They act in the order of the stages; within a stage, as listed.
     height_mm
-        Height of the sensor that the spot and the levels belong to.
+        Height of the sensor at which the footprint and the levels hold.
     """
 
     spot: Spot
@@ -109,17 +109,17 @@ class World:
         Parameters
         ----------
         surface
-            What lies there.
+            The surface below.
         x_mm, y_mm, orientation_rad
-            Where the sensor is sent, lab frame.
+            Commanded pose, lab frame.
         time_s
-            When.
+            Time of the reading.
         rng
-            Where the noise comes from; None: a reading without noise.
+            Generator of the noise; None: a reading without noise.
         direction
-            Unit vector of the move that brought it there, for backlash.
+            Unit vector of the motion that led there, for backlash.
         height_mm
-            How high the sensor stands; None: where the spot and the levels belong.
+            Height of the sensor; None: `self.height_mm`.
         """
         if rng is not None:
             require_rng(rng)
@@ -138,10 +138,10 @@ class World:
         return float(self._noisy(look, rng)[0])
 
     def look(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> Look:
-        """Carry out a plan up to what the sensor sees: the part of `expected` that sums light.
+        """Simulate a plan up to the seen white fraction: the part of `expected` that integrates light.
 
-        Effects from the stage "response" on play no part in it, so `answer` may be asked of a world
-        that differs in those alone.
+        It does not depend on effects from the stage "response" on, so `answer` may be called on a world that differs
+        in those only.
         """
         found = self._surfaces(plan, surfaces)
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
@@ -165,14 +165,14 @@ class World:
         Parameters
         ----------
         plan
-            Where, when and over what.
+            The plan.
         surfaces
-            What lies under a pattern's name, in place of what the plan says.
+            Surfaces by name of the pattern, in place of the plan's descriptions.
 
         Raises
         ------
         ParameterError
-            If the plan reads a pattern that nobody describes.
+            If the plan reads over a pattern that is not described.
         """
         return self.answer(self.look(plan, surfaces))
 
@@ -184,23 +184,23 @@ class World:
         surfaces: Mapping[str, Surface] | None = None,
         look: Look | None = None,
     ) -> Recording:
-        """Carry out a plan.
+        """Simulate the recording of a plan.
 
         Parameters
         ----------
         plan
-            Where, when and over what.
+            The plan.
         rng
-            Where the noise comes from; None: readings without noise, rounded all the same.
+            Generator of the noise; None: readings without noise, but rounded.
         surfaces
-            What lies under a pattern's name, in place of what the plan says.
+            Surfaces by name of the pattern, in place of the plan's descriptions.
         look
-            What the sensor sees, where `look` has told already.
+            Result of `look`, if already computed.
 
         Raises
         ------
         ParameterError
-            If the plan reads a pattern that nobody describes.
+            If the plan reads over a pattern that is not described.
         """
         return Recording(plan, self._noisy(self.look(plan, surfaces) if look is None else look, rng))
 
@@ -228,7 +228,7 @@ class World:
                 x_mm, y_mm = (center[chosen] + glimpse.shift_mm).T
                 seen[chosen] += glimpse.share * white(glimpse.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
-        # The LED lights less of what is farther away: the inverse square of the distance.
+        # Illumination by the LED falls with the inverse square of the distance.
         return Look(self._changed("seen", seen, there), scale**-2.0, there)
 
     def _noisy(self, look: Look, rng: np.random.Generator | None) -> FloatArray:
@@ -276,5 +276,5 @@ class World:
 
 
 def simulate(plan: Plan, world: World, *, rng: np.random.Generator) -> Recording:
-    """Carry out a plan in a world (World.simulate, as a function)."""
+    """Simulate the recording of a plan in a world (`World.simulate` as a function)."""
     return world.simulate(plan, rng=rng)

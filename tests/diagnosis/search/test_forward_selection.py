@@ -15,7 +15,7 @@ from probewise.world.challenge import Case, draw_case
 
 
 def diagnosed(number: int) -> tuple[Case, Diagnosis]:
-    case = draw_case(20270101, number, surviving=NullRefit())
+    case = draw_case(20270101, number, norm_after_refit=NullRefit())
     return case, diagnose(case.recording, rng=np.random.default_rng(number))
 
 

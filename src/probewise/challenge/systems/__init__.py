@@ -1,4 +1,4 @@
-"""Does the diagnosis of a person's simulator keep its promises? Concealed systems tell."""
+"""Challenges for the diagnosis of users' simulators: systems with concealed effects."""
 
 from probewise.challenge.systems.case import run_system_case
 from probewise.challenge.systems.table import family_of, score_systems

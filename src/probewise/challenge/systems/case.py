@@ -1,4 +1,4 @@
-"""One case of a challenge on systems: drawn, written to files, diagnosed blind, held against the truth."""
+"""One case of a challenge on systems: drawn, written to files, diagnosed blind, compared with the truth."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from probewise.world.systems import SystemCase, SystemEffect, draw_system_case, 
 
 __all__ = ["run_system_case"]
 
-_OWN = 1_000  # child of the case's seed sequence that the drawing has no use for
+_OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 
 
 def run_system_case(task: Task) -> dict[str, Any]:
-    """Draw a case, diagnose it from its two files alone, and say what was stated and what is true.
+    """Draw a case, diagnose it from its two files alone, and return the diagnosis and the truth.
 
     Returns
     -------
@@ -37,13 +37,13 @@ def run_system_case(task: Task) -> dict[str, Any]:
     result: dict[str, Any] = asdict(stratum)
     at = "drawing"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what is doubtful is scored like the rest
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
         try:
             case = draw_system_case(task.seed, task.number)
             result |= _truth(case)
             at = "diagnosis"
             result |= _diagnosed(case, task)
-        # A campaign outlives the case that breaks the diagnosis, and tells of it.
+        # A campaign survives a case that breaks the diagnosis, and reports it.
         except (
             ProbewiseError,
             ArithmeticError,
@@ -76,7 +76,7 @@ def _truth(case: SystemCase) -> dict[str, Any]:
 
 
 def _effect(effect: SystemEffect) -> dict[str, Any]:
-    """Tell of one effect; a rival that loses so many nats has that cosine to it."""
+    """Describe one effect; a rival's loss in nats is converted to a cosine."""
     squared = effect.size_lambda**2
     return {
         "name": effect.name,
@@ -114,5 +114,5 @@ def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
 
 
 def _has_formula(diagnosis: Diagnosis) -> bool:
-    """Tell whether what has no name was given a formula."""
+    """Return whether the unknown effect was given a formula."""
     return any(getattr(effect, "expression", "") for effect in getattr(diagnosis.repaired.chain, "effects", ()))

@@ -1,4 +1,4 @@
-"""What null, repaired, right and true model make of runs that a diagnosis of a system never saw."""
+"""Log predictive densities of a system's held-out runs under the null, repaired, right and true models."""
 
 from __future__ import annotations
 
@@ -19,23 +19,21 @@ from probewise.world.systems import SystemCase, right_predictions
 __all__ = ["log_densities_of_runs", "predicted_runs"]
 
 _N_SAMPLES = 200
-_N_OF_A_RUN = (
-    4000  # where something is a run's own: its prior is wide, and the density at a reading must not hang on a few draws
-)
+_N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the density must not depend on a few draws
 _LOG_ROOT = 0.5 * math.log(2 * math.pi)
 
 
 def log_densities_of_runs(
     case: SystemCase, diagnosis: Diagnosis, later: RunTable, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Sum the log predictive densities of each run kept back, in nats.
+    """Sum the log predictive densities of each held-out run, in nats.
 
-    "null" and "repaired" are the diagnosis's own models. "right", where something is concealed, is the model with just
-    that, fitted to the same readings by the world itself. "true" knows the noise-free reading.
+    "null" and "repaired" are the diagnosis's own models. "right" is the model with exactly the concealed effects,
+    fitted to the same readings by the world. "true" knows the noise-free reading.
 
     Returns
     -------
-    By run, "inside" the regime of those that were seen and "beyond" it, then by model.
+    Values by run, "inside" the regime of the recorded runs and "beyond" it, then by model.
     """
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
@@ -54,7 +52,7 @@ def log_densities_of_runs(
             right = right_predictions(case, _N_OF_A_RUN if case.drawn.kind.per_run else _N_SAMPLES, rng=fitting)
             scores["right"] = _log_density(right, np.full(len(right), sd), readings)
         except NotConvergedError:
-            pass  # then nobody could have fitted it, and the share has no case
+            pass  # no fit was possible, so the case does not count for the share
     run = case.drawn.rows.run[rows]
     names = {case.drawn.rows.n_runs - 2: "inside", case.drawn.rows.n_runs - 1: "beyond"}
     return {
@@ -66,9 +64,9 @@ def log_densities_of_runs(
 def predicted_runs(
     samples: ModelSamples, table: RunTable, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict runs that were not seen: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
+    """Predict new runs: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
 
-    What is a run's own is drawn from its prior.
+    Parameters per run are drawn from their prior.
     """
     chain = cast(SystemChain, samples.chain)
     wider = replace(chain, system=chain.system.with_runs(table))
@@ -76,7 +74,7 @@ def predicted_runs(
     n = _N_OF_A_RUN if of_run else _N_SAMPLES
     chosen = rng.permutation(np.arange(n) % len(samples.theta))
     known = dict(zip(chain.names, samples.theta[chosen].T, strict=True))
-    # One from each of n parts of equal mass: a prior is covered evenly.
+    # Stratified: one from each of n parts of equal prior mass.
     spread = {name: prior.from_unit((rng.permutation(n) + rng.random(n)) / n) for name, prior in of_run.items()}
     theta = np.stack([(known | spread)[name] for name in wider.names], axis=1)
     with np.errstate(all="ignore"):
@@ -85,7 +83,7 @@ def predicted_runs(
 
 
 def _log_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
-    """Log of the mean density over samples, (n_points,)."""
+    """Return the log of the mean density over samples, (n_points,)."""
     z = (readings - predicted) / sd[:, None]
     each = -0.5 * z**2 - np.log(sd)[:, None] - _LOG_ROOT
     return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))

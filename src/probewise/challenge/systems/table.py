@@ -1,4 +1,4 @@
-"""The table of a challenge on systems: each row what was aimed at, what was found, and whether that decides it."""
+"""The table of a challenge on systems: target, estimate and decision in each row."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ __all__ = ["family_of", "gains_of", "score_systems"]
 
 Result = Mapping[str, Any]
 
-_MOST_NATS = 100.0  # of a recording's held-out gain
-_LEAST_NATS = 3.0  # of the right model's gain, for a share of it to say anything
-_AS_GOOD = 0.8  # of the true law's held-out gain
+_MOST_NATS = 100.0  # cap on a recording's held-out gain
+_LEAST_NATS = 3.0  # least gain of the right model for a share of it to be meaningful
+_AS_GOOD = 0.8  # share of the true law's held-out gain that counts as equally good
 _RUNS = ("inside", "beyond")
 
 
@@ -100,7 +100,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
 
 
 def _surely_wrong(result: Result) -> bool:
-    """Tell whether a name that not even an alias excuses is stated above .9."""
+    """Return whether a wrong name, not an alias of the truth, is stated above .9."""
     return surely_wrong(result) and not fits(leading(result, clean=True)[0], answers(result, merged=True))
 
 
@@ -110,7 +110,7 @@ def _intervals(done: list[Result]) -> list[Row]:
 
 
 def gains_of(result: Result, best: str) -> tuple[float, float] | None:
-    """Return what the repaired and the best model gain in the runs kept back, each at most 100 nats."""
+    """Return the gains of the repaired and the best model on the held-out runs, each at most 100 nats."""
     own = [result["held_out"][run] for run in _RUNS]
     if any(model not in scores for scores in own for model in ("null", "repaired", best)):
         return None
@@ -152,7 +152,7 @@ def _strange(done: list[Result]) -> list[Row]:
 
 
 def _as_good(result: Result) -> bool:
-    """Tell whether a name or formula gains most of what the true law does; names that explain the same are as good."""
+    """Return whether a name or formula gains most of what the true law does; aliases count too."""
     if fits(leading(result, clean=True)[0], answers(result, merged=True)) and result["verdict"] != "unknown":
         return True
     gains = gains_of(result, "right")

@@ -1,17 +1,16 @@
 """Challenge cases: recordings that conceal an effect of a known size, drawn from a sealed seed.
 
-Which sensor, plan, noise and effect a case has follows from the seed and its number alone, and what is kept
-back for the test comes from the same world. The size of an effect needs the null model that it has to survive:
-whoever asks for a case hands over that refit.
+A case's sensor, plan, noise and effect follow from the seed and its number alone; its held-out readings come from the
+same world. The size of an effect is what a refit of the null model leaves of it: the caller supplies that refit.
 """
 
-from probewise.world.challenge.cases import ALIASES, Case, draw_case, kept_back
+from probewise.world.challenge.cases import ALIASES, Case, draw_case, held_out
 from probewise.world.challenge.inside import INSIDE, NEEDS_SENSOR, NO_PHYSICS, SINGLES
 from probewise.world.challenge.outsiders import OUTSIDE
-from probewise.world.challenge.plans import PLANS, draw_plan, kept_back_plans
+from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
 from probewise.world.challenge.regions import Region
 from probewise.world.challenge.sensors import NOISE_LEVELS, NOISE_MODELS, NOISE_NAMES, SSFS, draw_sensor, with_noise
-from probewise.world.challenge.sizing import Ruler, Surviving, amplitude_of_size
+from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import WHEEL, Kind, Stratum, stratum_of
 from probewise.world.challenge.truth import Alias, Hidden, Truth
 
@@ -30,19 +29,19 @@ __all__ = [
     "WHEEL",
     "Alias",
     "Case",
+    "EffectSizer",
     "Hidden",
     "Kind",
+    "NormAfterRefit",
     "Region",
-    "Ruler",
     "Stratum",
-    "Surviving",
     "Truth",
     "amplitude_of_size",
     "draw_case",
     "draw_plan",
     "draw_sensor",
-    "kept_back",
-    "kept_back_plans",
+    "held_out",
+    "held_out_plans",
     "stratum_of",
     "with_noise",
 ]

@@ -1,4 +1,4 @@
-"""What a case may conceal: everything about an effect is drawn, only its amplitude is left open."""
+"""Samplers of effects to conceal: all parameters are drawn except the amplitude."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from probewise.recordings.plan import Plan
 from probewise.world.concealed import Concealed
 from probewise.world.world import World
 
-__all__ = ["Candidate", "Draw", "OfAmplitude", "Setting", "log_uniform", "plain", "sign", "signed"]
+__all__ = ["CleanSetup", "Draw", "EffectSampler", "OfAmplitude", "log_uniform", "plain", "sign", "signed"]
 
 OfAmplitude: TypeAlias = Callable[[float], Concealed]
-"""The effect of an amplitude greater than 0."""
+"""Amplitude (greater than 0) to effect."""
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
-    """Where an effect is to be concealed: a plan, and a sensor that conceals nothing yet."""
+class CleanSetup:
+    """A plan and a world without effects, in which an effect will be concealed."""
 
     plan: Plan
     world: World
@@ -45,7 +45,7 @@ class Setting:
 
     @cached_property
     def scans(self) -> tuple[str, ...]:
-        """Names of the scans of 20 readings or more over something with an edge."""
+        """Names of the scans of 20 readings or more over a pattern with an edge."""
         return tuple(
             self.plan.scan_names[k]
             for k, rows in enumerate(self.plan.rows_by_scan())
@@ -54,31 +54,31 @@ class Setting:
         )
 
     def mounting_of(self, scan: str) -> tuple[str, ...]:
-        """Return the names of all scans that share this one's orientation, in the order they were taken."""
+        """Return the names of all scans with the orientation of this one, in order of time."""
         first = {name: rows[0] for name, rows in zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)}
         turn = self.plan.orientation_rad
         return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])
 
 
-Draw: TypeAlias = Callable[[Setting, np.random.Generator], OfAmplitude]
+Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], OfAmplitude]
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """An effect to be drawn.
+class EffectSampler:
+    """A distribution over one kind of effect, up to its amplitude.
 
     Parameters
     ----------
     shows_in
-        Covariates that its residual shows in.
+        Covariates along which its residual is visible.
     draw
-        Draws all but the amplitude.
+        Draws all parameters except the amplitude.
     first
-        Amplitude to begin with when a size is looked for.
+        First amplitude of the search for a size.
     limit
-        Largest amplitude that makes sense.
+        Largest plausible amplitude.
     sized
-        Whether its size can be chosen; otherwise the first amplitude is taken.
+        Whether its size can be chosen; otherwise the amplitude is `first`.
     """
 
     shows_in: tuple[str, ...]
@@ -99,14 +99,14 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def plain(make: OfAmplitude) -> Draw:
-    """Draw nothing: the amplitude is all there is."""
-    return lambda setting, rng: make
+    """Draw nothing: the amplitude is the only parameter."""
+    return lambda setup, rng: make
 
 
 def signed(make: OfAmplitude) -> Draw:
     """Draw the sign of the amplitude."""
 
-    def draw(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+    def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s = sign(rng)
         return lambda a: make(s * a)
 

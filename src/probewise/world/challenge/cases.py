@@ -1,4 +1,4 @@
-"""Draw a case: a recording, what it conceals, and what is kept back to test the diagnosis on."""
+"""Draw a case: a recording, its concealed effects, and held-out plans to test the diagnosis on."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 
 from probewise.errors import NotConvergedError
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.world.challenge.candidates import Setting
+from probewise.world.challenge.candidates import CleanSetup
 from probewise.world.challenge.inside import INSIDE, PAIRABLE, SINGLES
 from probewise.world.challenge.outsiders import OUTSIDE
-from probewise.world.challenge.plans import PLANS, draw_plan, kept_back_plans
+from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
 from probewise.world.challenge.regions import region_of
 from probewise.world.challenge.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise
-from probewise.world.challenge.sizing import Ruler, Surviving, amplitude_of_size
+from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import Stratum, stratum_of
 from probewise.world.challenge.truth import Alias, Hidden, Truth
 from probewise.world.concealed import Disturbs
 from probewise.world.world import World
 
-__all__ = ["ALIASES", "Case", "draw_case", "kept_back"]
+__all__ = ["ALIASES", "Case", "draw_case", "held_out"]
 
 ALIASES: tuple[tuple[str, str], ...] = (
     ("backlash", "edge_misplacement"),
@@ -30,10 +30,10 @@ ALIASES: tuple[tuple[str, str], ...] = (
     ("edge_misplacement", "sensor_tilt"),
     ("backlash", "sensor_tilt"),
 )
-"""What may not be told apart in the paper's plan; either may be the concealed one."""
+"""Pairs of effects that may be aliased in the paper's plan; either may be concealed."""
 
-_HONEST_NATS = 3.0  # below it two effects cannot be told apart (diagnosis, section 3)
-_APART = 0.5  # cosine of the two of a pair, less
+_HONEST_NATS = 3.0  # below it two effects are aliased (diagnosis, section 3)
+_APART = 0.5  # upper bound on the cosine of a pair
 _ATTEMPTS = 6
 
 
@@ -44,15 +44,15 @@ class Case:
     Parameters
     ----------
     recording
-        All that a diagnosis may see.
+        The recording to diagnose.
     truth
-        What it is scored against.
+        The truth that the diagnosis is scored against.
     world
-        The world with everything that it conceals.
+        The world with its concealed effects.
     test_plans
-        What `kept_back` reads, by name.
+        Plans of the held-out readings, by name.
     test_seed
-        Where the noise of those readings comes from.
+        Seed of the noise of the held-out readings.
     """
 
     recording: Recording
@@ -62,7 +62,7 @@ class Case:
     test_seed: np.random.SeedSequence
 
 
-def draw_case(seed: int, number: int, *, surviving: Surviving) -> Case:
+def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Case:
     """Draw case `number` of a challenge; it depends on the seed and the number alone.
 
     Parameters
@@ -70,14 +70,14 @@ def draw_case(seed: int, number: int, *, surviving: Surviving) -> Case:
     seed
         The sealed seed of the challenge.
     number
-        Which case, from 0 on: tells its stratum (stratum_of) and, with the seed, all else.
-    surviving
-        What the null model leaves of an effect, in units of the reading.
+        Number of the case, from 0: determines its stratum (`stratum_of`) and, with the seed, everything else.
+    norm_after_refit
+        Norm of an effect after a full refit of the null model, in reading units.
 
     Raises
     ------
     NotConvergedError
-        If no effect drawn for it can have the size wanted in this plan.
+        If no effect drawn can have the requested size in this plan.
     """
     stratum, turn = stratum_of(number)
     drawing, laying, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
@@ -86,14 +86,14 @@ def draw_case(seed: int, number: int, *, surviving: Surviving) -> Case:
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
     plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    plan_name, setting, secret = _settle(
-        stratum, turn, plan_names, sensor, surviving, rng, np.random.default_rng(laying)
+    plan_name, setup, secret = _settle(
+        stratum, turn, plan_names, sensor, norm_after_refit, rng, np.random.default_rng(laying)
     )
     if any(isinstance(hidden.effect, Disturbs) for hidden in secret.hidden):
-        model = "white"  # one thing at a time is wrong with the noise
-    plan = replace(setting.plan, instrumentation=_instrument(setting.plan, model))
+        model = "white"  # only one noise fault at a time
+    plan = replace(setup.plan, instrumentation=_instrument(setup.plan, model))
     concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in secret.hidden))
-    world = with_noise(concealing, model, duration_s=setting.duration_s)
+    world = with_noise(concealing, model, duration_s=setup.duration_s)
     truth = Truth(
         seed=seed,
         number=number,
@@ -110,13 +110,13 @@ def draw_case(seed: int, number: int, *, surviving: Surviving) -> Case:
         alias=secret.alias,
     )
     recording = world.simulate(plan, rng=np.random.default_rng(noise))
-    return Case(recording, truth, world, kept_back_plans(plan, rng=np.random.default_rng(test)), test_noise)
+    return Case(recording, truth, world, held_out_plans(plan, rng=np.random.default_rng(test)), test_noise)
 
 
-def kept_back(case: Case) -> dict[str, Recording]:
-    """Take the readings that were kept back from a diagnosis, in the same world after the recording.
+def held_out(case: Case) -> dict[str, Recording]:
+    """Simulate the held-out readings, in the same world after the recording.
 
-    What belongs to one scan, by its name, is not in them; time, wear and weather have gone on.
+    Effects tied to a named scan are not in them; effects in time continue.
     """
     rng = np.random.default_rng(case.test_seed)
     return {name: case.world.simulate(plan, rng=rng) for name, plan in case.test_plans.items()}
@@ -124,7 +124,7 @@ def kept_back(case: Case) -> dict[str, Recording]:
 
 @dataclass(frozen=True)
 class _Secret:
-    """What was found to conceal."""
+    """Effects chosen for a case, with the cosine of a pair or the alias."""
 
     hidden: tuple[Hidden, ...] = ()
     cosine: float | None = None
@@ -136,30 +136,30 @@ def _settle(
     turn: int,
     plan_names: list[str],
     sensor: World,
-    surviving: Surviving,
+    norm_after_refit: NormAfterRefit,
     rng: np.random.Generator,
     laying: np.random.Generator,
-) -> tuple[str, Setting, _Secret]:
-    """Try plan after plan, and in each some draws, until the effect can have its size."""
+) -> tuple[str, CleanSetup, _Secret]:
+    """Draw plans, and a few effects in each, until an effect can have the requested size."""
     failure = NotConvergedError("no plan to try")
     for plan_name in plan_names:
-        setting = Setting(draw_plan(plan_name, rng=laying), sensor)
+        setup = CleanSetup(draw_plan(plan_name, rng=laying), sensor)
         if stratum.kind == "clean":
-            return plan_name, setting, _Secret()
-        ruler = Ruler(setting, surviving)
+            return plan_name, setup, _Secret()
+        sizer = EffectSizer(setup, norm_after_refit)
         for _ in range(_ATTEMPTS):
             try:
-                return plan_name, setting, _conceal(stratum, turn, setting, ruler, rng)
+                return plan_name, setup, _conceal(stratum, turn, setup, sizer, rng)
             except NotConvergedError as error:
                 failure = error
     raise failure
 
 
-def _conceal(stratum: Stratum, turn: int, setting: Setting, ruler: Ruler, rng: np.random.Generator) -> _Secret:
-    """Draw once what a stratum wants to be concealed."""
+def _conceal(stratum: Stratum, turn: int, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator) -> _Secret:
+    """Draw the effects of a stratum once."""
 
     def one(name: str) -> Hidden:
-        return _sized(name, stratum.size, setting, ruler, rng)
+        return _sized(name, stratum.size, setup, sizer, rng)
 
     match stratum.kind:
         case "single":
@@ -168,30 +168,30 @@ def _conceal(stratum: Stratum, turn: int, setting: Setting, ruler: Ruler, rng: n
             return _Secret((one(list(OUTSIDE)[turn % len(OUTSIDE)]),))
         case "pair":
             first, second = (one(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
-            cosine = ruler.cosine(first.effect, second.effect)
+            cosine = sizer.cosine(first.effect, second.effect)
             if abs(cosine) >= _APART:
-                raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
+                raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
             return _Secret((first, second), cosine=cosine)
         case "alias":
             hidden, other = (one(str(name)) for name in rng.permutation(ALIASES[turn % len(ALIASES)]))
-            cosine = ruler.cosine(hidden.effect, other.effect)
+            cosine = sizer.cosine(hidden.effect, other.effect)
             if stratum.size**2 * (1 - cosine**2) / 2 >= _HONEST_NATS:
-                raise NotConvergedError(f"{hidden.name} and {other.name} are not alike: cosine {cosine:.2f}")
+                raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
             return _Secret((hidden,), alias=Alias(other.effect, cosine))
         case _:
             return _Secret((one(stratum.kind),))
 
 
-def _sized(name: str, wanted: float, setting: Setting, ruler: Ruler, rng: np.random.Generator) -> Hidden:
+def _sized(name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator) -> Hidden:
     candidate = INSIDE.get(name) or OUTSIDE[name]
-    of_amplitude = candidate.draw(setting, rng)
+    of_amplitude = candidate.draw(setup, rng)
     amplitude = candidate.first
     if candidate.sized:
         amplitude = amplitude_of_size(
-            lambda a: ruler.size(of_amplitude(a)), wanted, first=candidate.first, limit=candidate.limit
+            lambda a: sizer.size(of_amplitude(a)), wanted, first=candidate.first, limit=candidate.limit
         )
     effect = of_amplitude(amplitude)
-    return Hidden(effect, ruler.size(effect), region_of(effect, ruler))
+    return Hidden(effect, sizer.size(effect), region_of(effect, sizer))
 
 
 def _instrument(plan: Plan, model: str) -> Instrumentation:

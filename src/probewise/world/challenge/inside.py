@@ -1,4 +1,4 @@
-"""The vocabulary of the diagnosis, each name with how it is drawn and what its residual shows in."""
+"""Samplers of the effects in the diagnosis's vocabulary, with the covariates of their residuals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from probewise.world.challenge.candidates import Candidate, Draw, OfAmplitude, Setting, log_uniform, plain, sign, signed
+from probewise.world.challenge.candidates import (
+    CleanSetup,
+    Draw,
+    EffectSampler,
+    OfAmplitude,
+    log_uniform,
+    plain,
+    sign,
+    signed,
+)
 from probewise.world.concealed import (
     AlbedoGradient,
     AlbedoPatch,
@@ -50,145 +59,145 @@ __all__ = ["INSIDE", "NEEDS_SENSOR", "NO_PHYSICS", "PAIRABLE", "SINGLES"]
 def _sloping(make: Callable[[float, float], Concealed]) -> Draw:
     """Draw a direction within 60 degrees of X, which every plan moves along."""
 
-    def draw(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+    def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, angle = sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
         return lambda a: make(s * a * math.cos(angle), s * a * math.sin(angle))
 
     return draw
 
 
-def _ambient_step(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-    s, at_s = sign(rng), setting.start_s + rng.uniform(0.15, 0.85) * setting.duration_s
+def _ambient_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, at_s = sign(rng), setup.start_s + rng.uniform(0.15, 0.85) * setup.duration_s
     return lambda a: AmbientStep(s * a, at_s)
 
 
-def _gain_drift(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-    s, tau_s = sign(rng), log_uniform(rng, 60.0, setting.duration_s)
+def _gain_drift(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, tau_s = sign(rng), log_uniform(rng, 60.0, setup.duration_s)
     return lambda a: GainDrift(s * a, tau_s)
 
 
-def _flicker(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-    alias_hz, phase = log_uniform(rng, 0.01, setting.fastest_hz), rng.uniform(0, 2 * math.pi)
+def _flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    alias_hz, phase = log_uniform(rng, 0.01, setup.fastest_hz), rng.uniform(0, 2 * math.pi)
     return lambda a: Flicker(a, alias_hz, phase)
 
 
-def _saturation(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-    """Draw a ceiling below white by the amplitude, a share of the span; hard, or rounded over a unit."""
-    white, span = setting.world.white, setting.world.white - setting.world.black
+def _saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    """Draw a ceiling below white by the amplitude, a share of the span; hard, or softened over one unit."""
+    white, span = setup.world.white, setup.world.white - setup.world.black
     softness = float(rng.choice([0.0, 1.0]))
     return lambda a: Saturation(white - a * span, softness)
 
 
-def _position_scale(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _position_scale(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, ratio = sign(rng), rng.uniform(-1, 1)
     return lambda a: PositionScale(s * a, ratio * a)
 
 
-def _periodic(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _periodic(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     period_mm, phase = log_uniform(rng, 4.0, 25.0), rng.uniform(0, 2 * math.pi)
     return lambda a: PeriodicPositionError(a, period_mm, phase)
 
 
-def _scan_misplacement(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-    s, scan = sign(rng), str(rng.choice(setting.scans))
+def _scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, scan = sign(rng), str(rng.choice(setup.scans))
     return lambda a: ScanMisplacement(s * a, scan)
 
 
 def _in_scans(make: Callable[[float, tuple[str, ...]], Concealed]) -> Draw:
     """Draw one scan, or every scan of one mounting."""
 
-    def draw(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-        s, scan = sign(rng), str(rng.choice(setting.scans))
-        scans = setting.mounting_of(scan) if rng.random() < 0.5 else (scan,)
+    def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+        s, scan = sign(rng), str(rng.choice(setup.scans))
+        scans = setup.mounting_of(scan) if rng.random() < 0.5 else (scan,)
         return lambda a: make(s * a, scans)
 
     return draw
 
 
 def _place(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw where a stain or a glint lies, near enough to the scans along X, and its sd."""
+    """Draw the place of a stain or glint, near the scans along X, and its sd."""
     return rng.uniform(-40, 40), rng.uniform(-4, 4), log_uniform(rng, 3.0, 10.0)
 
 
-def _albedo_patch(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _albedo_patch(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, (x, y, r) = sign(rng), _place(rng)
     return lambda a: AlbedoPatch(s * a, x, y, r)
 
 
-def _glint(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _glint(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     x, y, r = _place(rng)
     return lambda a: Glint(a, x, y, r)
 
 
-def _edge_shadow(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _edge_shadow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     w = log_uniform(rng, 2.0, 8.0)
     return lambda a: EdgeShadow(a, w)
 
 
-def _halo(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _halo(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     r_mm = log_uniform(rng, 12.0, 40.0)
     return lambda a: Halo(a, r_mm)
 
 
-def _ssf_order(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _ssf_order(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     turn, sd_mm = rng.uniform(0, 2 * math.pi), rng.uniform(1.5, 4.0)
     return lambda a: SSFOrder(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
 
 
-def _outliers(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
+def _outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     share = log_uniform(rng, 0.01, 0.05)
     return lambda a: Outliers(share, a)
 
 
-def _dropouts(setting: Setting, rng: np.random.Generator) -> OfAmplitude:
-    """Draw how many are lost, too: one alone is plain to see."""
+def _dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    """Draw the number of lost readings too, since a single one is obvious."""
     value, factor = float(rng.choice([0.0, 100.0])), log_uniform(rng, 0.5, 5.0)
     return lambda a: Dropouts(factor * a, value)
 
 
-INSIDE: Mapping[str, Candidate] = {
-    "ambient_gradient": Candidate(("place",), _sloping(AmbientGradient), 0.01, 2.0),
-    "ambient_step": Candidate(("time",), _ambient_step, 0.5, 30.0),
-    "offset_drift": Candidate(("time",), signed(OffsetDrift), 5.0, 500.0),
-    "gain_drift": Candidate(("time",), _gain_drift, 0.03, 0.9),
-    "battery_sag": Candidate(("battery_mv",), signed(BatterySag), 0.5, 10.0),
-    "flicker": Candidate(("time",), _flicker, 0.3, 20.0),
-    "saturation": Candidate(("level",), _saturation, 0.05, 0.9),
-    "nonlinearity": Candidate(("level",), signed(lambda a: Nonlinearity(math.exp(a))), 0.1, 1.5),
-    "quantisation": Candidate(("lattice",), plain(Quantisation), 1.0, 20.0),
-    "hysteresis": Candidate(("direction",), signed(Hysteresis), 0.3, 20.0),
-    "lag": Candidate(("slope", "direction"), plain(Lag), 0.5, 20.0),
-    "backlash": Candidate(("slope", "direction"), plain(Backlash), 0.5, 15.0),
-    "position_scale": Candidate(("place",), _position_scale, 0.02, 0.4),
-    "periodic_position_error": Candidate(("place",), _periodic, 0.3, 10.0),
-    "edge_misplacement": Candidate(("slope",), signed(EdgeMisplacement), 0.3, 8.0),
-    "scan_misplacement": Candidate(("slope", "scan"), _scan_misplacement, 0.3, 8.0),
-    "scan_angle_error": Candidate(("scan", "orientation"), _in_scans(ScanAngleError), 5.0, 45.0),
-    "orientation_error": Candidate(("orientation",), signed(OrientationError), 5.0, 45.0),
-    "sensor_tilt": Candidate(("orientation", "slope"), _sloping(SensorTilt), 0.3, 8.0),
-    "height_gradient": Candidate(("place",), signed(HeightGradient), 0.01, 0.12),
-    "height_offset": Candidate(("scan",), _in_scans(HeightOffset), 0.3, 8.0),
-    "albedo_gradient": Candidate(("place",), _sloping(AlbedoGradient), 5e-4, 0.012),
-    "albedo_patch": Candidate(("place",), _albedo_patch, 0.05, 1.0),
-    "edge_blur": Candidate(("edge_distance",), plain(EdgeBlur), 1.0, 8.0),
-    "edge_shadow": Candidate(("edge_distance",), _edge_shadow, 0.02, 0.6),
-    "halo": Candidate(("edge_distance",), _halo, 0.05, 0.6),
-    "glint": Candidate(("place",), _glint, 1.0, 40.0),
-    "ssf_order": Candidate(("edge_distance",), _ssf_order, 0.05, 0.5),
-    "signal_dependent_noise": Candidate(("level",), plain(SignalDependentNoise), 1.0, 100.0),
-    "correlated_noise": Candidate(("scan",), plain(CorrelatedNoise), 0.3, 0.95),
-    "outliers": Candidate((), _outliers, 5.0, 30.0),
-    "dropouts": Candidate((), _dropouts, 0.01, 0.01, sized=False),
+INSIDE: Mapping[str, EffectSampler] = {
+    "ambient_gradient": EffectSampler(("place",), _sloping(AmbientGradient), 0.01, 2.0),
+    "ambient_step": EffectSampler(("time",), _ambient_step, 0.5, 30.0),
+    "offset_drift": EffectSampler(("time",), signed(OffsetDrift), 5.0, 500.0),
+    "gain_drift": EffectSampler(("time",), _gain_drift, 0.03, 0.9),
+    "battery_sag": EffectSampler(("battery_mv",), signed(BatterySag), 0.5, 10.0),
+    "flicker": EffectSampler(("time",), _flicker, 0.3, 20.0),
+    "saturation": EffectSampler(("level",), _saturation, 0.05, 0.9),
+    "nonlinearity": EffectSampler(("level",), signed(lambda a: Nonlinearity(math.exp(a))), 0.1, 1.5),
+    "quantisation": EffectSampler(("lattice",), plain(Quantisation), 1.0, 20.0),
+    "hysteresis": EffectSampler(("direction",), signed(Hysteresis), 0.3, 20.0),
+    "lag": EffectSampler(("slope", "direction"), plain(Lag), 0.5, 20.0),
+    "backlash": EffectSampler(("slope", "direction"), plain(Backlash), 0.5, 15.0),
+    "position_scale": EffectSampler(("place",), _position_scale, 0.02, 0.4),
+    "periodic_position_error": EffectSampler(("place",), _periodic, 0.3, 10.0),
+    "edge_misplacement": EffectSampler(("slope",), signed(EdgeMisplacement), 0.3, 8.0),
+    "scan_misplacement": EffectSampler(("slope", "scan"), _scan_misplacement, 0.3, 8.0),
+    "scan_angle_error": EffectSampler(("scan", "orientation"), _in_scans(ScanAngleError), 5.0, 45.0),
+    "orientation_error": EffectSampler(("orientation",), signed(OrientationError), 5.0, 45.0),
+    "sensor_tilt": EffectSampler(("orientation", "slope"), _sloping(SensorTilt), 0.3, 8.0),
+    "height_gradient": EffectSampler(("place",), signed(HeightGradient), 0.01, 0.12),
+    "height_offset": EffectSampler(("scan",), _in_scans(HeightOffset), 0.3, 8.0),
+    "albedo_gradient": EffectSampler(("place",), _sloping(AlbedoGradient), 5e-4, 0.012),
+    "albedo_patch": EffectSampler(("place",), _albedo_patch, 0.05, 1.0),
+    "edge_blur": EffectSampler(("edge_distance",), plain(EdgeBlur), 1.0, 8.0),
+    "edge_shadow": EffectSampler(("edge_distance",), _edge_shadow, 0.02, 0.6),
+    "halo": EffectSampler(("edge_distance",), _halo, 0.05, 0.6),
+    "glint": EffectSampler(("place",), _glint, 1.0, 40.0),
+    "ssf_order": EffectSampler(("edge_distance",), _ssf_order, 0.05, 0.5),
+    "signal_dependent_noise": EffectSampler(("level",), plain(SignalDependentNoise), 1.0, 100.0),
+    "correlated_noise": EffectSampler(("scan",), plain(CorrelatedNoise), 0.3, 0.95),
+    "outliers": EffectSampler((), _outliers, 5.0, 30.0),
+    "dropouts": EffectSampler((), _dropouts, 0.01, 0.01, sized=False),
 }
-"""In the order of diagnosis, section 2."""
+"""In the order of the diagnosis page, section 2."""
 
 NEEDS_SENSOR = frozenset({"orientation_error", "edge_blur"})
-"""What an SSF fitted to the same recording swallows."""
+"""Effects that an SSF fitted to the same recording absorbs."""
 
 NO_PHYSICS = frozenset({"ssf_order"})
 
 SINGLES = tuple(name for name in INSIDE if name not in NEEDS_SENSOR | NO_PHYSICS)
-"""What a case may conceal that is diagnosed from its recording alone."""
+"""Effects that a case may conceal when the sensor is calibrated on the same recording."""
 
 PAIRABLE = tuple(name for name in SINGLES[: SINGLES.index("signal_dependent_noise")] if name != "quantisation")
-"""What is added to the mean of the readings, so that two of them have a cosine."""
+"""Effects on the mean of the readings, for which a pair has a cosine."""

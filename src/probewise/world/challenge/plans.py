@@ -1,4 +1,4 @@
-"""The plans of a challenge, their patterns off any grid, and what is read for the test and kept back."""
+"""The plans of a challenge with randomly displaced patterns, and the held-out plans."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Qua
 from probewise.recordings.plan import Plan
 from probewise.recordings.plans import jittered, paper_plan, two_way_plan
 
-__all__ = ["PLANS", "draw_plan", "kept_back_plans"]
+__all__ = ["PLANS", "draw_plan", "held_out_plans"]
 
 PLANS: Mapping[str, Callable[[], Plan]] = {"paper": paper_plan, "two_way": two_way_plan}
 
@@ -31,18 +31,18 @@ class _Scan:
 
 
 def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
-    """Lay a plan's patterns off every grid, truly described, and take its times as an arm does."""
+    """Displace and turn a plan's patterns at random (the plan says so), and give its readings times as an arm does."""
     plan = PLANS[name]()
     patterns = {key: _off_grid(pattern, rng) for key, pattern in plan.patterns.items()}
     return jittered(replace(plan, patterns=patterns), rng=rng)
 
 
-def kept_back_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
-    """Lay out what the recording of `plan` has not: "angle", "pattern" and "direction", each read after it.
+def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
+    """Make three held-out plans that differ from `plan`: "angle", "pattern" and "direction", each read after it.
 
-    A scan across a boundary with the sensor turned by an odd angle; a scan over a triangle, or one to
-    the side of a disc where the plan had no disc; and a boundary read the other way: from +x to -x where
-    the plan goes one way only, along a slant where it goes both.
+    "angle": a scan across a boundary with the sensor at an unused angle. "pattern": a scan over a triangle, or beside a
+    disc where the plan has no disc. "direction": a boundary crossed from +x to -x where the plan goes one way only, or
+    obliquely where it goes both ways.
     """
     one_way = not (plan.direction[:, 0] < 0).any()
     line = np.stack([np.linspace(-50, 50, 101), np.zeros(101)], axis=-1)
@@ -94,7 +94,7 @@ def _off_grid(pattern: Pattern, rng: np.random.Generator) -> Pattern:
 def _after(plan: Plan, scan: _Scan, start_s: float) -> Plan:
     n_points = len(scan.places_mm)
     time_s = start_s + _READING_S * np.arange(n_points)
-    # The battery goes on draining as it did.
+    # The battery keeps draining at the same rate.
     covariates = {
         name: np.asarray(np.round(np.polyval(np.polyfit(plan.time_s, values, 1), time_s)), dtype=np.float64)
         for name, values in plan.covariates.items()

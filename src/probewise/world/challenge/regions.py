@@ -1,4 +1,4 @@
-"""Where a local effect is: what a diagnosis should find when it looks for the place."""
+"""The region of a local effect, which a diagnosis should locate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray
-from probewise.world.challenge.sizing import Ruler
+from probewise.world.challenge.sizing import EffectSizer
 from probewise.world.concealed import (
     AlbedoPatch,
     AmbientStep,
@@ -35,12 +35,13 @@ class Region:
     scans: tuple[str, ...] = ()
 
 
-def region_of(effect: Concealed, ruler: Ruler) -> Region | None:
-    """Say where a local effect is; None for one that is everywhere.
+def region_of(effect: Concealed, sizer: EffectSizer) -> Region | None:
+    """Return the region of a local effect, or None for a global one.
 
-    At a place and near an edge it is where it has at least half its greatest strength, in scans along X.
+    For effects about a place or an edge, the region is where the effect has at least half its maximum, in scans along
+    X.
     """
-    plan, clean = ruler.clean.plan, ruler.clean.readings
+    plan, clean = sizer.clean.plan, sizer.clean.readings
     match effect:
         case ScanMisplacement():
             return Region("scan", scans=(effect.scan,))
@@ -54,7 +55,7 @@ def region_of(effect: Concealed, ruler: Ruler) -> Region | None:
             return Region("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
         case AlbedoPatch() | Glint() | PlaceStep():
             along_x: BoolArray = np.abs(plan.direction[:, 0]) > 0
-            strength = np.where(along_x, np.abs(ruler.recording(effect).readings - clean), 0.0)
+            strength = np.where(along_x, np.abs(sizer.recording(effect).readings - clean), 0.0)
             there = plan.x_mm[strength >= strength.max() / 2]
             return Region("place", float(there.min()), float(there.max()))
         case _:

@@ -30,7 +30,7 @@ __all__ = [
     "with_noise",
 ]
 
-_PIXEL_MM = 0.5  # an SSF that is flat over half a millimetre is as true as any
+_PIXEL_MM = 0.5  # resolution of the raster: an SSF may be constant over half a millimetre
 
 NOISE_LEVELS: Mapping[str, float] = {"low": 0.4, "middle": 0.6, "high": 1.0}
 """Sd of a reading's noise, in reading units."""
@@ -45,7 +45,7 @@ NOISE_NAMES: Mapping[str, str] = {
     "signal_dependent": "signal_dependent_noise",
     "dropouts": "dropouts",
 }
-"""What the vocabulary calls a noise model; the others have no name in it, being declared or unheard of."""
+"""Names of noise models in the vocabulary; the other models are declared in the plan or out of vocabulary."""
 
 
 def _gaussian(rng: np.random.Generator) -> Spot:
@@ -94,25 +94,25 @@ SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
     "ring": _ring,
     "skewed": _skewed,
 }
-"""The last three are no mixtures of Gaussians; of each, the best mixture of four leaves a lambda of about 1 at the
-middle noise level: they cannot be modelled exactly, and well enough."""
+"""The last three are not mixtures of Gaussians; the best mixture of four leaves a residual of lambda about 1 at the
+middle noise level: a good but inexact model."""
 
 
 def draw_spot(ssf: str, *, rng: np.random.Generator) -> Spot:
-    """Draw a spot of this kind, its sizes within 15 % of a LEGO light sensor's."""
+    """Draw a footprint of this kind, with sizes within 15 % of a LEGO light sensor's."""
     return SSFS[ssf](rng)
 
 
 def draw_sensor(ssf: str, noise_level: str, *, rng: np.random.Generator) -> World:
-    """Draw a sensor that conceals nothing."""
+    """Draw a sensor without concealed effects."""
     black, white = float(rng.uniform(8, 14)), float(rng.uniform(55, 70))
     return World(draw_spot(ssf, rng=rng), black=black, white=white, noise_sd=NOISE_LEVELS[noise_level])
 
 
 def with_noise(world: World, model: str, *, duration_s: float) -> World:
-    """Give the world's noise one of the characters of NOISE_MODELS; `noise_sd` stays that of its normal part.
+    """Return the world with a noise model of NOISE_MODELS; `noise_sd` remains the sd of its Gaussian core.
 
-    "quantised" readings are rounded to whole units, and the plan should say so.
+    "quantised" readings are rounded to whole units, which the plan should declare.
     """
     if model == "quantised":
         return replace(world, step=1.0)

@@ -1,4 +1,4 @@
-"""Find the amplitude at which an effect has a wanted size, lambda of the diagnosis."""
+"""Find the amplitude at which an effect has a requested size lambda."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from scipy.stats import norm
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.recordings.plan import Recording
-from probewise.world.challenge.candidates import Setting
+from probewise.world.challenge.candidates import CleanSetup
 from probewise.world.concealed import Concealed, CorrelatedNoise, Disturbs, Dropouts, Outliers, SignalDependentNoise
 from probewise.world.concealed.stages import ANSWERING
 from probewise.world.world import Look
 
-__all__ = ["Ruler", "Surviving", "amplitude_of_size", "noise_size"]
+__all__ = ["EffectSizer", "NormAfterRefit", "amplitude_of_size", "noise_size"]
 
-Surviving: TypeAlias = Callable[[Recording, Recording], float]
-"""What a null model leaves of noise-free readings: (without effect, with effect) -> in units of the reading.
+NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]
+"""Norm of an effect after a refit of the null model: noise-free readings (without, with effect) to reading units.
 
-The root of the sum of squares of `with - null`, the null model refitted in full to `with`; what it leaves of
-the readings without effect, because it cannot take the true SSF's shape, is no effect's and not to be counted.
+It is the 2-norm of `with - null`, where the null model is refitted in full to `with`. The misfit to the readings
+without effect (the model cannot have the true SSF's shape) must not be counted.
 """
 
 
@@ -40,36 +40,36 @@ def amplitude_of_size(
     acceptable: float = 0.1,
     max_calls: int = 16,
 ) -> float:
-    """Search for an amplitude greater than 0 at which `size` is as wanted.
+    """Find an amplitude greater than 0 at which `size` has the requested value.
 
-    A size grows about as a power of the amplitude: steps follow the straight line in logarithms, first
-    out of the range that is known, then within it, with a bisection wherever the line gains too little.
+    Size grows roughly as a power of the amplitude: steps follow a straight line in log-log coordinates, first by
+    extrapolation, then by interpolation, with bisection where interpolation gains too little.
 
     Parameters
     ----------
     size
         Size at an amplitude.
     wanted
-        Size wanted, greater than 0.
+        Requested size, greater than 0.
     first
-        Amplitude to begin with.
+        First amplitude tried.
     limit
         Largest amplitude.
     tolerance
         Relative error of the size at which the search ends.
     acceptable
-        The same for a size that jumps past what is wanted as the amplitude grows.
+        Relative error accepted where the size jumps past the requested value as the amplitude grows.
     max_calls
-        Calls of `size` at most.
+        Largest number of calls of `size`.
 
     Raises
     ------
     NotConvergedError
-        If even the limit is too small, or no amplitude has an acceptable size; `partial` holds the amplitude
-        and the size that came nearest.
+        If even the limit is too small, or no amplitude has an acceptable size; `partial` holds the amplitude and size
+        that came closest.
     """
-    low: tuple[float, float] | None = None  # log amplitude and log size over wanted, too small
-    high: tuple[float, float] | None = None  # too large
+    low: tuple[float, float] | None = None  # log amplitude and log(size / wanted), size too small
+    high: tuple[float, float] | None = None  # the same, size too large
     at, nearest = math.log(first), (first, 0.0)
     for call in range(max_calls):
         found = size(math.exp(at))
@@ -99,66 +99,66 @@ def amplitude_of_size(
 
 
 @dataclass(frozen=True, eq=False)
-class Ruler:
-    """Measure how large effects are in a setting.
+class EffectSizer:
+    """Computes the sizes of effects for one plan and sensor.
 
     Parameters
     ----------
-    setting
-        A plan and a sensor that conceals nothing.
-    surviving
-        What the null model leaves of an effect.
+    setup
+        A plan and a world without effects.
+    norm_after_refit
+        Norm of an effect after a full refit of the null model.
     """
 
-    setting: Setting
-    surviving: Surviving
+    setup: CleanSetup
+    norm_after_refit: NormAfterRefit
 
     @cached_property
     def _look(self) -> Look:
-        return self.setting.world.look(self.setting.plan)
+        return self.setup.world.look(self.setup.plan)
 
     @cached_property
     def clean(self) -> Recording:
         """Noise-free readings without any effect."""
-        return self.setting.world.simulate(self.setting.plan, rng=None, look=self._look).unlimited()
+        return self.setup.world.simulate(self.setup.plan, rng=None, look=self._look).unlimited()
 
     def recording(self, *concealed: Concealed) -> Recording:
         """Return the noise-free readings with these effects."""
         late = all(effect.stage in ANSWERING for effect in concealed)
-        world = replace(self.setting.world, concealed=concealed)
-        return world.simulate(self.setting.plan, rng=None, look=self._look if late else None).unlimited()
+        world = replace(self.setup.world, concealed=concealed)
+        return world.simulate(self.setup.plan, rng=None, look=self._look if late else None).unlimited()
 
     def size(self, *concealed: Concealed) -> float:
-        """Return lambda of the effects together, in units of the sd of the noise's normal part."""
+        """Return lambda of the effects together, in sds of the noise's Gaussian core."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
-            return noise_size(concealed[0], self._look, self.clean.readings, self.setting.world.noise_sd)
-        return self.surviving(self.clean, self.recording(*concealed)) / self.setting.world.noise_sd
+            return noise_size(concealed[0], self._look, self.clean.readings, self.setup.world.noise_sd)
+        return self.norm_after_refit(self.clean, self.recording(*concealed)) / self.setup.world.noise_sd
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
-        """Return how alike the surviving parts of two effects are: a size of both and of each tells."""
+        """Return the cosine of two effects after the refit, from the sizes of both together and of each."""
         a, b, both = self.size(one), self.size(other), self.size(one, other)
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
 
 
 def noise_size(effect: Disturbs, look: Look, readings: FloatArray, noise_sd: float) -> float:
-    """Return the size of an effect on the noise: the lambda of an effect on the mean that is as plain to see.
+    """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
 
-    Half the square of lambda is the log likelihood that the truth gains, on average, over white Gaussian
-    noise of the best constant variance (Kullback-Leibler divergence times the readings).
+    lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
+    variance (Kullback-Leibler divergence summed over readings).
 
     Parameters
     ----------
     effect
-        One of the vocabulary's.
+        A noise effect of the vocabulary.
     look, readings
-        What the sensor sees, and the noise-free readings, shape (n_points,).
+        View of the sensor, and the noise-free readings, shape (n_points,).
     noise_sd
-        Sd of the noise's normal part.
+        Sd of the noise's Gaussian core.
 
     Raises
     ------
     ParameterError
-        If the effect is none of the vocabulary's.
+        If the effect is not a noise effect of the vocabulary.
     """
     n_points = len(look.seen)
     match effect:
@@ -171,14 +171,14 @@ def noise_size(effect: Disturbs, look: Look, readings: FloatArray, noise_sd: flo
         case Outliers():
             return math.sqrt(2 * n_points * _outlier_divergence(effect.share, effect.size))
         case Dropouts():
-            # As on the mean: a reading lost stands out as far as it lies from what it should have been.
+            # As for the mean: a lost reading deviates by its distance from the right value.
             return math.sqrt(effect.share * float(((effect.value - readings) ** 2).sum())) / noise_sd
         case _:
             raise ParameterError("effect", effect.name, "a noise effect of the vocabulary")
 
 
 def _outlier_divergence(share: float, size: float) -> float:
-    """Integrate the divergence of one reading: a mixture of two Gaussians from the one of equal variance."""
+    """Return the KL divergence of a two-Gaussian mixture from the Gaussian of equal variance."""
     wide, even = math.sqrt(1 + size**2), math.sqrt(1 + share * size**2)
 
     def integrand(z: float) -> float:

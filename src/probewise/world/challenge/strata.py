@@ -1,4 +1,4 @@
-"""How a campaign's cases are spread over what is to be measured: a wheel that turns."""
+"""The strata of a campaign: kinds and sizes of cases, in a repeating cycle."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Kind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_or
 
 @dataclass(frozen=True)
 class Stratum:
-    """One kind of case: at what size lambda (0 for clean), and whether its noise is white or of another kind."""
+    """A kind of case, its size lambda (0 for clean), and whether its noise is of another kind than white."""
 
     kind: Kind
     size: float = 0.0
@@ -34,13 +34,13 @@ WHEEL: tuple[Stratum, ...] = (
     Stratum("alias", 12.0),
     Stratum("ssf_order", 12.0),
 )
-"""A hundred turns, 6,000 cases: 2,000 clean, 1,200 single at lambda 8, 500 at 20, 300 pairs, 500 outside."""
+"""A hundred cycles are 6,000 cases: 2,000 clean, 1,200 single at lambda 8, 500 at 20, 300 pairs, 500 outside."""
 
-_STRIDE = 23  # has no divisor in common with the wheel: cases in a row are of different kinds
+_STRIDE = 23  # coprime to the length of the cycle, so that successive cases differ in kind
 
 
 def stratum_of(number: int) -> tuple[Stratum, int]:
-    """Return the stratum of a case and how many of that stratum come before it."""
+    """Return the stratum of a case and the number of earlier cases of that stratum."""
     turn, slot = divmod(number, len(WHEEL))
     order = [WHEEL[k * _STRIDE % len(WHEEL)] for k in range(len(WHEEL))]
     stratum = order[slot]

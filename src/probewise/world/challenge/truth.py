@@ -1,4 +1,4 @@
-"""What a case conceals: kept apart from its recording, for scoring only."""
+"""The truth of a case, separate from its recording and used for scoring only."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Hidden:
     Parameters
     ----------
     effect
-        What it is, with its parameters.
+        The effect with its parameters.
     size_lambda
-        What is left of it when the null model has been refitted, in units of the noise's sd.
+        Norm of its change after a refit of the null model, in noise sds.
     region
-        Where it is; None: everywhere.
+        Region where it acts; None: everywhere.
     """
 
     effect: Concealed
@@ -46,7 +46,7 @@ class Hidden:
 
     @property
     def shows_in(self) -> tuple[str, ...]:
-        """Covariates that its residual shows in."""
+        """Covariates along which its residual is visible."""
         return (INSIDE.get(self.name) or OUTSIDE[self.name]).shows_in
 
     @property
@@ -57,7 +57,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Alias:
-    """An effect that looks like the concealed one in this plan, and how much."""
+    """An effect that is aliased with the concealed one in this plan, and their cosine."""
 
     effect: Concealed
     cosine: float
@@ -65,24 +65,24 @@ class Alias:
 
 @dataclass(frozen=True)
 class Truth:
-    """Everything about a case that its recording does not say.
+    """The truth of a case.
 
     Parameters
     ----------
     seed, number
-        The case again.
+        Seed and number of the case.
     stratum
-        What kind of case it was to be.
+        Stratum of the case.
     ssf, noise_level, noise_model, plan
         Names of SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS.
     noise_sd, black, white
-        The sensor's numbers.
+        Noise sd and levels of the sensor.
     hidden
-        What is concealed, in the order of the vocabulary.
+        Concealed effects, in the order of the vocabulary.
     cosine
-        Of the surviving parts of a pair; None: no pair.
+        Cosine of a pair after the refit; None: no pair.
     alias
-        What the concealed effect cannot be told from; None where that was not asked.
+        The alias of the concealed effect, in the stratum of aliases; otherwise None.
     """
 
     seed: int
@@ -101,7 +101,7 @@ class Truth:
 
     @property
     def combination(self) -> tuple[str, ...]:
-        """What a perfect diagnosis says: names, sorted; () when clean; ("unknown",) outside the vocabulary.
+        """Answer of a perfect diagnosis: sorted names; () if clean; ("unknown",) outside the vocabulary.
 
         The name of the noise model is among them.
         """
@@ -113,7 +113,7 @@ class Truth:
         return tuple(sorted(names))
 
     def to_json(self) -> str:
-        """Write all of it as strict JSON, "format": "truth/1"."""
+        """Serialise as strict JSON, "format": "truth/1"."""
         content = {
             "format": "truth/1",
             **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},

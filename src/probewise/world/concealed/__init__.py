@@ -1,6 +1,6 @@
-"""What a world may do that a plain sensor model leaves out: one small value an effect, formulas of its own.
+"""Effects that a world may have and a plain sensor model leaves out: one small class each, with independent formulas.
 
-A concealed effect acts at one stage of the way from pose to reading. To add one, write a frozen
+A concealed effect acts at one stage of the chain from pose to reading. To add one, write a frozen
 dataclass with `name`, `stage` and the method of that stage (`stages`); `World` applies it there.
 """
 

@@ -1,4 +1,4 @@
-"""The arm does not stand where, or as, it was sent."""
+"""Position and orientation errors of the arm."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ __all__ = ["Backlash", "OrientationError", "PeriodicPositionError", "PositionSca
 
 @dataclass(frozen=True)
 class Backlash:
-    """The arm stands behind by half the play of its gears, whichever way it came."""
+    """Backlash: the arm stops short by half the play of its gears, in either direction."""
 
     name: ClassVar[str] = "backlash"
     stage: ClassVar[Stage] = "place"
     width_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Move places against the direction of the move by width/2."""
+        """Shift places by width/2 against the direction of motion."""
         return values - rows.direction * (self.width_mm / 2)
 
 
 @dataclass(frozen=True)
 class PositionScale:
-    """The arm's millimetre is not one: too long by a share `x` along X and `y` along Y."""
+    """Scale error of the arm: lengths are too long by a share `x` along X and `y` along Y."""
 
     name: ClassVar[str] = "position_scale"
     stage: ClassVar[Stage] = "place"
@@ -38,13 +38,13 @@ class PositionScale:
     y: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Stretch places about the origin."""
+        """Scale places about the origin."""
         return np.asarray(values * [1 + self.x, 1 + self.y])
 
 
 @dataclass(frozen=True)
 class PeriodicPositionError:
-    """A gear or a lead screw runs out of true: X errs by a sine of X."""
+    """Runout of a gear or lead screw: an error in X that is a sine of X."""
 
     name: ClassVar[str] = "periodic_position_error"
     stage: ClassVar[Stage] = "place"
@@ -61,7 +61,7 @@ class PeriodicPositionError:
 
 @dataclass(frozen=True)
 class ScanAngleError:
-    """The sensor was mounted askew for some scans, by their names."""
+    """An orientation error of the sensor in some scans, given by name."""
 
     name: ClassVar[str] = "scan_angle_error"
     stage: ClassVar[Stage] = "turn"
@@ -69,18 +69,18 @@ class ScanAngleError:
     scans: tuple[str, ...]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Turn the sensor on by `deg` in these scans."""
+        """Turn the sensor by `deg` in these scans."""
         return values + math.radians(self.deg) * rows.in_scans(self.scans)
 
 
 @dataclass(frozen=True)
 class OrientationError:
-    """The sensor sits askew on its axis, always."""
+    """A constant orientation error of the sensor."""
 
     name: ClassVar[str] = "orientation_error"
     stage: ClassVar[Stage] = "turn"
     deg: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Turn the sensor on by `deg`."""
+        """Turn the sensor by `deg`."""
         return values + math.radians(self.deg)

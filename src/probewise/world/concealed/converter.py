@@ -1,4 +1,4 @@
-"""From the signal to the number: inertia, a ceiling, coarse steps."""
+"""Effects between signal and recorded number: lag, saturation, quantisation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Lag", "Quantisation", "Saturation"]
 
 @dataclass(frozen=True)
 class Lag:
-    """The reading limps behind with a time constant; the first one of a scan does not."""
+    """A first-order lag with time constant `tau_s`, which starts anew with each scan."""
 
     name: ClassVar[str] = "lag"
     stage: ClassVar[Stage] = "lag"
@@ -34,7 +34,7 @@ class Lag:
 
 @dataclass(frozen=True)
 class Saturation:
-    """The converter ends at a level; `softness` (reading units, 0 = a sharp corner) rounds the corner."""
+    """Saturation at a level; `softness` (reading units, 0 for a sharp corner) rounds the corner."""
 
     name: ClassVar[str] = "saturation"
     stage: ClassVar[Stage] = "saturation"
@@ -42,7 +42,7 @@ class Saturation:
     softness: float = 0.0
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Let no reading pass the level."""
+        """Limit readings to the level."""
         if self.softness == 0:
             return np.minimum(values, self.level)
         return self.level - self.softness * np.logaddexp(0.0, (self.level - values) / self.softness)
@@ -50,7 +50,7 @@ class Saturation:
 
 @dataclass(frozen=True)
 class Quantisation:
-    """The number is rounded coarsely, and nobody says so."""
+    """Coarse rounding that the plan does not declare."""
 
     name: ClassVar[str] = "quantisation"
     stage: ClassVar[Stage] = "quantisation"

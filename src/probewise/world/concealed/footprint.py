@@ -1,4 +1,4 @@
-"""The footprint is displaced, of another size, blurred or has a skirt; or an edge casts a shadow."""
+"""Effects on the footprint: displacement, height, blur, halo; and the shadow of an edge."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["EdgeBlur", "EdgeShadow", "Halo", "HeightGradient", "HeightOffset", "
 
 @dataclass(frozen=True)
 class SensorTilt:
-    """The sensor hangs askew in the lab: the footprint is shifted there, however it is turned."""
+    """A tilted sensor: the footprint is shifted in the lab frame, independent of orientation."""
 
     name: ClassVar[str] = "sensor_tilt"
     stage: ClassVar[Stage] = "tilt"
@@ -32,7 +32,7 @@ class SensorTilt:
 
 @dataclass(frozen=True)
 class HeightGradient:
-    """The table slopes: the sensor is `mm_per_mm` X higher at X."""
+    """A sloping table: the sensor's height grows by `mm_per_mm` per mm of X."""
 
     name: ClassVar[str] = "height_gradient"
     stage: ClassVar[Stage] = "height"
@@ -45,7 +45,7 @@ class HeightGradient:
 
 @dataclass(frozen=True)
 class HeightOffset:
-    """The sensor was mounted higher for some scans, by their names."""
+    """A height offset of the sensor in some scans, given by name."""
 
     name: ClassVar[str] = "height_offset"
     stage: ClassVar[Stage] = "height"
@@ -59,20 +59,20 @@ class HeightOffset:
 
 @dataclass(frozen=True)
 class EdgeBlur:
-    """Printed edges are soft, by a Gaussian: the same light as through a spot blurred by it."""
+    """Soft printed edges: a Gaussian blur, which is equivalent to a blurred footprint."""
 
     name: ClassVar[str] = "edge_blur"
     stage: ClassVar[Stage] = "footprint"
     sd_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Blur what the sensor sees by."""
+        """Blur the footprint."""
         return tuple(replace(g, spot=blurred(g.spot, self.sd_mm)) for g in glimpses)
 
 
 @dataclass(frozen=True)
 class Halo:
-    """A share of the light comes by way of a wide Gaussian skirt of sd `r_mm` about the spot's middle."""
+    """A halo: a share of the light comes through a wide Gaussian of sd `r_mm` about the footprint's centre."""
 
     name: ClassVar[str] = "halo"
     stage: ClassVar[Stage] = "footprint"
@@ -80,17 +80,17 @@ class Halo:
     r_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Take the share from every glimpse and give it to the skirt."""
+        """Move the share from every component to the wide Gaussian."""
         middle = np.sum([g.share * g.spot.moments()[0] for g in glimpses], axis=0)
         blob = Blob(1.0, (float(middle[0]), float(middle[1])), (self.r_mm, self.r_mm))
-        # Edges are found by rays within the pixels, and over a third of its sd the skirt is straight enough.
+        # Rays resolve edges within pixels; the wide Gaussian is nearly linear over a third of its sd.
         skirt = gaussian_spot([blob], pixel_mm=self.r_mm / 3)
         return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, skirt))
 
 
 @dataclass(frozen=True)
 class SSFOrder:
-    """The spot has one round Gaussian more, in the sensor frame: no physics at all."""
+    """One more round Gaussian in the footprint, in the sensor frame; not a physical fault."""
 
     name: ClassVar[str] = "ssf_order"
     stage: ClassVar[Stage] = "footprint"
@@ -100,7 +100,7 @@ class SSFOrder:
     sd_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Take the share from every glimpse and give it to the Gaussian."""
+        """Move the share from every component to the Gaussian."""
         blob = Blob(1.0, (self.u_mm, self.v_mm), (self.sd_mm, self.sd_mm))
         more = gaussian_spot([blob], pixel_mm=glimpses[0].spot.pixel_mm)
         return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, more))
@@ -108,7 +108,7 @@ class SSFOrder:
 
 @dataclass(frozen=True)
 class EdgeShadow:
-    """The edge of the paper casts a shadow: light is lost where the sensor stands within about `w` mm of an edge."""
+    """Shadow of the paper's edge: light is lost within about `w` mm of an edge."""
 
     name: ClassVar[str] = "edge_shadow"
     stage: ClassVar[Stage] = "seen"
@@ -116,5 +116,5 @@ class EdgeShadow:
     w: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Take amp exp(-d^2 / 2 w^2) from the seen fraction, d the distance to the nearest edge."""
+        """Subtract amp exp(-d^2 / 2 w^2) from the seen fraction; d is the distance to the nearest edge."""
         return values - self.amp * np.exp(-((rows.edge_mm / self.w) ** 2) / 2)

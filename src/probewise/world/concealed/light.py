@@ -1,4 +1,4 @@
-"""From the light to the signal: the response curve, and a gain that changes."""
+"""Effects between light and signal: response curve and gain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["BatterySag", "GainDrift", "Nonlinearity"]
 
 @dataclass(frozen=True)
 class Nonlinearity:
-    """The photodiode's answer is a power of the light."""
+    """A response that is a power of the light."""
 
     name: ClassVar[str] = "nonlinearity"
     stage: ClassVar[Stage] = "response"
@@ -30,7 +30,7 @@ class Nonlinearity:
 
 @dataclass(frozen=True)
 class GainDrift:
-    """The LED warms up: the signal starts off by `frac` and settles with `tau_s`."""
+    """Warm-up of the LED: the signal starts wrong by a fraction `frac` and settles with time constant `tau_s`."""
 
     name: ClassVar[str] = "gain_drift"
     stage: ClassVar[Stage] = "gain"
@@ -44,7 +44,7 @@ class GainDrift:
 
 @dataclass(frozen=True)
 class BatterySag:
-    """The LED follows the battery: `per_volt` of the signal for each volt above `full_v`."""
+    """LED brightness that follows the battery: the signal changes by a fraction `per_volt` per volt above `full_v`."""
 
     name: ClassVar[str] = "battery_sag"
     stage: ClassVar[Stage] = "gain"

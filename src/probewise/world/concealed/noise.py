@@ -1,4 +1,4 @@
-"""Noise that is not white, not Gaussian or not everywhere the same."""
+"""Noise that is correlated, non-Gaussian or of changing variance; lost readings."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["CorrelatedNoise", "DriftingNoise", "Dropouts", "HeavyTails", "Outlie
 
 @dataclass(frozen=True)
 class CorrelatedNoise:
-    """Noise remembers: AR(1) within a scan with the sd unchanged."""
+    """AR(1) noise within each scan, with unchanged sd."""
 
     name: ClassVar[str] = "correlated_noise"
     stage: ClassVar[Stage] = "noise"
     rho: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Mix each draw with the one before it in the scan."""
+        """Mix each draw with its predecessor in the scan."""
         fresh = math.sqrt(1 - self.rho**2)
         out = values.copy()
         for k in np.flatnonzero(~rows.starts_scan()):
@@ -35,7 +35,7 @@ class CorrelatedNoise:
 
 @dataclass(frozen=True)
 class SignalDependentNoise:
-    """Bright readings are noisier: the variance grows by `ratio` from black to white."""
+    """Noise variance that grows by a fraction `ratio` from black to white."""
 
     name: ClassVar[str] = "signal_dependent_noise"
     stage: ClassVar[Stage] = "noise"
@@ -48,7 +48,7 @@ class SignalDependentNoise:
 
 @dataclass(frozen=True)
 class DriftingNoise:
-    """Noise grows in time: its sd rises to `factor` within `over_s`, and stays there."""
+    """Noise sd that rises to `factor` times its value within `over_s`, then stays constant."""
 
     name: ClassVar[str] = "drifting_noise"
     stage: ClassVar[Stage] = "noise"
@@ -56,26 +56,26 @@ class DriftingNoise:
     over_s: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Multiply the sd by 1 at the start to `factor`."""
+        """Multiply the sd by a factor that rises from 1 to `factor`."""
         return values * (1 + (self.factor - 1) * np.clip(rows.time_s / self.over_s, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
 class HeavyTails:
-    """Noise is Student-t of `dof` degrees of freedom, 3 or more, with the sd unchanged."""
+    """Student-t noise of `dof` degrees of freedom, 3 or more, with unchanged sd."""
 
     name: ClassVar[str] = "heavy_tails"
     stage: ClassVar[Stage] = "noise"
     dof: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Take each draw to the same quantile of the other distribution."""
+        """Map each draw to the same quantile of the Student-t distribution."""
         return np.asarray(stdtrit(self.dof, ndtr(values)) * math.sqrt((self.dof - 2) / self.dof))
 
 
 @dataclass(frozen=True)
 class Outliers:
-    """A share of the readings carries a second noise, `size` times the sd of the first."""
+    """Outliers: a share of the readings has additional noise of `size` times the sd."""
 
     name: ClassVar[str] = "outliers"
     stage: ClassVar[Stage] = "noise"
@@ -83,14 +83,14 @@ class Outliers:
     size: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Add the second noise where the dice say so."""
+        """Add the second noise to randomly chosen readings."""
         hit = rng.random(len(values)) < self.share
         return values + hit * self.size * rng.standard_normal(len(values))
 
 
 @dataclass(frozen=True)
 class Dropouts:
-    """A share of the readings is lost to one value."""
+    """Dropouts: a share of the readings is replaced by one value."""
 
     name: ClassVar[str] = "dropouts"
     stage: ClassVar[Stage] = "loss"
@@ -98,5 +98,5 @@ class Dropouts:
     value: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Replace readings where the dice say so."""
+        """Replace randomly chosen readings."""
         return np.where(rng.random(len(values)) < self.share, self.value, values)

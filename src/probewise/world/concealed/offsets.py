@@ -1,4 +1,4 @@
-"""Light that is no signal: something is added to the reading, on black too."""
+"""Additive offsets of the reading, on black too: stray light, drift, flicker, glint."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["AmbientGradient", "AmbientStep", "Flicker", "Glint", "Hysteresis", "
 
 @dataclass(frozen=True)
 class AmbientGradient:
-    """Room light falls in from one side."""
+    """Room light from one side: an offset that is a plane over the lab frame."""
 
     name: ClassVar[str] = "ambient_gradient"
     stage: ClassVar[Stage] = "offset"
@@ -31,7 +31,7 @@ class AmbientGradient:
 
 @dataclass(frozen=True)
 class AmbientStep:
-    """A lamp is switched on."""
+    """A lamp is switched on: a step in time."""
 
     name: ClassVar[str] = "ambient_step"
     stage: ClassVar[Stage] = "offset"
@@ -45,7 +45,7 @@ class AmbientStep:
 
 @dataclass(frozen=True)
 class OffsetDrift:
-    """The dark level creeps."""
+    """Linear drift of the dark level."""
 
     name: ClassVar[str] = "offset_drift"
     stage: ClassVar[Stage] = "offset"
@@ -58,7 +58,7 @@ class OffsetDrift:
 
 @dataclass(frozen=True)
 class Flicker:
-    """The mains, aliased by the sampling, or a slow lamp: one frequency."""
+    """A sinusoidal offset: mains flicker, aliased by the sampling, or a slow lamp."""
 
     name: ClassVar[str] = "flicker"
     stage: ClassVar[Stage] = "offset"
@@ -73,14 +73,14 @@ class Flicker:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """The way out reads higher than the way back."""
+    """An offset whose sign depends on the direction of motion."""
 
     name: ClassVar[str] = "hysteresis"
     stage: ClassVar[Stage] = "offset"
     amp: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add `amp` times the sign of the move along X, or along Y where X stands still."""
+        """Add `amp` times the sign of the motion along X, or along Y if X does not change."""
         along_x, along_y = np.sign(rows.direction).T
         sign: FloatArray = np.where(along_x != 0, along_x, along_y)
         return values + self.amp * sign
@@ -88,7 +88,7 @@ class Hysteresis:
 
 @dataclass(frozen=True)
 class Glint:
-    """A lamp mirrors in the surface at a place: a Gaussian of sd `r` about it."""
+    """A specular reflection of a lamp: an offset that is a Gaussian of sd `r` about a place."""
 
     name: ClassVar[str] = "glint"
     stage: ClassVar[Stage] = "offset"
@@ -98,6 +98,6 @@ class Glint:
     r: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add the mirrored light where the sensor stands."""
+        """Add the reflected light at the sensor's place."""
         squared = (rows.place_mm[:, 0] - self.x) ** 2 + (rows.place_mm[:, 1] - self.y) ** 2
         return values + self.amp * np.exp(-squared / (2 * self.r**2))

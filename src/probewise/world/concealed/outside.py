@@ -1,4 +1,4 @@
-"""What no name of the vocabulary stands for: a diagnosis can only say that something is there, and where."""
+"""Effects outside the vocabulary: a diagnosis can only detect and locate them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class BentRail:
-    """The arm's X errs by a square: `amp_mm` at 10 mm from the origin."""
+    """An error in X quadratic in X: `amp_mm` at 10 mm from the origin."""
 
     name: ClassVar[str] = "bent_rail"
     stage: ClassVar[Stage] = "place"
@@ -44,7 +44,7 @@ class BentRail:
 
 @dataclass(frozen=True)
 class TwistedRail:
-    """The arm's X errs by a cube: `amp_mm` at 10 mm from the origin."""
+    """An error in X cubic in X: `amp_mm` at 10 mm from the origin."""
 
     name: ClassVar[str] = "twisted_rail"
     stage: ClassVar[Stage] = "place"
@@ -57,7 +57,7 @@ class TwistedRail:
 
 @dataclass(frozen=True)
 class PlaceStep:
-    """A tooth is missing: X is `amp_mm` too far from `at_mm` on."""
+    """A missing gear tooth: X is too large by `amp_mm` beyond `at_mm`."""
 
     name: ClassVar[str] = "place_step"
     stage: ClassVar[Stage] = "place"
@@ -71,7 +71,7 @@ class PlaceStep:
 
 @dataclass(frozen=True)
 class StickSlip:
-    """The slide sticks and jumps: X lags behind by a sawtooth of X."""
+    """Stick-slip of the slide: an error in X that is a sawtooth of X."""
 
     name: ClassVar[str] = "stick_slip"
     stage: ClassVar[Stage] = "place"
@@ -87,7 +87,7 @@ class StickSlip:
 
 @dataclass(frozen=True)
 class SlippedPaper:
-    """The paper slips across its edge at a moment, and stays there."""
+    """The paper slips across its edge at one time, and stays there."""
 
     name: ClassVar[str] = "slipped_paper"
     stage: ClassVar[Stage] = "pattern"
@@ -101,7 +101,7 @@ class SlippedPaper:
 
 @dataclass(frozen=True)
 class Ghost:
-    """A glass plate mirrors: a faint second image, displaced in the lab frame."""
+    """A faint second image from a glass plate, displaced in the lab frame."""
 
     name: ClassVar[str] = "ghost"
     stage: ClassVar[Stage] = "footprint"
@@ -110,7 +110,7 @@ class Ghost:
     dy_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """See everything twice."""
+        """Add a displaced copy of every component."""
         first = (replace(g, share=g.share * (1 - self.share)) for g in glimpses)
         second = (
             replace(g, share=g.share * self.share, shift_mm=(g.shift_mm[0] + self.dx_mm, g.shift_mm[1] + self.dy_mm))
@@ -121,9 +121,9 @@ class Ghost:
 
 @dataclass(frozen=True)
 class ThermalGain:
-    """The gain wanders with the room's heat: slow waves, the power of each as its period (1/f).
+    """Gain that wanders with room temperature: slow waves with a 1/f power spectrum.
 
-    The waves are the first multiples of 1/`longest_s`, one for each of `phases` (rad).
+    Frequencies are the first multiples of 1/`longest_s`, one for each of `phases` (rad).
     """
 
     name: ClassVar[str] = "thermal_gain"
@@ -143,7 +143,7 @@ class ThermalGain:
 
 @dataclass(frozen=True)
 class CrossTalk:
-    """The cable pulls at the sensor as it turns: the gain follows twice the orientation."""
+    """Gain that varies with twice the orientation, as when a cable pulls at the sensor."""
 
     name: ClassVar[str] = "cross_talk"
     stage: ClassVar[Stage] = "gain"
@@ -157,20 +157,20 @@ class CrossTalk:
 
 @dataclass(frozen=True)
 class Floor:
-    """A dead zone: light below a share of white is not seen."""
+    """A dead zone: light below a share of white gives no signal."""
 
     name: ClassVar[str] = "floor"
     stage: ClassVar[Stage] = "response"
     share: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Answer with nothing below the share, as usual above it."""
+        """Set the response to zero below the share."""
         return np.where(values < self.share, 0.0, values)
 
 
 @dataclass(frozen=True)
 class PeakMemory:
-    """The photodiode does not forget: it adds a share of the brightest light since the scan began."""
+    """Persistence of the photodiode: it adds a share of the brightest light since the start of the scan."""
 
     name: ClassVar[str] = "peak_memory"
     stage: ClassVar[Stage] = "response"
@@ -186,7 +186,7 @@ class PeakMemory:
 
 @dataclass(frozen=True)
 class AfterGlow:
-    """The input discharges: each time that the reading rises through `level`, a pulse dies off with `tau_s`."""
+    """A pulse that decays with `tau_s` each time the reading rises through `level`."""
 
     name: ClassVar[str] = "after_glow"
     stage: ClassVar[Stage] = "offset"
@@ -195,7 +195,7 @@ class AfterGlow:
     level: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp exp(-t / tau), t the time since each rise."""
+        """Add amp exp(-t / tau) for every such rise, t the time since it."""
         bright = values > self.level
         rises = rows.time_s[np.flatnonzero(bright & ~np.concatenate([[True], bright[:-1]]))]
         since = rows.time_s[:, None] - rises
@@ -206,7 +206,7 @@ class AfterGlow:
 
 @dataclass(frozen=True)
 class Chirp:
-    """A fan runs up: the offset swings faster and faster, `first_hz` at the start and `rate_hz_per_s` on from it."""
+    """An oscillating offset of rising frequency, as of a fan running up: `first_hz` + `rate_hz_per_s` t."""
 
     name: ClassVar[str] = "chirp"
     stage: ClassVar[Stage] = "offset"

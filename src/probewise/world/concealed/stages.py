@@ -1,4 +1,4 @@
-"""Where on the way from pose to reading a concealed effect acts, and what it gets hold of there."""
+"""The stages of the chain from pose to reading, and the interface of an effect at each."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ STAGES: tuple[Stage, ...] = (
     "quantisation",
     "loss",
 )
-"""In the order of diagnosis: pose, scene, footprint, u, response, gain, offsets, lag, saturation, noise, rounding."""
+"""In order: pose, scene, footprint, u, response, gain, offsets, lag, saturation, noise, rounding."""
 
 ANSWERING = STAGES[STAGES.index("response") :]
 """The stages that come after the light is summed (World.look)."""
@@ -58,7 +58,7 @@ ANSWERING = STAGES[STAGES.index("response") :]
 
 @dataclass(frozen=True, eq=False)
 class Glimpse:
-    """A share of the light that comes by way of a spot; `shift_mm` displaces it in the lab frame."""
+    """One component of the footprint: a share of the light through a spot; `shift_mm` displaces it in the lab frame."""
 
     share: float
     spot: Spot
@@ -67,13 +67,13 @@ class Glimpse:
 
 @runtime_checkable
 class Changes(Protocol):
-    """Change one value a reading.
+    """An effect that changes one quantity per reading.
 
-    By stage: "place", where the sensor stands (n_points, 2) in mm; "turn", its orientation in rad;
-    "pattern", how far the pattern lies from where it is described, (n_points, 2) in mm; "tilt", how far
-    the footprint is shifted in the lab frame, (n_points, 2) in mm; "height" above the surface in mm;
-    "seen" and "response", the seen white fraction u; "gain", the signal without I_min; "offset", "lag",
-    "saturation" and "quantisation", the reading; (n_points,) where not said otherwise.
+    The quantity by stage: "place", position of the sensor, (n_points, 2), mm; "turn", its orientation, rad; "pattern",
+    displacement of the pattern from its description, (n_points, 2), mm; "tilt", shift of the footprint in the lab
+    frame, (n_points, 2), mm; "height" above the surface, mm; "seen" and "response", the seen white fraction u; "gain",
+    the signal without I_min; "offset", "lag", "saturation" and "quantisation", the reading. Shape (n_points,) unless
+    given.
     """
 
     name: ClassVar[str]
@@ -86,34 +86,34 @@ class Changes(Protocol):
 
 @runtime_checkable
 class Retouches(Protocol):
-    """Change the surface, at the stage "albedo"."""
+    """An effect that changes the surface, at the stage "albedo"."""
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
 
     def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Return the albedo at places in the lab frame, arrays of one shape in, the same shape out."""
+        """Return the changed albedo at places in the lab frame; all arrays of one shape."""
         ...
 
 
 @runtime_checkable
 class Looks(Protocol):
-    """Change what the sensor sees by, at the stage "footprint"."""
+    """An effect that changes the footprint, at the stage "footprint"."""
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Return the glimpses, shares summing to one, that take the place of these."""
+        """Return the new components of the footprint; shares sum to one."""
         ...
 
 
 @runtime_checkable
 class Disturbs(Protocol):
-    """Change the noise or lose readings.
+    """An effect that changes the noise or loses readings.
 
-    By stage: "noise", independent standard normal draws to be turned into the noise in units of its sd;
-    "loss", the finished readings; (n_points,).
+    By stage: "noise", independent standard normal draws, to become the noise in units of its sd; "loss", the finished
+    readings; shape (n_points,).
     """
 
     name: ClassVar[str]

@@ -1,4 +1,4 @@
-"""What lies under the sensor is not what the description says."""
+"""Surfaces that differ from their description."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["AlbedoGradient", "AlbedoPatch", "EdgeMisplacement", "ScanMisplacemen
 
 @dataclass(frozen=True)
 class EdgeMisplacement:
-    """Every pattern lies too far on, across its edge (along X where it has no one edge)."""
+    """A displacement of every pattern across its edge (along X if it has no single edge)."""
 
     name: ClassVar[str] = "edge_misplacement"
     stage: ClassVar[Stage] = "pattern"
@@ -29,7 +29,7 @@ class EdgeMisplacement:
 
 @dataclass(frozen=True)
 class ScanMisplacement:
-    """The same in one scan, by its name."""
+    """A displacement of the pattern in one scan, given by name."""
 
     name: ClassVar[str] = "scan_misplacement"
     stage: ClassVar[Stage] = "pattern"
@@ -43,7 +43,7 @@ class ScanMisplacement:
 
 @dataclass(frozen=True)
 class AlbedoGradient:
-    """The print is whiter on one side: a plane over the lab frame as a factor."""
+    """A print that is whiter on one side: the albedo times a plane over the lab frame."""
 
     name: ClassVar[str] = "albedo_gradient"
     stage: ClassVar[Stage] = "albedo"
@@ -57,7 +57,7 @@ class AlbedoGradient:
 
 @dataclass(frozen=True)
 class AlbedoPatch:
-    """A stain at a place, in every pattern: `albedo` more in its middle, a Gaussian of sd `r` about it."""
+    """A stain in every pattern: albedo plus a Gaussian of height `albedo` and sd `r` about a place."""
 
     name: ClassVar[str] = "albedo_patch"
     stage: ClassVar[Stage] = "albedo"

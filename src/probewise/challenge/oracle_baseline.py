@@ -1,10 +1,9 @@
-"""How well names can be told, by their likeness alone: a yardstick to hold the found rows against.
+"""Oracle baseline: how well effects can be identified, given the cosines of their changes alone.
 
-What survives of an effect of size lambda, and the nearest that an effect of another name comes to it with its size
-fitted, lie d = lambda sqrt(1 - rho^2) noise sds apart, rho the cosine of the two. Where nothing else is open, the log
-Bayes factor of the true one is normal, mean d^2 / 2, sd d, and it is right with probability Phi(d / 2). That is no
-bound: who averages over a rival's settings does better than against the nearest, and who has a sensor to learn, and
-rivals by the dozen, does worse than against one.
+The change by an effect of size lambda (after the refit) and the best imitation by another effect are d = lambda sqrt(1
+- rho^2) noise sds apart, where rho is their cosine. With nothing else unknown, the log Bayes factor of the true effect
+is normal with mean d^2 / 2 and sd d, so it is right with probability Phi(d / 2). This is not a bound: averaging over a
+rival's parameters does better than the comparison with its best fit; many rivals and an unknown sensor do worse.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from probewise._arrays import FloatArray
 from probewise.challenge.scoring import HONEST_NATS, accepted
 from probewise.effects import VOCABULARY
 
-__all__ = ["covariate_by_likeness", "name_by_likeness", "readings_by_repeating", "set_size_by_likeness"]
+__all__ = ["oracle_covariate_rate", "oracle_name_rate", "oracle_set_size", "readings_by_repeating"]
 
 _DRAWS = 400
 _HELD = 0.95
@@ -27,13 +26,13 @@ _HELD = 0.95
 Hidden = Mapping[str, Any]
 
 
-def name_by_likeness(hidden: Hidden) -> float:
-    """Expect how often the right name or an alias of it comes before the one rival that is hardest to tell."""
+def oracle_name_rate(hidden: Hidden) -> float:
+    """Return the probability that the right name or an alias of it ranks before its most similar rival."""
     return _against_the_hardest(hidden, accepted(hidden))
 
 
-def covariate_by_likeness(hidden: Hidden) -> float:
-    """Expect how often the right covariate comes before the hardest rival that shows in none of the right ones."""
+def oracle_covariate_rate(hidden: Hidden) -> float:
+    """Return the probability that the right covariate ranks before the most similar rival without it."""
     shown = set(hidden["shows_in"])
     named = [name for name in hidden["cosines"] if name in VOCABULARY]
     covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in named}
@@ -41,10 +40,10 @@ def covariate_by_likeness(hidden: Hidden) -> float:
     return _against_the_hardest(hidden, {name for name, own in covariates.items() if shown & set(own)})
 
 
-def set_size_by_likeness(hidden: Hidden) -> float:
-    """Expect the size of a 95 % credible set, the truth and its aliases as one.
+def oracle_set_size(hidden: Hidden) -> float:
+    """Return the expected size of a 95 % credible set, with the truth and its aliases counted as one.
 
-    What tells one rival is taken to be independent of what tells another; the draws are the same each time.
+    The log Bayes factors against the rivals are taken as independent; the random draws are fixed.
     """
     apart = _apart(hidden)
     d: FloatArray = np.array(list(apart.values()))
@@ -61,7 +60,7 @@ def set_size_by_likeness(hidden: Hidden) -> float:
 
 
 def readings_by_repeating(result: Mapping[str, Any]) -> float:
-    """Tell how many readings of the same plan would set an aliased pair 3 nats apart (inf, if alike)."""
+    """Return how many readings of the same plan would separate an aliased pair by 3 nats (inf if identical)."""
     size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
     apart = size**2 * (1 - rho**2) / 2
     return float(result["readings"]) * HONEST_NATS / apart if apart > 0 else np.inf
@@ -72,7 +71,7 @@ def _against_the_hardest(hidden: Hidden, right: Set[str]) -> float:
 
 
 def _apart(hidden: Hidden) -> dict[str, float]:
-    """How far every rival is, in noise sds; nothing looks like an effect on the noise."""
+    """Return the distance of every rival in noise sds; noise effects have no rivals."""
     cosines: Mapping[str, float] = hidden["cosines"]
     size = float(hidden["size_lambda"])
     return {

@@ -1,4 +1,4 @@
-"""What a null model leaves of noise-free readings: the lambda of the diagnosis is its norm in units of the noise."""
+"""Refit of the null model to noise-free readings: lambda is the norm of its residuals in noise sds."""
 
 from __future__ import annotations
 
@@ -17,43 +17,43 @@ from probewise.recordings.plan import Recording
 
 __all__ = ["NullRefit"]
 
-_NOISE_SD = 0.6  # the middle of a challenge's noise levels: weighs the readings against the priors
+_NOISE_SD = 0.6  # the middle noise level of a challenge; weights the readings against the priors
 _MOST_GAUSSIANS = 4
-_BEHIND = 3.0  # nats; an SSF order so far behind the best has no better one beyond it
+_BEHIND = 3.0  # nats: once an SSF order is this far behind the best, higher orders are not tried
 
 
 class NullRefit:
-    """Fit the null to clean readings once, then refit it to readings with an effect, as often as asked.
+    """Fit the null to clean readings once, then refit it to readings with effects.
 
-    The order of the SSF is the one of most evidence on the clean readings, as a diagnosis chooses it. What the
-    null leaves of those, because no mixture of Gaussians has the true SSF's shape, is taken off before a refit.
+    The order of the SSF is the one with the largest evidence on the clean readings, as in a diagnosis. Its residuals on
+    those readings (the true SSF may be no mixture of Gaussians) are subtracted before a refit.
     """
 
     def __init__(self) -> None:
         self._clean: Recording | None = None
 
     def __call__(self, clean: Recording, changed: Recording) -> float:
-        """Return the root of the sum of squares that a full refit leaves of an effect, in units of the reading."""
+        """Return the norm of the residuals that a full refit leaves of an effect, in reading units."""
         return float(np.linalg.norm(self.refit(clean, changed).residuals))
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:
-        """Refit the null to what an effect makes of a sensor that the null takes exactly."""
+        """Refit the null to an effect's readings, as if the null fitted the clean sensor exactly."""
         null = self.null(clean)
         return _fit(null.model, self.exact(clean, changed), null.z)
 
     def with_one_more(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
-        """Refit with one Gaussian more than `refit` gave, which is no physics, to the same readings."""
+        """Refit the same readings with one Gaussian more than `refit`, which is not a physical effect."""
         fits = _with_one_more(found, self.exact(clean, changed), Extent.of(clean))
         return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
 
     def exact(self, clean: Recording, changed: Recording) -> Recording:
-        """Take off `changed` what the null leaves of `clean`."""
+        """Subtract the null's residuals on `clean` from `changed`."""
         readings = changed.readings.copy()
         readings[clean.usable] -= self.null(clean).residuals
         return Recording(changed.plan, readings)
 
     def null(self, clean: Recording) -> Fit:
-        """Fit the null to the clean readings; asked about the same ones again, it remembers."""
+        """Fit the null to the clean readings; the result is cached."""
         if self._clean is not clean:
             self._clean, self._null = clean, _best_order(clean)
         return self._null
@@ -78,7 +78,7 @@ def _best_order(clean: Recording) -> Fit:
 
 
 def _with_one_more(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
-    """Fit with one Gaussian more, from every way to split the heaviest."""
+    """Fit with one more Gaussian, starting from every way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
     for z in start_with_more_gaussians(found.model.sensor, found.z, wanted):
         yield _fit(Model(wanted, (), recording.plan), recording, z)

@@ -1,4 +1,4 @@
-"""How alike a concealed effect is to every effect that a diagnosis could name instead, and what one of two leaves."""
+"""Cosines of a concealed effect with the effects of the vocabulary, and the residual of a pair when one is named."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.challenge.surviving import NullRefit
+from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.fitting.fit import Fit, fit
@@ -17,11 +17,11 @@ from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["cosines", "left_beside"]
+__all__ = ["cosines", "residual_with_one_named"]
 
 _WORTH_A_REFIT = 0.8
-_STARTS = 3  # variants of an effect that are refitted where it is one of two
-_LIKE_AN_SSF = ("halo", "edge_blur")  # what looks like these may be an SSF of one Gaussian more
+_STARTS = 3  # variants of an effect of a pair that are refitted
+_LIKE_AN_SSF = ("halo", "edge_blur")  # aliases of these may be an SSF with one more Gaussian
 
 
 def cosines(
@@ -31,12 +31,12 @@ def cosines(
     *,
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
 ) -> dict[str, float]:
-    """Compare what survives of an effect with every named effect on the mean, each at its best.
+    """Compare what a refit of the null leaves of an effect with every named effect on the mean, at its best fit.
 
     Parameters
     ----------
     refit
-        The null.
+        The null model's refit.
     clean, changed
         Noise-free readings without and with the effect.
     vocabulary
@@ -44,9 +44,9 @@ def cosines(
 
     Returns
     -------
-    For each name rho: the square root of the share of the surviving sum of squares that the effect of that name
-    takes up together with the null. Those that take up most of it are refitted in full, the others linearised. Where
-    what survives is like a skirt or a blur, "ssf_order" too: one Gaussian more, and no physics left out.
+    Cosine rho by name: the square root of the share of the residual sum of squares that the effect of that name
+    explains together with the null. The effects that explain most are refitted in full, the others linearised. If a
+    halo or blur is similar, "ssf_order" is included: one more Gaussian and no missing physics.
     """
     found = refit.refit(clean, changed)
     usable = np.flatnonzero(clean.usable)
@@ -69,22 +69,24 @@ def cosines(
     return out
 
 
-def left_beside(refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]) -> dict[str, float]:
-    """Tell what is left of two effects where one of them is named, in units of the reading: what shows of the other.
+def residual_with_one_named(
+    refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
+) -> dict[str, float]:
+    """Return the residual norm of two effects when one of them is in the model, in reading units.
 
     Parameters
     ----------
     refit
-        The null.
+        The null model's refit.
     clean, both
         Noise-free readings without any effect and with both.
     names
-        The ones that are fitted, together with the null, each by itself.
+        Effects fitted together with the null, one at a time.
 
     Returns
     -------
-    For each name the root of the sum of squares of the residuals: in noise sds, the size of the other beside it.
-    Readings that a ceiling cuts off say nothing of a paler patch, however large it would be alone.
+    Norm of the residuals by name; divided by the noise sd, it is the size of the other effect given this one. It may be
+    much smaller than that effect's size alone: readings cut off by a ceiling do not show a paler patch.
     """
     found, exact = refit.refit(clean, both), refit.exact(clean, both)
     usable = np.flatnonzero(clean.usable)
@@ -95,7 +97,7 @@ def left_beside(refit: NullRefit, clean: Recording, both: Recording, names: Iter
         fits = [found]
         if effect is not None:
             templates, taken = _taken_by_each(problem, found, effect, usable)
-            best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # of each variant, the best last
+            best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # fits of each variant, the best last
             starts = [*best.values()][-_STARTS:]
             fits += [_with_effect(problem, found, effect, templates, at, exact) for at in starts]
         out[name] = min(float(np.linalg.norm(by.residuals)) for by in fits)
@@ -105,7 +107,7 @@ def left_beside(refit: NullRefit, clean: Recording, both: Recording, names: Iter
 def _taken_by_each(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
-    """Lay out an effect's bank, and what each entry takes up of the sum of squares, (n_entries,)."""
+    """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
     templates = effect_templates(found, effect, usable)
     blocks = Blocks.of(problem, templates.columns, [effect.name] * len(templates.columns))
     return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
@@ -122,12 +124,12 @@ def _with_effect(
     model = found.model.with_effect(templates.variant(at))
     start_z = np.concatenate([z, model.scores_of(start[None, :])[0]])
     rss = float(found.residuals @ found.residuals)
-    # As floor of the sd a tenth of what survives: far enough below it to be seen, and no exact fit is asked for.
+    # The floor of the sd is a tenth of the residual: small enough for accuracy, large enough not to force an exact fit.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))
     return fit(model, exact, start_z, white(len(found.residuals), least=floor), tolerance=0.02)
 
 
 def _taken_up(found: Fit, by: Fit) -> float:
-    """Square root of the share of what a fit leaves that another takes up."""
+    """Return the square root of the share of a fit's residual sum of squares that another fit explains."""
     left = float(by.residuals @ by.residuals) / float(found.residuals @ found.residuals)
     return float(np.sqrt(np.clip(1 - left, 0.0, 1.0)))

@@ -54,10 +54,10 @@ def test_a_plan_that_was_written_decides(tmp_path):
 
 def test_two_investigations_do_not_mix(tmp_path):
     begin = partial(RoundsFolder, tmp_path / "rounds")
-    with pytest.raises(FileError, match="without --resume a new one begins"):
+    with pytest.raises(FileError, match="omit --resume to begin a new one"):
         begin({"seed": 1}, resume=True)
     begin({"seed": 1}, resume=False).record(1, few_rows(), "", take=TAKE)
-    with pytest.raises(FileError, match="--resume to go on"):
+    with pytest.raises(FileError, match="--resume to continue it"):
         begin({"seed": 1}, resume=False)
     with pytest.raises(FileError, match="seed 1"):
         begin({"seed": 2}, resume=True)

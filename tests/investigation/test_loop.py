@@ -73,13 +73,13 @@ def test_it_ends_when_the_budget_is_spent(diagnosed):
     diagnosed(*[diagnosis(0.6)] * 3)
     rounds = rounds_of(budget=Budget(readings=2 * n))
     assert len(rounds) == 3
-    assert rounds[-1].stop_reason == "what may be spent on readings is spent"
+    assert rounds[-1].stop_reason == "the budget of readings is spent"
     assert sum(len(each.recording) for each in rounds[1:]) == 2 * n
 
 
 def test_it_ends_after_the_rounds_that_were_allowed(diagnosed):
     diagnosed(*[diagnosis(0.6)] * 2)
-    assert rounds_of(rounds=2)[-1].stop_reason == "2 rounds are over"
+    assert rounds_of(rounds=2)[-1].stop_reason == "the limit of 2 rounds is reached"
 
 
 def test_a_round_thinks_alike_however_often_the_others_were_run(diagnosed):

@@ -1,7 +1,7 @@
-"""From a doubt to an answer: record, diagnose, take the readings that the diagnosis asks for, until it is settled.
+"""Investigations: record, diagnose, take the advised readings, and repeat until one explanation is settled.
 
 One diagnosis says what a sensor model leaves out and which readings would tell more. An investigation takes them:
-each round records what the round before asked for and diagnoses everything read so far.
+each round records the plan that the previous diagnosis advised, and diagnoses all readings so far.
 """
 
 from probewise.investigation.budget import Budget

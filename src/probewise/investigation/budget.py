@@ -1,4 +1,4 @@
-"""How much may be measured beyond the first plan."""
+"""The measurement budget beyond the first plan."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ __all__ = ["Budget"]
 
 @dataclass(frozen=True)
 class Budget:
-    """Readings and minutes that may be spent after the first plan; infinite: as many as it takes.
+    """Readings and minutes that may be spent after the first plan; may be infinite.
 
-    Minutes are those of the plans: from the first reading of a round to its last, breaks between rounds included.
+    Minutes are times in the plans, including the breaks between rounds.
     """
 
     readings: float = 400
@@ -30,11 +30,11 @@ class Budget:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
     def less(self, plan: Plan, after_s: float) -> Budget:
-        """Take off what a plan costs that begins after a time; never below nothing."""
+        """Subtract the cost of a plan that begins after a time; the budget stays at 0 or more."""
         return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes(plan, after_s), 0.0))
 
     def affordable(self, plan: Plan, after_s: float) -> Plan | None:
-        """Keep the leading scans of a plan that can be afforded; None where not even the first can."""
+        """Return the leading scans of a plan that fit the budget; None if not even the first does."""
         kept = np.zeros(0, dtype=np.int64)
         for rows in plan.rows_by_scan():
             more = np.concatenate([kept, rows])

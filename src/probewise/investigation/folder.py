@@ -1,8 +1,8 @@
-"""The folder of an investigation: the plan and the readings of each round, kept as they come.
+"""The folder of an investigation: the plan and the readings of each round, written as they arrive.
 
-`settings.json` says what was begun, `1_plan.csv` what the first round was to read, `1.csv` what it has read. A round
-that was cut goes on behind its last reading; a plan that has been written decides, also where another machine's
-arithmetic would have asked for other readings.
+`settings.json` holds the settings, `1_plan.csv` the plan of the first round, `1.csv` its readings. An interrupted round
+resumes after its last reading. A plan that has been written is used as it is, even if another machine's arithmetic
+would advise other readings.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from probewise.recordings.plan import Plan, Recording
 __all__ = ["RoundsFolder", "Take"]
 
 Take: TypeAlias = Callable[[int, Plan, str, Sequence[Reading]], Iterator[Reading]]
-"""Takes a round's number, its plan, the plan in words and the readings taken already, and yields those that follow."""
+"""Function of a round's number, its plan, the plan in words and the readings so far; yields the further readings."""
 
 _SETTINGS = "settings.json"
 _ALLOWED = "the settings of an investigation, a JSON object"
-_KEPT_AGAIN_S = 0.5  # an arm takes longer for a reading: none of its readings is lost
+_KEPT_AGAIN_S = 0.5  # an arm takes longer per reading, so that none of its readings is lost
 
 
 class RoundsFolder:
@@ -43,11 +43,11 @@ class RoundsFolder:
     Parameters
     ----------
     path
-        The folder; made with the first round where it is missing.
+        The folder; created with the first round if missing.
     settings
-        What decides the investigation, as JSON.
+        Settings that determine the investigation, as JSON.
     resume
-        Whether to go on with what the folder holds.
+        Whether to resume the investigation in the folder.
 
     Raises
     ------
@@ -61,14 +61,14 @@ class RoundsFolder:
         file, wanted = path / _SETTINGS, dict(settings)
         if resume:
             if not file.exists():
-                raise FileError(file, "no such file", "an investigation to resume; without --resume a new one begins")
+                raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")
             _require_same(file, wanted)
         elif file.exists():
-            raise FileError(file, "an investigation stands there", "--resume to go on with it, or another --out")
+            raise FileError(file, "an investigation is in this folder", "--resume to continue it, or another --out")
         self._settings = wanted
 
     def record(self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent) -> Recording:
-        """Carry out a round, or what is left of it, and keep its readings."""
+        """Take the readings of a round, or those still missing, and write them to the folder."""
         planned, readings_file = self.path / f"{number}_plan.csv", self.path / f"{number}.csv"
         if not planned.exists():
             self.path.mkdir(parents=True, exist_ok=True)
@@ -92,12 +92,12 @@ class RoundsFolder:
 
     @property
     def n_readings(self) -> int:
-        """How many readings it holds."""
+        """Number of readings in the folder."""
         return sum(len(recording) for recording in self._recordings())
 
     @property
     def ended_s(self) -> float:
-        """When the last of them was taken; 0 where there is none."""
+        """Time of the last reading; 0 if there is none."""
         return max((float(recording.plan.time_s.max()) for recording in self._recordings()), default=0.0)
 
     def _recordings(self) -> Iterator[Recording]:

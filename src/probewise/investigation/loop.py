@@ -1,4 +1,4 @@
-"""The loop: record a plan, diagnose everything, ask for more, until it is settled or the budget is spent."""
+"""The loop: record a plan, diagnose all readings, plan further ones, until settled or the budget is spent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["MOST_ROUNDS", "Record", "investigate"]
 MOST_ROUNDS = 6
 
 Record: TypeAlias = Callable[[int, Plan, str], Recording]
-"""Takes a round's number, its plan and the plan in words, and gives the recording; it may hold fewer readings."""
+"""Function of a round's number, its plan and the plan in words; returns the recording, which may be shorter."""
 
 
 def investigate(
@@ -36,37 +36,37 @@ def investigate(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Generator[Round, None, None]:
-    """Record and diagnose until one hypothesis has probability .95, or nothing more can be told or afforded.
+    """Record and diagnose until one hypothesis has probability .95, no reading would help, or the budget is spent.
 
     Parameters
     ----------
     record
         Takes the readings of a round's plan.
     plan
-        What is recorded first.
+        The first plan.
     sensor
         An earlier calibration, whose posterior becomes the prior; without it each diagnosis calibrates its own.
     effects
-        The vocabulary to choose from, by name.
+        The vocabulary of effects, by name.
     budget
-        How much may be measured beyond `plan`; 400 readings where none is given.
+        Budget beyond `plan`; default: 400 readings.
     rounds
-        How many rounds at most, the first included.
+        Largest number of rounds, including the first.
     hands
-        Whether somebody can turn a sheet or lay another one; without, only scans over what lies there are taken.
+        Whether a person can turn or exchange sheets; if not, plans only scan the sheet in place.
     rng
-        Source of randomness; each round has a child of its own, so that a resumed investigation goes on alike.
+        Random generator; each round has its own child, so that a resumed investigation is reproducible.
     progress
-        Told of every step.
+        Called at every step.
 
     Yields
     ------
-    One `Round` a round; the last has a `stop_reason`.
+    One `Round` per round; the last has a `stop_reason`.
 
     Raises
     ------
     ParameterError
-        If an argument is not what it has to be; see also `diagnose`.
+        If an argument is invalid; see also `diagnose`.
     """
     require_takes_places("record", record, 3, "a function of a round's number, its plan and the plan in words")
     require_plan(plan)
@@ -103,8 +103,8 @@ def _rounds(
         reason = (
             settled
             or _nothing_to_ask(following)
-            or (f"{rounds} rounds are over" if number == rounds else None)
-            or ("what may be spent on readings is spent" if affordable is None else None)
+            or (f"the limit of {rounds} rounds is reached" if number == rounds else None)
+            or ("the budget of readings is spent" if affordable is None else None)
         )
         yield Round(number, recordings[-1], asked, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:

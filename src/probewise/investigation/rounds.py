@@ -1,4 +1,4 @@
-"""What one round found, and what all of them came to."""
+"""The result of one round, and of a whole investigation."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Round:
     number
         From 1.
     recording
-        What this round read.
+        Recording of this round.
     asked
-        Why these readings were taken, in words.
+        Reason for these readings, in words.
     diagnosis
-        Of this round's readings and all before.
+        Diagnosis of this and all earlier readings.
     stop_reason
-        Why the investigation ends here; None: it goes on.
+        Reason why the investigation ends here; None: it continues.
     settled
         Whether it ends because one hypothesis has probability `SURE`.
     """
@@ -59,11 +59,11 @@ class Investigation(ShowsItself):
 
     @property
     def extra_readings(self) -> int:
-        """How many readings were taken beyond the first round's."""
+        """Number of readings after the first round."""
         return sum(len(each.recording) for each in self.rounds[1:])
 
     def summary(self) -> str:
-        """Tell the rounds in plain text."""
+        """Return a plain-text summary of the rounds."""
         lines = []
         for each in self.rounds:
             label, probability = each.believed[0]
@@ -77,9 +77,9 @@ class Investigation(ShowsItself):
 
 
 def settled_by(diagnosis: Diagnosis) -> str | None:
-    """Say which hypothesis settles a diagnosis: the first with probability `SURE`; None where none does.
+    """Return the hypothesis that settles a diagnosis, the first with probability `SURE`, in words; else None.
 
-    What the verdict does not state, such as aliases that readings cannot tell apart, is not settled.
+    Aliased effects, which the verdict does not state, are not settled.
     """
     first = diagnosis.hypotheses[0]
     if diagnosis.verdict == "cannot_tell" or first.probability < SURE:

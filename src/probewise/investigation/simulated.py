@@ -1,4 +1,4 @@
-"""A simulated arm for investigations: a world that conceals something carries out the plans."""
+"""A simulated arm for investigations: plans are carried out in a world with concealed effects."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from probewise.world.concealed import Concealed
 __all__ = ["SimulatedRecorder", "parse_concealed"]
 
 NOTHING = "nothing"
-_LARGEST = 1e9  # of a number of an effect
+_LARGEST = 1e9  # largest magnitude of a parameter of an effect
 
 
 @dataclass(frozen=True)
 class SimulatedRecorder:
-    """Carry out plans in a world; each round's noise follows from the seed and the round's number."""
+    """Simulates plans in a world; the noise of a round follows from the seed and the round's number."""
 
     world: World
     seed: int
 
     def __call__(self, number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
-        """Yield the readings of a round's plan that follow those taken already."""
+        """Yield the readings of a round's plan after those already taken."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         recording = self.world.simulate(plan, rng=rng)
         yield from readings_of(recording)[len(taken) :]
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:
-    """Read what a world conceals: NAME:VALUE,VALUE, several joined by +, or "nothing".
+    """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing".
 
     Raises
     ------
     ParameterError
-        If there is no such effect, or it takes other values.
+        If the effect is unknown or takes other values.
     """
     return () if text == NOTHING else tuple(_one(part) for part in text.split("+"))
 
@@ -68,7 +68,7 @@ def _one(text: str) -> Concealed:
 
 
 def _kinds() -> dict[str, Any]:
-    """Give the effects that are described by numbers alone, by name."""
+    """Return the effects whose parameters are all numbers, by name."""
     every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
     named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]
     of_numbers = [kind for kind in named if all(field.type == "float" for field in fields(kind))]

@@ -1,7 +1,7 @@
-"""How many measurements does the robot need? Studies over many circles (paper, section 4, "Results").
+"""Studies over many circles: how many readings the robot needs (paper, section 4, "Results").
 
-A study is a campaign of autonomous runs: every row of its table looks for the same circles and meets
-the same noise, and differs from a reference row in one thing.
+A study is a campaign of autonomous runs: every row of its table has the same circles and the same noise, and differs
+from a reference row in one factor.
 """
 
 from probewise.study.circles import POPULATIONS, Population, noise_of

@@ -1,4 +1,4 @@
-"""The circles that every row of a study looks for, and the noise it meets on the way."""
+"""The circles and the noise that all rows of a study share."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _SEED = 2013
 
 @dataclass(frozen=True)
 class Population:
-    """A family of circles, which is also what the robot believes beforehand."""
+    """A distribution of circles, which is also the robot's prior."""
 
     name: str
     shape: Circle
 
     def circles(self, n: int, *, seed: int = _SEED) -> FloatArray:
-        """Draw the first `n` circles, x_mm, y_mm and radius_mm, (n, 3): of one seed always the same ones."""
+        """Return the first `n` circles of a seed: x_mm, y_mm and radius_mm, (n, 3)."""
         if n < 1:
             raise ParameterError("n", n, "1 or more")
         return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(seed).random((n, 3))))
@@ -41,5 +41,5 @@ POPULATIONS: Mapping[str, Population] = {
 
 
 def noise_of(circle: int, n: int) -> FloatArray:
-    """Noise of the first `n` readings of a run, in units of its sd, (n,): of every row's run the same."""
+    """Return the noise of the first `n` readings of a run in units of its sd, (n,); it is the same in every row."""
     return np.random.default_rng([circle, 99]).standard_normal(n)

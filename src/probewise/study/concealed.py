@@ -1,8 +1,8 @@
-"""Measure the robot with a concealed fault: whether it finds the circle, finds the fault, or is sure and wrong.
+"""Studies of the robot with a concealed fault: success rates, named faults, and runs that are sure and wrong.
 
-The sensor model is exact but for one thing, which the world does and the robot is not told: three sizes of each
-effect. The world is `probewise.world`, which sums pixels and shares no code
-with the models. Every row looks for the same circles, with the same noise, with and without doubt.
+The sensor model is exact except for one concealed effect, at three sizes each. The world is `probewise.world`, which
+sums pixels and shares no code with the models. Every row has the same circles and the same noise, with and without
+doubt in the sensor.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ from probewise.world.rows import Rows
 
 __all__ = ["CONCEALED", "ConcealedTrial", "concealed_table", "run_concealed", "run_concealed_trial"]
 
-_EACH_S = 8.0  # between readings, about
+_EACH_S = 8.0  # seconds between readings, about
 _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
 
 
 @dataclass(frozen=True)
 class Fading:
-    """A lamp that loses a share of the signal with every reading, eight seconds."""
+    """A lamp that loses a share of the signal with every reading (eight seconds)."""
 
     share: float
 
@@ -93,21 +93,21 @@ CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, 
     "sensor_tilt": (lambda mm: SensorTilt(mm, 0.0), (2.0, 6.0, 12.0)),
     "position_scale": (lambda share: PositionScale(share, share), (0.005, 0.02, 0.05)),
 }
-"""What the world conceals, by name, from a number, and the three sizes: barely detectable, plain, gross."""
+"""For each name: the concealed effect as a function of its size, and three sizes: barely detectable, clear, gross."""
 
 NAMES: Mapping[str, str] = {"": CLEAN, "gain_loss": GainDrift.name, "sensor_tilt": CLEAN, "position_scale": CLEAN}
-"""What a run is to say of a row, where that is not its name: what amounts to another circle no reading shows."""
+"""The right answer of a row, if not its name: an effect equivalent to another circle cannot be detected."""
 
 _IN_ARM_FRAME: Mapping[str, Callable[[float, FloatArray], FloatArray]] = {
     "sensor_tilt": lambda mm, circle: circle - np.array([mm, 0.0, 0.0]),
     "position_scale": lambda share, circle: circle / (1.0 + share),
 }
-_REMEMBERING = frozenset({"lag", "correlated_noise"})  # a reading depends on those before
+_REMEMBERING = frozenset({"lag", "correlated_noise"})  # effects by which a reading depends on earlier ones
 
 
 @dataclass(frozen=True)
 class ConcealedTrial:
-    """One run: what is concealed (empty: nothing) at which of its sizes, which circle of a seed, at what trust."""
+    """One run: the concealed effect (empty: none), the index of its size, circle, seed, and trust in the sensor."""
 
     effect: str
     size: int
@@ -118,18 +118,18 @@ class ConcealedTrial:
 
     @property
     def circle_mm(self) -> FloatArray:
-        """The circle that lies there: x_mm, y_mm, radius_mm, (3,)."""
+        """The true circle: x_mm, y_mm, radius_mm, (3,)."""
         return np.asarray(POPULATIONS[REFERENCE.population].circles(self.circle + 1, seed=self.seed)[self.circle])
 
     @property
     def truth(self) -> FloatArray:
-        """The circle as it lies in the arm's own frame, (3,)."""
+        """The true circle in the arm's own frame, (3,)."""
         frame = _IN_ARM_FRAME.get(self.effect)
         return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
 
     @property
     def name(self) -> str:
-        """What the run is to say."""
+        """The right answer of the run."""
         return NAMES.get(self.effect, self.effect)
 
     @property
@@ -139,13 +139,13 @@ class ConcealedTrial:
 
 
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
-    """Look for a circle with a sensor that does what the robot is not told.
+    """Search for a circle with a sensor that has a concealed effect.
 
     Returns
     -------
-    A JSON object: `known`, `readings`, `error_mm` (the largest of a length), `held` (of each 95 % interval),
-    `chance_wrong`, the probability of the truth among what may be left out and the credible set of names, whether the
-    run itself says that something is wrong (`noticed`), and processor time a decision (`cpu_s`: median, 95 %).
+    A JSON object: `known`, `readings`, `error_mm` (largest error of a length), `held` (whether each 95 % interval
+    covers the truth), `chance_wrong`, the probability of the true effect and the credible set of names, whether the run
+    reports a fault (`noticed`), and processor time per decision (`cpu_s`: median, 95 %).
     """
     experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
     cpu = []
@@ -166,7 +166,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
 
 
 def _arm(trial: ConcealedTrial) -> SimulatedArm:
-    """Stand an arm in the world that conceals; its noise goes by the reading's number alone."""
+    """Return an arm in the world with the concealed effect; its noise depends only on the number of the reading."""
     concealed: tuple[Concealed, ...] = ()
     if trial.effect:
         make, sizes = CONCEALED[trial.effect]
@@ -203,20 +203,20 @@ def run_concealed(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> dict[ConcealedTrial, dict[str, Any]]:
-    """Run every row over the first circles, with doubt and without, or go on with a study that was stopped.
+    """Run every row over the first circles, with and without doubt, or resume an interrupted study.
 
     Parameters
     ----------
     n_circles
-        Circles a row.
+        Circles per row.
     path
-        The campaign's file; what it holds is not done again.
+        The campaign's file; runs in it are not repeated.
     max_readings
-        A run that knows too little after so many readings counts as a miss.
+        A run that has not reached the target precision after this many readings is a miss.
     effects, sizes
-        Rows beside that in which nothing is concealed.
+        Rows to run besides the clean one.
     n_clean
-        Circles of that row; by default as many as of the others.
+        Circles of the clean row; by default as many as for the others.
     seed
         Of circles, noise and robot.
     executor, progress
@@ -243,7 +243,7 @@ def run_concealed(
 
 
 def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Sum up each row, (effect, size, trust): shares with Wilson's 95 % intervals as text."""
+    """Summarise each row, (effect, size, trust): shares with Wilson's 95 % intervals as text."""
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
     for trial, result in results.items():
         rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.name, result))

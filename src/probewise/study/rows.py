@@ -19,30 +19,30 @@ _IN_BATCHES = ("finishing", "information")
 
 @dataclass(frozen=True)
 class Row:
-    """One way to look for circles.
+    """One configuration of the search.
 
     Parameters
     ----------
     population
-        Which circles, and what is believed of them: "anywhere" (radius 20 to 150 mm) or "inside" (50 to 150 mm,
-        wholly in the field).
+        Distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50 to
+        150 mm, entirely in the field).
     model
-        What the robot takes its sensor for: "ssf" or "naive". The world's sensor is the SSF one always.
+        The robot's sensor model: "ssf" or "naive". The true sensor always has the SSF.
     utility
-        Worth of a reading, by name (see `inquiry.utility_named`).
+        Acquisition function by name (see `inquiry.utility_named`).
     noise_sd
         Sd of the world's noise, which the robot knows, LEGO units.
     width
-        Width of the SSF that the robot believes in over that of the world's: 1, or a wrong one.
+        Width of the robot's SSF over the true one; 1 if right.
     learn_sensor
         Whether it learns the sensor along with the shape.
     batch
-        Readings that are chosen together.
+        Readings chosen together.
     method
-        How it infers and chooses: "particles", or "paper", with the utility "entropy" (see
+        Method of inference and choice: "particles", or "paper" with the utility "entropy" (see
         `experiment.paper_experiment`).
     nested_stop
-        When nested sampling ends with the method "paper": "change" or "remaining".
+        Stopping rule of nested sampling with the method "paper": "change" or "remaining".
     """
 
     population: str = "inside"
@@ -85,7 +85,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Say in a few words in what it differs from the reference."""
+        """Short description of the difference from the reference."""
         words = [self.population, "SSF" if self.model == "ssf" else "naive"]
         if self.method == "paper":
             words.append("the paper's method" + (" to remaining evidence" if self.nested_stop == "remaining" else ""))
@@ -102,7 +102,7 @@ class Row:
         return ", ".join(words)
 
     def settings(self) -> dict[str, Any]:
-        """Give its fields, as JSON holds them."""
+        """Return its fields as JSON values."""
         return asdict(self)
 
 
@@ -110,7 +110,7 @@ REFERENCE = Row()
 
 
 def paper_rows(*, population: str = REFERENCE.population, nested_stop: NestedStop = "change") -> tuple[Row, ...]:
-    """List, for each sensor model, the reference's method and the paper's."""
+    """Return rows with the reference's and the paper's method for each sensor model."""
     paper = {"method": "paper", "utility": "entropy", "nested_stop": nested_stop}
     ways: tuple[dict[str, Any], ...] = ({}, paper)
     return tuple(
@@ -119,7 +119,7 @@ def paper_rows(*, population: str = REFERENCE.population, nested_stop: NestedSto
 
 
 def standard_rows() -> tuple[Row, ...]:
-    """List the rows of the published table, the reference first."""
+    """Return the rows of the published table, the reference first."""
     changes: tuple[dict[str, Any], ...] = (
         {},
         {"model": "naive"},

@@ -1,4 +1,4 @@
-"""A study: rows by circles, done as a campaign, summed up as a table."""
+"""A study: rows by circles, run as a campaign and summarised as a table."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["Study", "read_study", "run_study"]
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Results of each row, in the order of the circles, and how many readings a run could take."""
+    """Results of each row in the order of the circles, and the limit of readings."""
 
     trials: Mapping[Row, tuple[Mapping[str, Any], ...]]
     max_readings: int
 
     def table(self) -> dict[Row, Summary]:
-        """Sum up every row that has two runs or more."""
+        """Summarise every row with two or more runs."""
         return {row: summarise(t, max_readings=self.max_readings) for row, t in self.trials.items() if len(t) > 1}
 
 
@@ -41,22 +41,22 @@ def run_study(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> Study:
-    """Run every row over the first circles of its population, or go on with a study that was stopped.
+    """Run every row over the first circles of its population, or resume an interrupted study.
 
     Parameters
     ----------
     rows
-        The rows; as a mapping, each with its own number of circles.
+        The rows; a mapping gives each its own number of circles.
     n_circles
-        Circles a row, where `rows` does not say.
+        Circles per row, unless `rows` gives them.
     path
-        The campaign's file. More rows and more circles may be asked of it later: what it holds is not done again.
+        The campaign's file. Rows and circles may be added later: runs in the file are not repeated.
     max_readings
-        A run that knows too little after so many readings counts as a miss.
+        A run that has not reached the target precision after this many readings is a miss.
     executor
         Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
     progress
-        Told how many runs have ended.
+        Called with the number of finished runs.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def run_study(
     for row, n in wanted.items():
         if n < 1:
             raise ParameterError(f"circles of the row {row.name!r}", n, "1 or more")
-    # Circle by circle, so that a study that was stopped has as many of each row.
+    # Circle by circle, so that an interrupted study has equally many runs in each row.
     trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
     results = run_campaign(
         run_trial,
@@ -83,12 +83,12 @@ def run_study(
 
 
 def read_study(path: str | os.PathLike[str], rows: Sequence[Row]) -> Study:
-    """Read what a study's file holds of these rows, finished or not.
+    """Read the results of these rows from a study's file, finished or not.
 
     Raises
     ------
     FileError
-        If the file is no study's.
+        If the file does not belong to a study.
     """
     found = read_campaign(path)
     if "study" not in found.settings:

@@ -1,4 +1,4 @@
-"""What a row of a study comes to, with errors."""
+"""Summary of a row of a study, with errors."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from probewise.errors import ParameterError
 __all__ = ["LEAST_FOR_MEDIAN", "Estimate", "Summary", "share_within", "summarise"]
 
 WRONG_MM = 12.0
-"""An error that the stopping rule rules out, three times its 4 mm: a run that ends with it is sure and wrong."""
+"""Three times the 4 mm of the stopping rule: a run that ends with a larger error is sure and wrong."""
 
 LEAST_FOR_MEDIAN = 6
-"""Runs of which the least and the greatest enclose the median with 95 %: 1 - 2 / 2^6 is 97 %."""
+"""Smallest number of runs whose range covers the median with 95 %: 1 - 2 / 2^6 is 97 %."""
 
 _CHANCE = 0.01
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and the bounds of its error: one standard error to either side, or a 95 % interval where said."""
+    """An estimate and its bounds: one standard error to either side, or a 95 % interval where stated."""
 
     value: float
     low: float
@@ -44,30 +44,30 @@ class Summary:
     Attributes
     ----------
     n_runs
-        Circles looked for.
+        Number of runs, one per circle.
     reached
-        Share of runs that came to know every length within the limit of readings, with its 95 % interval.
+        Share of runs that reached the target precision within the limit of readings, with its 95 % interval.
     mean, median
-        Readings needed, a miss counted as the limit; the mean's standard error, the median's 95 % interval, NaN
-        of fewer than `LEAST_FOR_MEDIAN` runs.
+        Readings needed, a miss counted as the limit; mean with standard error, median with 95 % interval (NaN for fewer
+        than `LEAST_FOR_MEDIAN` runs).
     to_white
         Readings up to the first one on white, a run without one counted as the limit.
     after_white
-        Readings after the first one on white, of runs that reached the end.
+        Readings after the first one on white, over runs that reached the precision.
     bits_each
-        Bits a reading, prior less posterior differential entropy.
+        Bits per reading: prior minus posterior differential entropy.
     error_mm
-        Largest error of a length at the stop, its median over runs that reached the end.
+        Largest error of a length at the stop, median over runs that reached the precision.
     wrong
-        Runs that stopped sure with an error above `WRONG_MM`.
+        Number of runs that reached the precision with an error above `WRONG_MM`.
     wrong_expected, wrong_limit
-        How many their own posteriors expect, and the number that Poisson's law exceeds in one of a hundred studies.
+        Number expected from their own posteriors, and the 99 % quantile of a Poisson distribution with that mean.
     held
-        Share of the 95 % intervals at the stop that hold the truth, with the standard error over runs.
+        Coverage of the 95 % intervals at the stop, with the standard error over runs.
     arm_s
-        Seconds of arm time a run, with the standard error.
+        Arm time per run in seconds, with the standard error.
     cpu_s
-        Processor time a decision, median over runs of each run's median; None where it was not taken.
+        Processor time per decision, median over runs of each run's median; None if not recorded.
     """
 
     n_runs: int
@@ -87,15 +87,15 @@ class Summary:
 
 
 def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summary:
-    """Sum up the runs of one row, each a result of `run_trial`.
+    """Summarise the runs of one row, each a result of `run_trial`.
 
     Raises
     ------
     ParameterError
-        If there are fewer than two: no error can be told.
+        If there are fewer than two runs, which have no standard error.
     """
     if len(trials) < 2:
-        raise ParameterError("number of trials", len(trials), "2 or more, so that there is an error to tell")
+        raise ParameterError("number of trials", len(trials), "2 or more, so that there is a standard error")
     sure = [t for t in trials if t["reached"]]
     needed = np.array([t["readings"] if t["reached"] else max_readings for t in trials], dtype=np.float64)
     after = [t["readings"] - t["first_white"] for t in sure if t["first_white"] is not None]
@@ -123,7 +123,7 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
 def share_within(k: int, n: int) -> Estimate:
     """Estimate a share from k of n, with Wilson's 95 % interval.
 
-    Wilson's interval keeps its promise also near 0 and 1 (Wilson 1927).
+    Wilson's interval has its nominal coverage also near 0 and 1 (Wilson 1927).
     """
     z = 1.959963984540054
     share, centre = k / n, (k + z * z / 2) / (n + z * z)
@@ -139,9 +139,9 @@ def _mean(values: FloatArray) -> Estimate:
 
 
 def _median(values: FloatArray) -> Estimate:
-    """Median with the order statistics that enclose it with 95 %, whatever the distribution.
+    """Return the median with a distribution-free 95 % interval of order statistics.
 
-    The least and the greatest of fewer than six enclose it more seldom: no interval is given.
+    The range of fewer than six values covers the median less often, so that there is no interval.
     """
     ordered = np.sort(values)
     if len(ordered) < LEAST_FOR_MEDIAN:

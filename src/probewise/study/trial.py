@@ -1,4 +1,4 @@
-"""One autonomous run of a study: look for one circle in one way, and say how it went."""
+"""One autonomous run of a study: the search for one circle in one configuration."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from probewise.world import Blob, Spot, World, gaussian_spot
 __all__ = ["Trial", "arm_of", "experiment_for_trial", "experiment_of", "judged", "reached", "run_trial", "timed_steps"]
 
 SEED = 2013
-# The study's sensor: one Gaussian, mm and LEGO units; the same numbers for the robot and, by pixels, for the world.
+# The study's sensor: one Gaussian, in mm and LEGO units; the world uses the same numbers, rasterised to pixels.
 DARK, BRIGHT = 10.0, 60.0
 _CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
 _ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
@@ -50,7 +50,7 @@ _UNROUNDED = LegoScale(-math.inf, math.inf, None)
 
 @dataclass(frozen=True)
 class Trial:
-    """A task of a study: the row, the number of the circle, and how many readings the robot may take."""
+    """A task of a study: the row, the number of the circle, and the limit of readings."""
 
     row: Row
     circle: int
@@ -69,7 +69,7 @@ class Trial:
 
 @lru_cache(maxsize=16)
 def experiment_of(row: Row) -> Experiment:
-    """Pose what the robot of a row believes and wants; once a process, with its tables."""
+    """Build the experiment of a row, cached per process with its tables."""
     scene = HypothesisScene(POPULATIONS[row.population].shape)
     common: dict[str, Any] = {
         "noise_sd": row.noise_sd,
@@ -82,7 +82,7 @@ def experiment_of(row: Row) -> Experiment:
     if row.model == "naive":
         likelihood = Naive(DARK, row.noise_sd, BRIGHT, row.noise_sd)
         model = NaiveSensor(FixedLevels(DARK, BRIGHT), scene)
-        # A reading on the edge fits neither level, and the naive model knows no edge.
+        # A reading on the edge fits neither level, and the naive model has no partial coverage.
         return Experiment(shape, model, likelihood, **common, doubt_p=0.0)
     sd_u, sd_v = (row.width * sd for sd in _SD)
     covariance = np.array([[sd_u**2, _CORRELATION * sd_u * sd_v], [_CORRELATION * sd_u * sd_v, sd_v**2]])
@@ -98,7 +98,7 @@ def experiment_of(row: Row) -> Experiment:
 
 
 def experiment_for_trial(trial: Trial) -> Experiment:
-    """Pose the experiment of a row over one circle: the paper's naive robot reads black and white sheets before."""
+    """Build the experiment of a row over one circle; the paper's naive robot first reads black and white sheets."""
     posed = experiment_of(trial.row)
     if (trial.row.method, trial.row.model) != ("paper", "naive"):
         return posed
@@ -109,16 +109,15 @@ def experiment_for_trial(trial: Trial) -> Experiment:
 
 
 def run_trial(trial: Trial) -> dict[str, Any]:
-    """Look for a circle.
+    """Search for a circle.
 
     Returns
     -------
-    A JSON object: whether every length became known (`reached`), the number of `readings`, that of the
-    first on white (`first_white`, or None), `bits` gained in all and when white was first met
-    (`bits_at_white`), the largest error of a length (`error_mm`) and the chance, by the run's own
-    posterior, that it is above 12 mm (`chance_wrong`), whether each 95 % interval holds the truth
-    (`held`), seconds of arm time (`arm_s`), median processor time a decision (`cpu_s`), the widest posterior sd
-    after each reading (`widest_mm`), and the fit (`p_value`).
+    A JSON object: whether the target precision was reached (`reached`), number of `readings`, number of the first one
+    on white (`first_white`, or None), total `bits` gained and those at the first white (`bits_at_white`), the largest
+    error of a length (`error_mm`) and its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 %
+    interval covers the truth (`held`), arm time in seconds (`arm_s`), median processor time per decision (`cpu_s`),
+    widest posterior sd after each reading (`widest_mm`), and the p-value of the fit (`p_value`).
     """
     experiment = experiment_for_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
@@ -145,7 +144,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 def timed_steps(
     arm: SimulatedArm, experiment: Experiment, *, circle: int, max_readings: int, seed: int = SEED
 ) -> Iterator[tuple[Step, float]]:
-    """Yield the steps of a run and the processor time of each (s); its randomness goes by seed and circle alone."""
+    """Yield the steps of a run and the processor time of each (s); randomness depends on seed and circle only."""
     rng = np.random.default_rng([seed, circle])
     with arm:
         steps = explore(arm, experiment, rng=rng, max_readings=max_readings)
@@ -158,13 +157,13 @@ def timed_steps(
 
 
 def reached(last: Step, experiment: Experiment) -> bool:
-    """Tell whether a run ended because every length is known, by a posterior that fits its readings."""
+    """Return whether a run reached the target precision with a posterior that fits its readings."""
     known = experiment.is_known(last.sd, last.shapes, last.chance_off)
     return bool(last.p_value >= experiment.doubt_p and known)
 
 
 def judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
-    """Hold the last posterior of the shape against the truth, (3,)."""
+    """Compare the last posterior of the shape with the truth, (3,)."""
     columns = experiment.shape_columns
     theta, weight = last.posterior.theta[:, columns], last.posterior.weight
     held = []
@@ -179,7 +178,7 @@ def judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, A
 
 
 def arm_of(trial: Trial) -> SimulatedArm:
-    """Stand an arm that reaches the whole grid over the circle, with the noise that every row meets there."""
+    """Return an arm that reaches the whole grid over the circle, with the noise that all rows share."""
     world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
@@ -195,12 +194,12 @@ def arm_of(trial: Trial) -> SimulatedArm:
 
 @lru_cache(maxsize=1)
 def spot_of() -> Spot:
-    """Paint what the study's sensor sees, pixel by pixel."""
+    """Return the footprint of the study's sensor as pixels."""
     return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
 
 
 def _changed() -> Product:
-    """Believe that the sensor may have changed as `experiment.sensor_prior` believes by default."""
+    """Return the prior of changes of the sensor, the default of `experiment.sensor_prior`."""
     change = Change()
     level = change.level * (BRIGHT - DARK)
     size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)

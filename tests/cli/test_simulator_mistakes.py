@@ -60,7 +60,7 @@ def cell(row, column, text):
 
 TABLES = {
     "a reading that is text": (cell(5, "temp_c", "warm"), "warm in row 5"),
-    "an input that is text": (cell(5, "power_w", "4;5"), "these hold texts: power_w ('4;5')"),
+    "an input that is text": (cell(5, "power_w", "4;5"), "these contain text: power_w ('4;5')"),
     "a time that is missing": (cell(5, "t_s", ""), "row 5, column t_s: the cell is empty"),
     "a time that falls": (cell(5, "t_s", "1"), "column 't_s' is '1 in row 5, after 10 in run 1'"),
     "no rows": ("run,t_s,power_w,room_c,temp_c\n", "no row below the header"),

@@ -1,4 +1,4 @@
-"""Any simulator over any table: what a person brings, and the chain of what it may leave out."""
+"""A user's simulator over a table of readings, and the chain of effects that it may leave out."""
 
 from probewise.systems.calls import CountedCalls
 from probewise.systems.file import read_simulator

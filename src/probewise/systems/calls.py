@@ -1,4 +1,4 @@
-"""How a person's `simulate` is called: for all samples at once where it broadcasts, else for one after the other."""
+"""Calls of a user's `simulate`: for all samples at once if it broadcasts, otherwise one sample at a time."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from probewise.systems.simulator import Simulate
 __all__ = ["Caller", "CountedCalls", "Tally"]
 
 MOST_CALLS = 20_000
-"""Of a `simulate` that takes one sample at a time, in a diagnosis."""
+"""Limit of calls in a diagnosis, for a `simulate` that takes one sample at a time."""
 
-_N_NODES = 5  # values at which a parameter that cannot vary by row is held, to interpolate between
-_MOST_REMEMBERED = 2_000_000  # numbers of earlier calls that are kept
-_SAME = 1e-9  # of the largest reading: what two ways of calling may differ by
+_N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
+_MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
+_SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 
 
 @dataclass(eq=False)
 class Tally:
-    """Count what a law has cost: steps of its integration, and samples at which it raises an error."""
+    """Counts the integration steps of a law, and the samples at which it raises an error."""
 
     n_failed: int = 0
     n_steps: int = 0
@@ -37,20 +37,20 @@ class Tally:
 
 @dataclass(eq=False)
 class Caller:
-    """Call `simulate` for many samples; count the calls, and those that failed.
+    """Calls `simulate` for many samples, and counts the calls and the failures.
 
     Parameters
     ----------
     simulate
-        A person's function.
+        The user's function.
     broadcasts
-        Whether it takes parameters (n_samples, 1) and columns (n_points,) together.
+        Whether it takes parameters (n_samples, 1) with columns (n_points,).
     by_row
         Parameters that it takes as arrays (n_points,) when called for one sample; ignored where it broadcasts.
     name
         What a person calls the function, for messages.
 
-    `cut_short` is set where something was left undone because there had been too many calls.
+    `cut_short` is set if work was skipped because of too many calls.
     """
 
     simulate: Simulate
@@ -75,14 +75,14 @@ class Caller:
         broadcasts: bool,
         name: str = "simulate",
     ) -> Caller:
-        """Find out how a function can be called, at some samples (n_samples, 1 or n_points) of its parameters.
+        """Determine how a function can be called, from trial calls at some samples (n_samples, 1 or n_points).
 
         Raises
         ------
         ParameterError
             If it raises at every sample.
         ShapeError
-            If what it returns is not one number for each row.
+            If it does not return one number per row.
         """
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:
@@ -107,7 +107,7 @@ class Caller:
     ) -> FloatArray:
         """Simulate parameters (n_samples, 1 or n_points) over columns (n_points,) or (n_samples, n_points).
 
-        A sample at which `simulate` raises gets NaN; `strict`: the first error is raised where all fail.
+        A sample at which `simulate` raises an error gives NaN; with `strict`, the first error is raised if all fail.
         """
         n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
         n_points = max(np.shape(v)[-1] for v in columns.values())
@@ -141,7 +141,7 @@ class Caller:
         return out
 
     def _remembered(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
-        """Call `simulate`, but not again where it was called so: effects on the readings alone leave it as it was."""
+        """Call `simulate`, or return its cached result: effects on the readings do not change its arguments."""
         digest = hashlib.blake2b(digest_size=16)
         for name, values in (*own.items(), *columns.items()):
             digest.update(name.encode())
@@ -177,14 +177,14 @@ class Caller:
 
 
 class CountedCalls:
-    """Progress that says beside each stage how often `simulate` has been called, anew at every call.
+    """A progress function that adds the number of calls of `simulate` to each stage, updated at every call.
 
     Parameters
     ----------
     progress
         Told.
     caller
-        Whose calls are counted, from here on.
+        The caller whose calls are counted from now on.
     """
 
     def __init__(self, progress: Progress, caller: Caller) -> None:
@@ -193,7 +193,7 @@ class CountedCalls:
         caller.on_call = self._again
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        """Tell how far a stage is."""
+        """Report the progress of a stage."""
         self._now = stage, done, total, note
         self._again()
 

@@ -1,4 +1,4 @@
-"""FILE.py: a simulator as a person writes it, read and checked."""
+"""Read and check FILE.py, the file in which a user describes a simulator."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ _NAMES = (
 
 
 def read_simulator(path: str | os.PathLike[str]) -> Simulator:
-    """Run a person's file and take the simulator that it describes.
+    """Run a user's file and return the simulator that it describes.
 
     Raises
     ------
     FileError
-        If it cannot be read or run, or what it says does not fit together; it names the line where there is one.
+        If it cannot be read or run, or is inconsistent; the message names the line, if there is one.
     """
     path = require_path("path", path, "the name of a Python file that describes a simulator")
     text = read_text(path, "a Python file that describes a simulator")

@@ -1,4 +1,4 @@
-"""A simulator fitted to a recording, repaired or not, and the file that carries it to predictions."""
+"""A simulator fitted to a recording, repaired or not, and its file format."""
 
 from __future__ import annotations
 
@@ -35,37 +35,37 @@ _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` 
 
 @dataclass(frozen=True, eq=False)
 class FittedSystem(ShowsItself):
-    """Hold what a recording taught about a simulator and what it leaves out.
+    """Posterior of a simulator's parameters and of the effects that it leaves out.
 
     Parameters
     ----------
     simulator
         The simulator.
     names
-        Parameters, one a column of `samples`: the simulator's, `name[run]` where a run has its own, then
+        Names of the columns of `samples`: the simulator's parameters, `name[run]` for those per run, then
         "<effect>.<parameter>".
     samples
         Equally weighted posterior samples, (n_samples, n_params), at least 500.
     noise_sd
-        Sd of one new reading, one for each sample, (n_samples,).
+        Sd of one new reading for each sample, (n_samples,).
     effects
-        Names of the effects, those on the noise too.
+        Names of the effects, including noise effects.
     absent
-        Samples that do without an effect, (n_samples,), by the effect.
+        By effect, whether it is absent in each sample, (n_samples,).
     level
-        Least and largest reading that was predicted of the recording.
+        Smallest and largest predicted reading of the recording.
     max_step
-        Longest step of the integration, where there is a law.
+        Largest integration step, if there is a law.
     known
-        What the effects were bound about; None where there is none.
+        The recording and fit about which the effects were bound; None without effects.
     recording
         Fingerprint of the recording.
     source
-        Its file's name.
+        Name of the recording's file.
     notes
         Why the result should be used with care.
     version
-        The package's.
+        Version of the package.
     """
 
     simulator: Simulator
@@ -95,12 +95,12 @@ class FittedSystem(ShowsItself):
         object.__setattr__(self, "noise_sd", noise_sd)
 
     def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Central interval of each parameter that holds `mass`."""
+        """Return the central interval of each parameter with probability `mass`."""
         low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
         return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
 
     def summary(self) -> str:
-        """Say in plain text what it models, and each parameter with its interval."""
+        """Return a plain-text summary with each parameter's interval."""
         own, unit = self.simulator, self.simulator.unit
         effects = f", with {', '.join(self.effects)}" if self.effects else ""
         lines = [f"{own.source or 'a simulator'} of {own.reading} ({unit}){effects}; {len(self.samples)} samples"]
@@ -108,7 +108,7 @@ class FittedSystem(ShowsItself):
         return "\n".join([*lines, self.parameter_table()])
 
     def parameter_table(self) -> str:
-        """List each parameter with its median and its 95 % interval, as text."""
+        """Return a text table of each parameter's median and 95 % interval."""
         width = max(9, *(len(name) for name in self.names))
         median, interval = np.median(self.samples, axis=0), self.interval()
         lines = [f"{'parameter':<{width}}  {'median':>11}  95 % interval"]
@@ -119,7 +119,7 @@ class FittedSystem(ShowsItself):
         return "\n".join(lines)
 
     def to_json(self) -> str:
-        """Write it as strict JSON, format "system/1"."""
+        """Serialise as strict JSON, format "system/1"."""
         interval = self.interval()
         mean, median, sd = (of(self.samples, axis=0).tolist() for of in (np.mean, np.median, np.std))
         document = {
@@ -149,12 +149,12 @@ class FittedSystem(ShowsItself):
 
     @classmethod
     def from_json(cls, text: str, simulator: Simulator, path: object = "repaired.json") -> FittedSystem:
-        """Read what `to_json` wrote; `path` is what error messages call it.
+        """Parse the text from `to_json`; error messages name `path`.
 
         Raises
         ------
         FileError
-            If the text is damaged, of another format, or of another simulator than this one.
+            If the text is damaged, has another format, or belongs to another simulator.
         """
         try:
             document = strict_json(text)
@@ -208,13 +208,13 @@ def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> Fi
 
 
 def write_fitted_system(fitted: FittedSystem, path: str | os.PathLike[str]) -> None:
-    """Write repaired.json or calibrated.json in one piece or not at all."""
+    """Write repaired.json or calibrated.json atomically."""
     require_fitted_system(fitted)
     write_text_atomically(path, fitted.to_json())
 
 
 def require_fitted_system(fitted: object) -> None:
-    """Raise ParameterError unless `fitted` is a FittedSystem, saying how to come by one."""
+    """Raise ParameterError, with the way to obtain one, unless `fitted` is a FittedSystem."""
     allowed = "a FittedSystem: repaired_of(diagnosis), calibrated_of(diagnosis), of probewise.diagnosis"
     if isinstance(getattr(fitted, "fitted", None), FittedSystem):
         allowed = f"a FittedSystem: take its .fitted, this is the {type(fitted).__name__}"
@@ -233,7 +233,7 @@ def _known_json(known: Recorded) -> dict[str, Any]:
 
 
 def _column_json(values: NDArray[Any]) -> list[Any]:
-    """Write a column; a number that is missing is null."""
+    """Convert a column to JSON; missing numbers are null."""
     if values.dtype != np.float64:
         return [str(value) for value in values.tolist()]
     return [value if math.isfinite(value) else None for value in values.tolist()]
@@ -259,7 +259,7 @@ def _marks(rows: list[int], n_samples: int) -> BoolArray:
 
 
 def samples_csv(fitted: FittedSystem) -> str:
-    """Write the posterior samples out as the text of a CSV file: a column a parameter, and the sd of the noise."""
+    """Return the posterior samples as CSV text: one column per parameter, and the sd of the noise."""
     columns = {name: fitted.samples[:, k] for k, name in enumerate(fitted.names)}
     columns["noise_sd"] = fitted.noise_sd
     return csv_text({name: [number_text(value) for value in values] for name, values in columns.items()})

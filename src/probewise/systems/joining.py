@@ -1,4 +1,4 @@
-"""Several tables of one system, taken together."""
+"""Join several tables of one system."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ _FILE = "file"
 
 
 def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
-    """Set tables behind each other: the first one's columns, and runs of two tables stay two runs.
+    """Concatenate tables: columns are those of the first, and runs of different tables remain distinct.
 
-    A column that another table lacks is missing there. Where no column names the runs, each table is one.
+    A column that a later table lacks is missing there. Without a column of runs, each table is one run.
 
     Parameters
     ----------
     tables
         One or more, with the same time and run.
     sources
-        What messages call each.
+        Name of each in messages.
 
     Returns
     -------
-    The table, and notes on columns that not all have.
+    The table, and notes on columns that some tables lack.
 
     Raises
     ------
     ParameterError
-        If two are the same, or a column is of numbers in one and of texts in another.
+        If two tables are the same, or a column has numbers in one and texts in another.
     """
     if not tables:
         raise ParameterError("tables", (), "one or more")
@@ -63,7 +63,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
 
 
 def behind(table: RunTable, more: Sequence[RunTable]) -> RunTable:
-    """Set tables with the same columns behind a table, with their runs as they are called."""
+    """Append tables with the same columns; names of runs are unchanged."""
     columns = {name: np.concatenate([t.columns[name] for t in (table, *more)]) for name in table.columns}
     return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
 
@@ -86,7 +86,7 @@ def _joined(
 
 
 def _runs(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> Iterable[str]:
-    """Name the run of each row: as in its table, or with a number behind where another table's run has that name."""
+    """Name the run of each row as in its table, with a number appended if another table's run has that name."""
     taken: set[str] = set()
     for table, source in zip(tables, sources, strict=True):
         own = {}
@@ -98,14 +98,14 @@ def _runs(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) ->
 
 
 def unused_name(name: str, taken: Iterable[str]) -> str:
-    """Give a name that is not taken: this one, or with a number behind."""
+    """Return an unused name: this one, or with a number appended."""
     known = set(taken)
     numbered = (f"{name} ({k})" for k in itertools.count(2))
     return next(n for n in itertools.chain([name], numbered) if n not in known)
 
 
 def _same(first: RunTable, second: RunTable) -> bool:
-    """Tell whether two tables hold the same rows."""
+    """Return whether two tables hold the same rows."""
     if len(first) != len(second) or set(first.columns) != set(second.columns):
         return False
     return all(_equal(values, second.columns[name]) for name, values in first.columns.items())

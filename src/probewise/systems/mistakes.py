@@ -1,4 +1,4 @@
-"""What goes wrong inside a person's functions, told in one line: which function, where in it, what is allowed."""
+"""One-line messages for errors in a user's functions: which function, where, and what is allowed."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _LONGEST = 160
 
 
 def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]) -> FileError:
-    """Tell of an error that `simulate`, `rates` or `observe` raises wherever it is called.
+    """Build the message for an error that `simulate`, `rates` or `observe` raises at every call.
 
     Parameters
     ----------
     what
         The function.
     error
-        What it raises.
+        The exception.
     simulator, columns
-        Whose function it is, and the columns that it was given.
+        The simulator, and the columns passed to the function.
     """
     where = _files(simulator)
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename in where]
@@ -43,14 +43,14 @@ def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mappi
         )
     elif texts and isinstance(error, TypeError | ValueError):
         shown = ", ".join(f"{name} ({_first_text(columns[name])!r})" for name in texts[:4])
-        allowed = f"calculations with columns of numbers; these hold texts: {shown}"
+        allowed = f"calculations with numeric columns; these contain text: {shown}"
     else:
-        allowed = f"a function that gives a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
+        allowed = f"a function that returns a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
 
 
 def _files(simulator: Simulator) -> set[str]:
-    """Files that a person's functions are in."""
+    """Return the files that hold the user's functions."""
     functions: list[Any] = [simulator.simulate]
     if simulator.law is not None:
         functions += [simulator.law.rates, simulator.law.observe]
@@ -59,7 +59,7 @@ def _files(simulator: Simulator) -> set[str]:
 
 
 def _first_text(values: NDArray[Any]) -> str:
-    """Give the first cell that is no number, where there is one."""
+    """Return the first cell that is not a number, or ""."""
     for cell in values.tolist():
         try:
             float(cell)

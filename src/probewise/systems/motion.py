@@ -1,4 +1,4 @@
-"""Integrate a law of motion between the rows of each run: all samples and all runs at once."""
+"""Integrate a law between the rows of each run, for all samples and runs at once."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from probewise.systems.table import RunTable
 __all__ = ["Limit", "Motion", "RowsInRuns", "Term", "integrate", "integrate_states"]
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
-"""A term of a state's rate: states, parameters and columns to an array (n_samples, n_runs)."""
+"""A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Limit:
-    """A bound that a state cannot pass: `level` (n_samples, 1), reached from below where `upper`."""
+    """A bound of a state: `level` (n_samples, 1), an upper bound if `upper`, else a lower bound."""
 
     state: str
     level: FloatArray
@@ -32,10 +32,10 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A law with what effects add to it: terms of rates, dry friction, bounds.
+    """A law with the contributions of effects: terms of rates, dry friction, bounds.
 
-    `friction` holds by state the size of a force against its motion, (n_samples, 1): at rest the state sticks until
-    the rest of its rate is larger.
+    `friction` is, by state, the size of the force against its motion, (n_samples, 1): a state at rest sticks until the
+    other terms of its rate exceed it.
     """
 
     law: Law
@@ -62,7 +62,7 @@ class Motion:
         return not (self.terms or self.friction or self.limits)
 
     def ways(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
-        """Which way friction holds each state through the step that begins here: 1, -1, or 0 where it sticks."""
+        """Return the direction of motion of each state with friction during the next step: 1, -1, or 0 if it sticks."""
         if not self.friction:
             return {}
         free = self.rates(s, p, u, {})
@@ -76,7 +76,7 @@ class Motion:
     def rates(
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """Rate of each state, with bounds, and with the friction of the `ways` that are given."""
+        """Return the rate of each state, with bounds, and with friction against the directions `ways`."""
         given = self.law.rates(s, p, u)
         if self._is_bare:
             return given
@@ -92,7 +92,7 @@ class Motion:
         return out
 
     def settled(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-        """Put states right at the end of a step: none beyond its bound, none through zero against its friction."""
+        """Correct states at the end of a step: clip to bounds, and stop states that friction brought to rest."""
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
         for limit in self.limits:
@@ -103,19 +103,19 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class RowsInRuns:
-    """The rows of a table by their place in its runs: all runs go on together, the short ones wait at their end.
+    """The rows of a table by position in its runs, for stepping all runs together; short runs repeat their last row.
 
     Raises
     ------
     ParameterError
-        If time falls within a run.
+        If time decreases within a run.
     """
 
     table: RunTable
 
     @cached_property
     def rows(self) -> IntArray:
-        """Row of the table at each place of each run, (n_places, n_runs)."""
+        """Row of the table at each position of each run, (n_places, n_runs)."""
         table, by_run = self.table, self.table.rows_by_scan()
         for name, rows in zip(table.scan_names, by_run, strict=True):
             falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
@@ -128,19 +128,19 @@ class RowsInRuns:
 
     @cached_property
     def gaps(self) -> FloatArray:
-        """Time from each place to the next, (n_places - 1, n_runs)."""
+        """Time from each position to the next, (n_places - 1, n_runs)."""
         return np.diff(self.table.time_s[self.rows], axis=0)
 
     @cached_property
     def place(self) -> tuple[IntArray, IntArray]:
-        """Place and run of each row, (n_points,) both."""
+        """Position and run of each row, (n_points,) each."""
         place = np.empty(len(self.table), dtype=np.int64)
         for rows in self.table.rows_by_scan():
             place[rows] = np.arange(len(rows))
         return place, self.table.scan
 
     def n_steps(self, max_step: float) -> IntArray:
-        """Count the steps from each place to the next, (n_places - 1,)."""
+        """Return the number of steps from each position to the next, (n_places - 1,)."""
         longest = self.gaps.max(axis=1, initial=0.0)
         return np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
 
@@ -153,20 +153,20 @@ def integrate(
     *,
     max_step: float,
 ) -> FloatArray:
-    """Integrate by the classical Runge-Kutta rule of fourth order, at every row the reading: (n_samples, n_points).
+    """Integrate by the classical fourth-order Runge-Kutta method; return all readings, (n_samples, n_points).
 
     Parameters
     ----------
     motion
-        The law, and what effects add to it.
+        The law with the contributions of effects.
     places
-        The rows by their place in runs.
+        The rows by position in runs.
     parameters
-        (n_samples, 1), or (n_samples, n_points) where they vary by row.
+        (n_samples, 1), or (n_samples, n_points) if they vary by row.
     columns
-        (n_points,), or (n_samples, n_points) where an effect changes them.
+        (n_points,), or (n_samples, n_points) if an effect changes them.
     max_step
-        Longest step, in the unit of time.
+        Largest step, in the unit of time.
     """
     states = integrate_states(motion, places, parameters, columns, max_step=max_step)
     if motion.law.observe is None:
@@ -184,7 +184,7 @@ def integrate_states(
     *,
     max_step: float,
 ) -> dict[str, FloatArray]:
-    """Integrate as `integrate` does: every state at every row, (n_samples, n_points)."""
+    """Integrate like `integrate`, but return every state at every row, (n_samples, n_points)."""
     motion = Motion(motion) if isinstance(motion, Law) else motion
     rows = places.rows
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
@@ -213,7 +213,7 @@ def integrate_states(
 def _stepped(
     motion: Motion, s: dict[str, Any], between: Callable[[Any], Pair], gap: FloatArray, begin: float, length: float
 ) -> dict[str, Any]:
-    """Step on by a share `length` of a gap, in two where friction brings a state to rest on the way."""
+    """Advance by a share `length` of a gap; split the step where friction brings a state to rest."""
     ways = motion.ways(s, *between(begin))
     after = _runge_kutta(motion, s, between, gap, begin, length, ways)
     for state, way in ways.items():
@@ -238,7 +238,7 @@ def _runge_kutta(
     length: Any,
     ways: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Step by the classical rule of fourth order; `begin` and `length` are shares of a gap, of all runs or of each."""
+    """Take one fourth-order Runge-Kutta step; `begin` and `length` are shares of a gap, one for all runs or each."""
     width = gap * length
     half, sixth = 0.5 * width, width / 6
     middle = between(begin + 0.5 * length)
@@ -254,7 +254,7 @@ Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
 
 @dataclass(frozen=True, eq=False)
 class _Given:
-    """Parameters and columns at the places of runs: what stays over a gap, and what moves on a straight line.
+    """Parameters and columns at the positions of runs: those held over a gap, and those interpolated linearly.
 
     Arrays are (1 or n_samples, n_places, n_runs).
     """
@@ -293,7 +293,7 @@ class _Given:
         return cls(constant, moving, held, sloping)
 
     def between(self, k: int) -> Callable[[Any], Pair]:
-        """Give parameters and columns at a share of the gap from place k to the next."""
+        """Return a function of the share of the gap from position k to the next, which gives parameters and columns."""
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
         held = {name: v[:, k] for name, v in self.held.items()}
@@ -310,7 +310,7 @@ class _Given:
 
 
 class _Asked(dict[str, Any]):
-    """Columns that note which of them a law asks for."""
+    """Columns that record which of them a law uses."""
 
     def __init__(self, columns: Mapping[str, Any]) -> None:
         super().__init__(columns)
@@ -344,7 +344,7 @@ class _Asked(dict[str, Any]):
 
 
 def _at(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
-    """Look values up at rows (n_places, n_runs): (n_points,) or (n_samples, n_points); constant ones as (n, 1, 1)."""
+    """Index values, (n_points,) or (n_samples, n_points), by rows (n_places, n_runs); constants become (n, 1, 1)."""
     if values.ndim == 1:
         return np.asarray(values[rows][None])
     return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

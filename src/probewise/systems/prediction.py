@@ -1,4 +1,4 @@
-"""Predict the rows of any table by a fitted simulator."""
+"""Predict the rows of a table with a fitted simulator."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from probewise.systems.table import RunRecording, RunTable, relative_sd_of
 
 __all__ = ["SystemPrediction", "as_recording", "predict_system", "write_system_prediction"]
 
-_FEW = 20  # samples that tell which rows cannot be predicted
-_BLOCK = 2_000_000  # numbers held at once by one pass over some samples
-_SOME = 200  # samples that tell how wide predictions scatter in each row
+_FEW = 20  # samples used to find rows that cannot be predicted
+_BLOCK = 2_000_000  # numbers in memory for one block of samples
+_SOME = 200  # samples used to estimate the scatter of predictions in each row
 
 
 @dataclass(frozen=True, eq=False)
 class SystemPrediction(ShowsItself):
-    """What each row's reading is expected to be, (n_points,).
+    """Predictive distribution of each row's reading, all arrays (n_points,).
 
     `sd` is that of one new reading, noise and parameters together; `log_density` is the natural logarithm of the
-    predictive density of that row's reading alone, per unit of the reading, NaN where none is scored. `n_failed`
-    samples of `n_samples` were left out: there the simulator gives no finite readings.
+    predictive density of that row's reading alone, per unit of the reading, NaN without a reading. `n_failed` of
+    `n_samples` samples were left out because the simulator gives no finite readings for them.
     """
 
     table: RunTable
@@ -52,12 +52,12 @@ class SystemPrediction(ShowsItself):
     n_failed: int = 0
 
     def summary(self) -> str:
-        """Say how many readings were predicted and, of those that were recorded, how well they were expected."""
+        """Return the number of predicted readings and a score of those that were recorded."""
         return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
 
 
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
-    """Give a table the unit, range and step of a reading; readings are NaN where there is no such column.
+    """Build a recording from a table, with unit, range and step; readings are NaN if the table has none.
 
     Raises
     ------
@@ -106,22 +106,22 @@ def predict_system(
 ) -> SystemPrediction:
     """Predict every row of a table, and score its readings where there are any.
 
-    The law of a new reading is the mixture, over the posterior samples, of that sample's noise about its prediction,
-    with all effects of the model. Of a run that was not recorded each sample draws what is a run's own: a `per_run`
-    parameter from its prior; a value that an effect gives each run from a Student-t about the values of the recorded
-    runs of that sample, as wide as they scatter, with as many degrees of freedom as there are runs and one more.
+    The predictive distribution of a reading is the mixture, over posterior samples, of each sample's noise about its
+    prediction, with all effects of the model. For a run outside the recording, each sample draws the parameters per
+    run: a `per_run` parameter from its prior; an effect's value per run from a Student-t about the sample's values for
+    the recorded runs, with their scatter as its width, and one degree of freedom more than there are runs.
 
     Parameters
     ----------
     fitted
         The fitted simulator.
     table
-        What to predict, n_points rows, with the columns that the simulator and the effects read: a table, a dict of
+        The n_points rows to predict, with the columns that the simulator and the effects use: a table, a dict of
         arrays, or a DataFrame.
     rng
-        Source of randomness, for runs that were not recorded.
+        Random generator, for runs outside the recording.
     progress
-        Told how many samples are done.
+        Called with the number of finished samples.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def predict_system(
 
 
 def _lost(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
-    """Find rows that cannot be predicted because a column is missing there, (n_points,)."""
+    """Return which rows cannot be predicted because a value is missing, (n_points,)."""
     missing = (
         np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
     )
@@ -219,15 +219,15 @@ def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any
 
 
 def _columns_read(effects: Sequence[str], table: RunTable) -> set[str]:
-    """Columns of the recording that are the targets of effects."""
+    """Return the columns of the recording that are targets of effects."""
     return {part for name in effects for part in name.split(":")[1:] if part in table.columns}
 
 
 def _between_samples(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Choose how far each sample's prediction of a row is smoothed, (n_points,), by Silverman's rule.
+    """Return the kernel width for smoothing over samples in each row, (n_points,), by Silverman's rule.
 
-    A parameter of a new run is drawn from its prior, some thousand times: where that prior is wide the predictions lie
-    farther apart than the noise is wide, and whether a reading meets one of them would be chance.
+    A parameter of a new run is drawn from its prior some thousand times. If the prior is wide, the predictions are
+    farther apart than the noise is wide, and without smoothing the density would depend on chance.
     """
     some = chain.predict(theta[:: max(len(theta) // _SOME, 1)], table)
     there = some[np.isfinite(some).all(axis=1)]
@@ -239,7 +239,7 @@ def _between_samples(chain: SystemChain, theta: FloatArray, table: RunTable) -> 
 
 
 def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator) -> tuple[FloatArray, bool]:
-    """Lay the samples out by the columns of a chain, with draws of what belongs to runs that were not recorded.
+    """Arrange the samples by the columns of a chain, with draws of parameters of runs outside the recording.
 
     Returns
     -------
@@ -252,22 +252,21 @@ def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
         if name in at:
             out[:, k] = fitted.samples[:, at[name]]
         elif name in system.marginals:
-            # One draw for each sample, spread evenly over the prior.
+            # One stratified draw from the prior for each sample.
             out[:, k] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
             effect = next(own for own in fitted.effects if own_of_runs(own) and name.startswith(f"{own}."))
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
-            positive = effect == NoisePerRun.name  # what scatters evenly is then the logarithm
+            positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
             drawn = _of_another_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
     return out, any(name not in at for name in chain.names)
 
 
 def _of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw what a further run has, where these do: (n_samples, n_runs) -> (n_samples,).
+    """Draw the value of a new run given those of other runs: (n_samples, n_runs) -> (n_samples,).
 
-    The mean and the variance of the runs are unknown; of the variance is believed beforehand as much as two more runs
-    would show that scatter like these.
+    Mean and variance of the runs are unknown; the prior of the variance is worth two more runs with the same scatter.
     """
     n_runs = known.shape[1]
     spread = known.std(axis=1, ddof=1) if n_runs > 1 else np.abs(known[:, 0])
@@ -277,7 +276,7 @@ def _of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArra
 def _noise_level(
     fitted: FittedSystem, chain: SystemChain, theta: FloatArray, mean: FloatArray, sd: FloatArray, table: RunTable
 ) -> NoiseLevel:
-    """Noise of each reading: its sd, then the effects on it."""
+    """Return the noise of each reading: its sd with the noise effects applied."""
     low, high = fitted.level
     seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
     declared = fitted.simulator.noise.sd
@@ -295,9 +294,9 @@ def _noise_level(
 
 
 def write_system_prediction(prediction: SystemPrediction, path: str | os.PathLike[str]) -> None:
-    """Write the rows of the table in their order, none dropped, with `mean`, `sd` and `log_density`, in full precision.
+    """Write all rows of the table in order, with `mean`, `sd` and `log_density` in full precision.
 
-    Columns of the table that have one of these names are left out.
+    Columns of the table with one of these names are left out.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a person brings beside the table: parameters with priors, and a function or a law."""
+"""A user's simulator: parameters with priors, and a function or a law."""
 
 from __future__ import annotations
 
@@ -36,31 +36,31 @@ Columns: TypeAlias = Mapping[str, NDArray[Any]]
 """Columns of the table by name, (n_points,)."""
 
 Simulate: TypeAlias = Callable[[Values, Columns], FloatArray]
-"""Parameters and columns to noise-free readings, (n_points,)."""
+"""Function of parameters and columns; returns noise-free readings, (n_points,)."""
 
 Rates: TypeAlias = Callable[[Values, Values, Values], Mapping[str, Any]]
-"""States, parameters and columns to the rate of each state; arrays broadcast."""
+"""Function of states, parameters and columns; returns the rate of each state; arrays broadcast."""
 
 Observe: TypeAlias = Callable[[Values, Values, Values], Any]
-"""States, parameters and columns to the noise-free reading."""
+"""Function of states, parameters and columns; returns the noise-free reading."""
 
 Hold: TypeAlias = Literal["previous", "linear"]
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What is known of the noise.
+    """Prior knowledge of the noise.
 
     Parameters
     ----------
     sd
-        Sd of a reading: a number, the name of a column, or None where it is not known.
+        Sd of a reading: a number, the name of a column, or None if unknown.
     step
-        What readings are rounded to; None where that was not declared.
+        Rounding step of the readings; None if not declared.
     range
-        Least and largest reading that the instrument gives; None at an end that is open.
+        Smallest and largest reading of the instrument; None for an open end.
     zero
-        The reading of nothing, about which a gain acts.
+        Reading at zero signal, about which a gain acts.
     """
 
     sd: float | str | None = None
@@ -70,12 +70,12 @@ class Noise:
 
     @classmethod
     def of(cls, given: object) -> Noise:
-        """Read what is known of the noise as a person writes it: a dict with some of "sd", "step", "range", "zero".
+        """Build from a user's dict with some of "sd", "step", "range", "zero".
 
         Raises
         ------
         ParameterError
-            If it is nothing like that.
+            If it is anything else.
         """
         if isinstance(given, Noise):
             return given
@@ -99,20 +99,20 @@ class Noise:
 
 @dataclass(frozen=True)
 class Law:
-    """The law of a system that moves: where each run starts, how fast each state changes, what is read.
+    """A dynamical system: initial states, rates of the states, and the observation.
 
     Parameters
     ----------
     states
-        Where each state starts in every run: the name of a parameter, or a number.
+        Initial value of each state in every run: the name of a parameter, or a number.
     rates
-        Rate of each state from states, parameters and columns.
+        Function of states, parameters and columns that returns the rate of each state.
     observe
-        The reading from states, parameters and columns; None: the first state.
+        Function of states, parameters and columns that returns the reading; None: the first state.
     hold
-        What a column is between two rows: as in the row before, or on the straight line to the next.
+        Interpolation of columns between rows: "previous" (held) or "linear".
     max_step_s
-        Longest step of the integration, in the unit of time; None: as the law asks.
+        Largest integration step, in the unit of time; None: chosen automatically.
     """
 
     states: Mapping[str, str | float]
@@ -136,9 +136,9 @@ class Law:
 
 @dataclass(frozen=True)
 class Extra:
-    """An effect of a person's own: a further parameter that `simulate` or `rates` finds in p.
+    """A user's own effect: an extra parameter that `simulate` or `rates` finds in p.
 
-    `null` is its value where the effect is absent; `says` is a sentence with {value} in it.
+    `null` is its value when the effect is absent; `says` is a sentence that contains {value}.
     """
 
     prior: Marginal
@@ -148,34 +148,34 @@ class Extra:
 
 @dataclass(frozen=True, eq=False)
 class Simulator:
-    """A simulator of readings and what is known of its parameters: one of `simulate` and `law`.
+    """A simulator of readings and the priors of its parameters, with either `simulate` or `law`.
 
     Parameters
     ----------
     reading, unit
-        The column that is predicted, and its unit.
+        Name of the predicted column, and its unit.
     parameters
         Prior of each parameter, as in FILE.py: (low, high), ("log", low, high), ("normal", mean, sd), or a prior.
     simulate
-        Predicts the readings of the whole table.
+        Function that predicts the readings of the whole table.
     law
-        Or the law of motion, which is integrated between the rows of each run.
+        Alternatively a law, which is integrated between the rows of each run.
     time, time_unit
-        The column of time, if there is one, and its unit.
+        Name of the time column, if any, and its unit.
     run
-        The column that says to which run a row belongs, if there is one.
+        Name of the column that assigns rows to runs, if any.
     per_run
-        Parameters with a value of their own in every run.
+        Parameters with a separate value in every run.
     controls
-        Columns that a person can set.
+        Columns that the user can set.
     noise
-        What is known of the noise; a dict with some of "sd", "step", "range", "zero" does.
+        Prior knowledge of the noise; may be a dict with some of "sd", "step", "range", "zero".
     extra
-        Effects of a person's own, by name.
+        The user's own effects, by name.
     vectorized
         Whether `simulate` takes parameters (n_samples, 1) and returns (n_samples, n_points).
     source, fingerprint
-        The file it was read from, and the fingerprint of its text.
+        The file that it was read from, and the fingerprint of its text.
     """
 
     reading: str
@@ -240,24 +240,24 @@ class Simulator:
 
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
-    """Take a table, or columns by name (a dict of arrays, a DataFrame), with the time and the runs of a simulator."""
+    """Build a table from columns by name (a dict of arrays, a DataFrame), with a simulator's time and run columns."""
     require_simulator(simulator)
     return data if isinstance(data, RunTable) else RunTable(data, simulator.time, simulator.run)
 
 
 def require_simulator(simulator: object) -> None:
-    """Raise ParameterError unless `simulator` is a Simulator, saying how to come by one."""
+    """Raise ParameterError, with the way to obtain one, unless `simulator` is a Simulator."""
     allowed = "a Simulator(reading, unit, parameters, simulate=...), or read_simulator('FILE.py'), of probewise.systems"
     require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
 
 
 def marginal_of(name: str, given: object) -> Marginal:
-    """Read a prior as a person writes it: (low, high), ("log", low, high), ("normal", mean, sd), or a prior.
+    """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
 
     Raises
     ------
     ParameterError
-        If it is nothing of these, or has no mass.
+        If it is none of these, or has no mass.
     """
     allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
     if all(hasattr(given, each) for each in ("from_unit", "to_unit", "log_prob")):

@@ -1,4 +1,4 @@
-"""A simulator over the runs of a table: a null model like any other, and the chain of its effects."""
+"""A simulator over the runs of a table as a null model, and its chain of effects."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from probewise.systems.table import RunTable
 __all__ = ["System", "SystemChain"]
 
 _N_STARTS = 8
-_N_TRIED = 3  # places of the prior at which a function is called to find out how it can be called
-_MOST_STEPS = 4096  # of the integration, from one end of the longest run to the other, a row at least one
+_N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
+_MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A simulator with one value of each `per_run` parameter for every run: a null model.
+    """A null model: a simulator with one value of each `per_run` parameter for every run.
 
     Parameters
     ----------
     simulator
-        What a person brought.
+        The user's simulator.
     runs
         Names of the runs.
     max_step
-        Longest step of the integration, where there is a law.
+        Largest integration step, if there is a law.
     caller
-        How `simulate` is called, where there is none.
+        Caller of `simulate`, if there is no law.
     first
-        Coordinates of an earlier fit, to start from.
+        Coordinates of an earlier fit, used as the start.
     tally
         Counts samples at which a law raises an error.
     """
@@ -58,16 +58,16 @@ class System:
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable) -> System:
-        """Take the runs of a table, and find out how the simulator can be called.
+        """Build the system for the runs of a table, and determine how the simulator can be called.
 
         Raises
         ------
         ParameterError
-            If a column that the simulator names is missing, or it gives no finite reading anywhere in the prior.
+            If a column that the simulator names is missing, or no reading is finite at any trial point of the prior.
         ShapeError
-            If it does not give one reading for each row.
+            If it does not return one reading per row.
         FileError
-            If it raises an error wherever it is called.
+            If it raises an error at every trial call.
         """
         declared = simulator.noise.sd
         if isinstance(declared, str) and declared not in table.covariates:
@@ -102,7 +102,7 @@ class System:
         return system
 
     def try_law(self, table: RunTable) -> None:
-        """Integrate the law at some places of the prior.
+        """Integrate the law at some points of the prior.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class System:
         return Product(self.marginals)
 
     def parameters(self, theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:
-        """Name the columns of theta: (n_samples, 1), or (n_samples, n_points) of what is a run's own."""
+        """Return parameters by name: (n_samples, 1), or (n_samples, n_points) for parameters per run."""
         own, out = self.simulator, {}
         at = {name: k for k, name in enumerate(self.marginals)}
         for name in own.parameters:
@@ -157,7 +157,7 @@ class System:
         return out | {name: np.full((1, 1), extra.null) for name, extra in own.extra.items()}
 
     def with_runs(self, table: RunTable) -> System:
-        """Add the runs of another table, each with the prior of what is its own."""
+        """Add the runs of another table; their parameters per run have the prior."""
         return replace(self, runs=tuple(dict.fromkeys((*self.runs, *table.scan_names))))
 
     @property
@@ -172,30 +172,30 @@ class System:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """None beside its parameters."""
+        """0: no degrees of freedom besides its parameters."""
         return 0
 
     @property
     def form(self) -> str:
-        """Nothing."""
+        """Empty: it has no SSF."""
         return ""
 
     @property
     def exchangeable(self) -> bool:
-        """There are no Gaussians."""
+        """False: it has no Gaussians."""
         return False
 
     @property
     def nuisance(self) -> tuple[str, ...]:
-        """What is a run's own belongs to this table alone."""
+        """Parameters per run, which apply to this table only."""
         return tuple(name for name in self.marginals if name not in self.simulator.parameters)
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Start from an earlier fit, or else the prior's middle and points spread evenly over it, (n, n_params)."""
+        """Return starting points: an earlier fit, or the prior's centre and quasi-random points, (n, n_params)."""
         if self.first is not None:
             return self.first[None, :]
-        # Additive recurrence by the roots of x^(d+1) = x + 1 (Roberts's sequence): even in any number of dimensions.
+        # Roberts's sequence (additive recurrence by the root of x^(d+1) = x + 1): uniform in any number of dimensions.
         root = 2.0
         for _ in range(32):
             root = (1 + root) ** (1 / (self.n_params + 1))
@@ -204,47 +204,47 @@ class System:
 
     @property
     def least_readings(self) -> int:
-        """Three for each shared parameter, one more for each of a run's own."""
+        """Three readings per shared parameter and one per parameter of a run."""
         n_own = len(self.simulator.per_run) * len(self.runs)
         return max(12, 3 * (self.n_params - n_own) + n_own)
 
     @property
     def in_bulk(self) -> bool:
-        """Whether many samples cost little more than one: a law, or a `simulate` that takes all of them at once."""
+        """Whether many samples cost little more than one: for a law, or a `simulate` that broadcasts."""
         return self.caller is None or self.caller.broadcasts
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Tell whether an effect acts at a stage that this system has."""
+        """Return whether an effect acts at a stage of this system."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map normal scores, (n_samples, n_params), to parameters."""
+        """Map standard-normal coordinates, (n_samples, n_params), to parameters."""
         return self.prior.from_unit_cube(ndtr(z))
 
     def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
-        """Add effects; the table and `n_nodes` play no part."""
+        """Add effects; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
     def standing_still(
         self, table: RunTable, z: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float
     ) -> System:
-        """Halve the step of the integration until predictions at coordinates z move by less than a tolerance, rms.
+        """Halve the integration step until predictions at coordinates z change by less than a tolerance (rms).
 
         Parameters
         ----------
         table
             The rows.
         z
-            Coordinates (n_samples, n_params); where predictions are not finite at either step they do not count.
+            Coordinates (n_samples, n_params); samples without finite predictions do not count.
         effects
-            Added to the law.
+            Effects added to the law.
         tolerance
-            In the unit of a reading.
+            Tolerance, in the unit of a reading.
 
         Raises
         ------
         ParameterError
-            If they still move when the longest run takes 4,096 steps more than it has rows.
+            If predictions still change with 4,096 more steps than rows in the longest run.
         """
         if self.simulator.law is None:
             return self
@@ -267,7 +267,7 @@ class System:
 
 
 def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
-    """Columns as `simulate` and `rates` get them: all but the reading, which is what they predict."""
+    """Return the columns passed to `simulate` and `rates`: all except the reading, which they predict."""
     return {name: values for name, values in table.columns.items() if name != simulator.reading}
 
 

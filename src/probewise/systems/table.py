@@ -1,4 +1,4 @@
-"""A person's table: any columns, rows in runs, a time if there is one."""
+"""A user's table: columns, runs, and optionally time."""
 
 from __future__ import annotations
 
@@ -24,21 +24,20 @@ _ONE_RUN = "all"
 
 @dataclass(frozen=True, eq=False)
 class RunTable:
-    """Hold the rows of a table in the order in which they stand; all columns have shape (n_points,).
+    """The rows of a table in their order; all columns have shape (n_points,).
 
     Parameters
     ----------
     columns
         Every column by name: numbers (NaN where missing) or texts.
     time
-        Name of the column of time; None where no time was recorded.
+        Name of the time column; None if no time was recorded.
     run
-        Name of the column that says to which run a row belongs; None where there is one run.
+        Name of the column that assigns rows to runs; None for a single run.
     instrumentation
         Unit, range and step of a reading.
     like
-        Runs that are yet to be taken, each with the recorded run that it is taken to be like: what is a run's own is
-        there as it was in that run.
+        Planned runs, each with the recorded run whose per-run parameters it is assumed to share.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -76,12 +75,12 @@ class RunTable:
 
     @property
     def has_time(self) -> bool:
-        """Whether a time was recorded, and goes on."""
+        """Whether a time was recorded, and increases."""
         return self.time is not None and float(np.ptp(self.time_s)) > 0
 
     @cached_property
     def time_s(self) -> FloatArray:
-        """Time as printed, in its own unit; the row's number where none was recorded, (n_points,)."""
+        """Time as recorded, in its own unit; the row's number if none was recorded, (n_points,)."""
         return frozen(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
 
     @cached_property
@@ -105,14 +104,14 @@ class RunTable:
 
     @cached_property
     def covariates(self) -> dict[str, FloatArray]:
-        """Columns of numbers that were logged or set: neither the time nor the run."""
+        """Numeric columns that were logged or set, without time and run."""
         kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run)}
         numbers = {name: values for name, values in kept.items() if values.dtype == np.float64}
         return {name: values for name, values in numbers.items() if np.isfinite(values).any()}
 
     @cached_property
     def time_begins_anew(self) -> bool:
-        """Whether time falls from one row to the next: it is counted from the start of each run."""
+        """Whether time decreases from one row to the next, because it is counted from the start of each run."""
         return bool((np.diff(self.time_s) < 0).any())
 
     def rows_by_scan(self) -> list[IntArray]:
@@ -130,13 +129,13 @@ class RunTable:
 
 @dataclass(frozen=True, eq=False)
 class RunRecording(Recording):
-    """A table and its readings, in the place of a plan and its readings: it offers what the diagnosis asks of both."""
+    """A table with its readings; it has the interface of a recording that the diagnosis needs."""
 
     sd_column: str = ""
-    """Column that says how exact each reading is; "": all are alike."""
+    """Column with the sd of each reading; "": all have the same sd."""
 
     least_share_of_span: ClassVar[float] = 1e-12
-    """Of the span of the readings: what arithmetic leaves of it; a good instrument's noise may be a millionth."""
+    """Least noise as a share of the span of the readings: set by arithmetic, since real noise may be a millionth."""
 
     def _require_plan(self) -> None:
         if not isinstance(self.plan, RunTable):
@@ -144,7 +143,7 @@ class RunRecording(Recording):
 
     @property
     def relative_sd(self) -> FloatArray:
-        """Declared sd of each reading relative to the median, (n_points,); 1 where none is declared."""
+        """Declared sd of each reading relative to the median, (n_points,); 1 if none is declared."""
         if not self.sd_column:
             return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
@@ -152,7 +151,7 @@ class RunRecording(Recording):
 
 
 def relative_sd_of(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
-    """Scale a column of sds by the typical one, its median by default, (n_points,); 1 where there is none."""
+    """Scale a column of sds by the typical one, by default its median, (n_points,); 1 without a column."""
     values = table.covariates.get(column, np.full(len(table), np.nan))
     there = np.isfinite(values) & (values > 0)
     if not there.any():
@@ -172,12 +171,12 @@ def _column(name: str, values: Any) -> NDArray[Any]:
 
 
 def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str | None) -> RunTable:
-    """Read a CSV file with one header row; a column in which each cell is a number, empty or nan is one of numbers.
+    """Read a CSV file with one header row; a column is numeric if every cell is a number, empty or nan.
 
     Raises
     ------
     FileError
-        If the file cannot be used or lacks a column; it names row, column, what stood there and what is allowed.
+        If the file is unusable or lacks a column; the message gives row, column, content and what is allowed.
     """
     table = read_table(require_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
     if not len(table):
@@ -196,7 +195,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
 
 
 def write_run_table(table: RunTable) -> str:
-    """Write a table out as the text of a CSV file, numbers in full precision."""
+    """Return a table as CSV text, with numbers in full precision."""
     return csv_text(
         {
             name: [number_text(v) if values.dtype == np.float64 else str(v) for v in values.tolist()]

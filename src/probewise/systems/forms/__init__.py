@@ -1,4 +1,4 @@
-"""The vocabulary of forms: what any simulator may leave out, bound to its columns, parameters, states and reading."""
+"""The vocabulary of forms: effects that a simulator may leave out, bound to columns, parameters, states, reading."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["About", "Form", "driving_columns", "forms_of"]
 
 
 def forms_of(about: About) -> dict[str, Form]:
-    """Bind every form that this table could show, by name."""
+    """Bind every form that could be detectable in this table, by name."""
     named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
     found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]

@@ -1,4 +1,4 @@
-"""About which fit forms are bound: what the readings can see there gives each form its scale."""
+"""The fit about which forms are bound: the sensitivity of the readings there sets each form's scale."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from probewise.systems.table import RunTable
 
 __all__ = ["About"]
 
-_ANY = Uniform(0.0, 1.0)  # prior of a trial, which no one asks for
-_ROWS_OF_A_RUN = 3  # on the average
-_UNSEEN = 1e-7  # of the noise: what changes the readings by less changes nothing
-_TYPICAL = 1.0  # noise sds, rms, that an effect of typical size changes the readings by
-_LEAST, _MOST = 0.05, 1e4  # noise sds, rms, between which sizes without an amplitude are looked for
+_ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
+_ROWS_OF_A_RUN = 3  # least rows per run on average
+_UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
+_TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
+_LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
 
 
 @dataclass(frozen=True, eq=False)
 class About:
     """A fit of a system: coordinates z (n_params,), and the sd of a reading.
 
-    Forms are given the size at which the readings here change by one sd: so no span is asked of anything.
+    The typical size of a form changes the readings here by one sd, so that no quantity needs a declared range.
     """
 
     system: System
@@ -62,7 +62,7 @@ class About:
 
     @property
     def tells_runs_apart(self) -> bool:
-        """Whether there are several runs, with rows enough that a value for each does not meet every reading."""
+        """Whether there are several runs, with enough rows that one value per run does not fit every reading."""
         n_runs = len(self.table.scan_names)
         return n_runs > 1 and len(self.table) >= _ROWS_OF_A_RUN * n_runs
 
@@ -78,18 +78,18 @@ class About:
 
     @property
     def duration(self) -> float:
-        """Time from the first row to the last, in its unit."""
+        """Time from the first row to the last, in the unit of time."""
         return float(np.ptp(self.table.time_s)) or 1.0
 
     @cached_property
     def gap(self) -> float:
-        """Time from a row to the next of its run, the median."""
+        """Median time from a row to the next of its run."""
         gaps = np.concatenate([np.diff(self.table.time_s[rows]) for rows in self.table.rows_by_scan()])
         gaps = gaps[gaps > 0]
         return float(np.median(gaps)) if gaps.size else 1.0
 
     def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
-        """Rms change of the readings by each setting (n_settings, n_params), in sds; NaN where it is not finite."""
+        """Return the rms change of the readings by each setting (n_settings, n_params), in sds; NaN if not finite."""
         trial = Form(
             "trial",
             stage,
@@ -107,9 +107,9 @@ class About:
         return np.asarray(np.sqrt(np.mean(change**2, axis=1)) / self.sd)
 
     def typical(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
-        """Find the amplitude at which the readings change by one sd; None where they do not change.
+        """Find the amplitude at which the readings change by one sd; None if they do not change.
 
-        `entries` (n_entries, n_columns, n_params) are laid out at the amplitude `guess`.
+        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`.
         """
         settings = entries.reshape(-1, entries.shape[-1])
         rms = self.rms(stage, act, settings[:: max(len(settings) // 16, 1)])
@@ -119,7 +119,7 @@ class About:
         return _TYPICAL * guess / float(np.median(rms[rms > _UNSEEN]))
 
     def sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        """Find between which sizes (n_tried,) the readings change, and not out of all proportion; None if nowhere."""
+        """Find the range of sizes (n_tried,) that change the readings by a plausible amount; None if there is none."""
         rms = self.rms(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST))
         if not there.size:
@@ -128,6 +128,6 @@ class About:
         return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
 
     def log_uniform(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
-        """Take the prior of such a size as even over its orders of magnitude."""
+        """Return a log-uniform prior over that range of sizes."""
         between = self.sizes(stage, act, tried)
         return None if between is None or not between[0] < between[1] else LogUniform(*between)

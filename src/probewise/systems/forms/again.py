@@ -1,4 +1,4 @@
-"""Forms bound again, without a fit: a form takes what it needs from the recording that it was bound about."""
+"""Rebind the forms of a stored model from its recording, without a new fit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OWN_OF_RUNS = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What forms were bound about: the table, and what the fit there predicts of readings and states, (n_points,)."""
+    """The table that forms were bound about, and the readings and states that the fit predicts there, (n_points,)."""
 
     table: RunTable
     predicted: FloatArray
@@ -35,7 +35,7 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class _AsRecorded(About):
-    """A fit that is known by what it predicted: nothing is simulated, and sizes, which only priors need, are any."""
+    """A fit known by its predictions: nothing is simulated, and sizes, which only priors need, are arbitrary."""
 
     known: Recorded | None = None
 
@@ -64,30 +64,30 @@ class _AsRecorded(About):
 
 
 def recorded(about: About) -> Recorded:
-    """Take what forms were bound about."""
+    """Store the table and the predictions about which forms are bound."""
     return Recorded(about.table, about.predicted, about.states)
 
 
 def forms_again(
     names: Iterable[str], simulator: Simulator, known: Recorded, *, more_runs: Iterable[str] = ()
 ) -> dict[str, Form]:
-    """Bind forms as they were bound about a recording, by name; names that are no form's are left out.
+    """Rebind forms about a recording, by name; names of other effects are left out.
 
     Parameters
     ----------
     names
-        Of forms and proposals.
+        Names of forms and proposals.
     simulator
         The simulator.
     known
-        What they were bound about.
+        The recording that they were bound about.
     more_runs
-        Runs that the recording does not hold: forms with a value for each run get one for each of these too.
+        Runs outside the recording, for which forms with one value per run also get a value.
 
     Raises
     ------
     ParameterError
-        If a proposal cannot be bound again.
+        If a proposal cannot be rebound.
     """
     wanted = list(dict.fromkeys(names))
     system = System(simulator, known.table.scan_names)
@@ -109,7 +109,7 @@ def forms_again(
 
 
 def own_of_runs(name: str) -> bool:
-    """Tell whether a form has a value for each run."""
+    """Return whether a form has one value per run."""
     return name.partition(":")[0] in _OWN_OF_RUNS
 
 

@@ -1,4 +1,4 @@
-"""Effects of a person's own: a further parameter of the simulator, away from the value at which it does nothing."""
+"""A user's own effects: an extra parameter of the simulator, with a null value at which it has no effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A form: physics that any simulator may leave out, bound to one target of it."""
+"""A form: a generic effect that a simulator may leave out, bound to one target."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from probewise.systems.table import RunTable
 __all__ = ["Act", "Form", "Moments", "Say", "with_unit"]
 
 Act = Callable[[Any, FloatArray, RunTable], Any]
-"""The value of a stage, parameters (n_samples, n_params) and the table to the value with the effect."""
+"""Function of the stage's value, parameters (n_samples, n_params) and the table; returns the value with the effect."""
 
 Say = Callable[[FloatArray, FloatArray], str]
-"""Mean and sd of the parameters, (n_params,) both, to a sentence."""
+"""Function of the parameters' mean and sd, (n_params,) each; returns a sentence."""
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Times, row numbers, or values of a column, between which a change point lies; a form's last parameter is one.
+    """Candidate positions of a change point (times, row numbers or values of a column), a form's last parameter.
 
-    `gated` says that the form does nothing before the change point and the same as everywhere after it, so that one
-    prediction does for all of them.
+    `gated`: the form has no effect before the change point and the same effect everywhere after it, so that one
+    prediction serves all change points.
     """
 
     at: tuple[float, ...]
@@ -40,49 +40,49 @@ class Moments:
     column: str = ""
 
     def along(self, table: RunTable) -> FloatArray:
-        """Give what the change point is compared with, (n_points,)."""
+        """Return the variable that is compared with the change point, (n_points,)."""
         if self.column:
             return table.covariates[self.column]
         return np.arange(float(len(table))) if self.by_row else table.time_s
 
     def thinned(self) -> Moments:
-        """Leave enough to see that something changed at one of them."""
+        """Keep a subset of positions that is dense enough to detect a change."""
         stride = -(-(len(self.at) - 1) // self.few)
         return replace(self, at=(*self.at[:-1:stride], self.at[-1]))
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """One effect of the vocabulary of forms, bound to its target.
+    """A form bound to its target.
 
     Parameters
     ----------
     name
         `name` or `name:target`.
     stage
-        Where in the chain it acts.
+        Stage of the chain at which it acts.
     marginals
         Prior of each parameter.
     units
         Unit of each parameter.
     covariates
-        Along which its residual shows.
+        Covariates along which its residual is visible.
     act
-        What it does.
+        The function that applies it.
     entries
-        Settings to look for it with, (n_entries, n_columns, n_params).
+        Template bank: trial settings, (n_entries, n_columns, n_params).
     amplitudes
-        Which parameters are amplitudes.
+        Indices of the parameters that are amplitudes.
     says
-        The sentence.
+        Function that describes it in a sentence.
     absent
-        Values of parameters at which it does nothing, where no amplitude says so.
+        Parameter values at which it has no effect, if these are not zero amplitudes.
     moments
-        Where it has a change point.
+        Candidate positions of its change point, if it has one.
     joined
-        Turns an entry and its columns' amounts into a setting, where amplitudes do not scale one by one.
+        Converts an entry and the fitted amounts of its columns to a setting, if amplitudes do not scale independently.
     expression
-        The formula of a proposal, which has no name in the vocabulary; empty for every other form.
+        Formula of a proposal, which has no name in the vocabulary; otherwise empty.
     """
 
     name: str
@@ -106,23 +106,23 @@ class Form:
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
-        """Values at which it does nothing: all amplitudes 0, or those given."""
+        """Parameter values at which it has no effect: all amplitudes 0, or `absent`."""
         return dict(self.absent) or dict.fromkeys(self.amplitudes, 0.0) or None
 
     def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
-        """Act with parameters theta (n_samples, n_params)."""
+        """Apply the effect with parameters theta (n_samples, n_params)."""
         return self.act(value, theta, plan)
 
     def bank(self) -> FloatArray:
-        """Lay out settings to look for it with, (n_entries, n_columns, n_params)."""
+        """Return the template bank: trial settings, (n_entries, n_columns, n_params)."""
         return self.entries
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say in plain words what it does, with its numbers, each of shape (n_params,)."""
+        """Describe the effect in plain words, given the parameters' mean and sd, (n_params,) each."""
         return self.says(mean, sd)
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Turn an entry and its columns' fitted amounts into a setting."""
+        """Convert a bank entry and the fitted amounts of its columns to a setting."""
         if self.joined is not None:
             return self.joined(entry, amounts)
         setting = entry[0].copy()
@@ -132,26 +132,26 @@ class Form:
 
     @property
     def n_peaks(self) -> int:
-        """Phases have two turns, so that each wave is there twice."""
+        """Number of equivalent modes: phases span two turns, so each wave has two."""
         return 2 if self.joined is not None else 1
 
     @property
     def scans(self) -> tuple[str, ...]:
-        """It acts in all runs."""
+        """Empty: it acts in all runs."""
         return ()
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """It knows no patterns."""
+        """Empty: tables have no patterns."""
         return ()
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Nothing that has to be named."""
+        """Empty: no further columns are needed."""
         return ()
 
     def variants(self) -> tuple[Form, ...]:
-        """Choose the two readings between which the change point lies."""
+        """Return one variant for each interval between two readings in which the change point may lie."""
         if self.moments is None:
             return (self,)
         last = list(self.marginals)[-1]
@@ -163,11 +163,11 @@ class Form:
         return tuple(out)
 
     def coarse(self) -> Form:
-        """Look between fewer readings."""
+        """Return the form with a thinned set of change points."""
         return self if self.moments is None else replace(self, moments=self.moments.thinned())
 
     def gates(self, plan: Any) -> Gates | None:
-        """Act everywhere, and after the middle of each interval."""
+        """Return the ungated form, and the change points at the middle of each interval."""
         if self.moments is None or not self.moments.gated:
             return None
         always = self.entries[0].copy()
@@ -176,7 +176,7 @@ class Form:
         return Gates(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.moments.at)]))
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw the change point from all intervals by their weight."""
+        """Draw the change point from all intervals by weight."""
         if self.moments is None:
             return theta
         at = np.array(self.moments.at)
@@ -186,6 +186,6 @@ class Form:
 
 
 def with_unit(mean: float, sd: float, unit: str) -> str:
-    """Write mean ± sd and a unit, as many digits as the sd deserves."""
+    """Write mean ± sd with a unit, rounded according to the sd."""
     digits = give_or_take(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"
     return f"{digits} {unit}" if unit not in ("", "1") else digits

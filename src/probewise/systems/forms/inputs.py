@@ -1,4 +1,4 @@
-"""Forms on the inputs: a column that is not what it says, and a clock that is wrong."""
+"""Forms on the inputs: errors of a column, and of the clock."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from probewise.systems.table import RunTable
 __all__ = ["driving_columns", "forms_on_inputs"]
 
 _N_SIZES = 9
-_NUDGE = 1e-4  # of a column's spread, to see whether it drives the readings
+_NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
 _MOST_WAVES_OF_A_LAW = 96
 _MOST_WAVES = 600
-_ROWS_OF_A_WAVE = 4  # distinct values to a period on the average: with fewer any readings lie on some wave
-_NEAR_ZERO = 0.1  # of a column's range
-_FORTH_AND_BACK = 0.02  # of the rows that go each way
+_ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
+_NEAR_ZERO = 0.1  # of a column's range: largest dead zone
+_FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
 
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
-"""A column (n_points,) or (n_samples, n_points), parameters and the table to the column as it really is."""
+"""Function of a column (n_points,) or (n_samples, n_points), parameters and the table; returns the true column."""
 
 
 def driving_columns(about: About) -> list[str]:
-    """List the columns that the simulator's readings depend on, the time left out."""
+    """Return the columns, except time, that the simulated readings depend on."""
     own, table = about.system.simulator, about.table
     out = []
     for name, values in table.covariates.items():
@@ -48,7 +48,7 @@ def driving_columns(about: About) -> list[str]:
 
 
 def forms_on_inputs(about: About) -> Iterator[Form]:
-    """List what may be wrong with each column that drives the simulator, and with the clock."""
+    """Yield the possible errors of each column that drives the simulator, and of the clock."""
     table, time, law = about.table, about.table.time, about.system.simulator.law
     holds = law is not None and law.hold == "previous"
     for name in driving_columns(about):
@@ -60,7 +60,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
         yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
         yield from _cut_off(about, name, low, high)
         says = partial(_said, f"{name} does nothing within {{}} of 0")
-        if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # farther off it is an offset
+        if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
             yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
         if _turns_back(values, table):
             says = partial(_said, f"{name} has {{}} of play")
@@ -200,7 +200,7 @@ def _dead(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
 
 
 def late(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Give a column as it was earlier by a dead time, within runs."""
+    """Delay a column by a dead time, within runs."""
     values = np.atleast_2d(c)
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
@@ -209,9 +209,9 @@ def late(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
 
 
 def late_where_held(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Give what a column that stays as in the row before makes, come late, of each gap between rows: its mean there.
+    """Return the mean over each gap of a column that is held between rows and delayed by a dead time.
 
-    Over the gap that follows a row it is, for the dead time, what it was in the row before that.
+    The column at any time has the held value of one dead time earlier.
     """
     values = np.atleast_2d(c)
     out = np.array(np.broadcast_to(values, (max(len(values), len(theta)), values.shape[1])))
@@ -227,14 +227,14 @@ def late_where_held(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatA
 
 
 def play(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Follow a column with play: nothing moves until it is taken up; at the start of a run it is half taken up."""
+    """Apply play (backlash) to a column: no motion until the play is taken up; a run starts in the middle of it."""
     values = np.atleast_2d(c)
     half = 0.5 * theta[:, 0]
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
         own = np.broadcast_to(values[:, rows[0]], half.shape).copy()
         first = np.flatnonzero(np.diff(values[0, rows]))
-        if first.size:  # it came the way it goes on
+        if first.size:  # assume the direction of arrival is that of the first motion
             own -= half * np.sign(values[0, rows[first[0] + 1]] - values[0, rows[first[0]]])
         for row in rows:
             own = np.clip(own, values[:, row] - half, values[:, row] + half)

@@ -1,4 +1,4 @@
-"""How something varies over the rows: along time, at a change point, from run to run, as a wave, with a column."""
+"""Variation over the rows: drift, step, per run, wave, or in proportion to a column."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ __all__ = [
 
 _MOST_MOMENTS = 512
 _MOST_WAVES = 1024
-_PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns: one of a phase's names lies far from both ends
+_PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns, so that one of a phase's equivalent values is far from both ends
 
 
 @dataclass(frozen=True, eq=False)
 class Modulation:
     """A function of the rows: `over(theta, table)` (n_samples, n_points), 0 where the amplitude is 0.
 
-    `marginals` takes the typical amplitude; `units` and `says` the unit of what varies.
+    `marginals` is a function of the typical amplitude; `units` and `says` of the unit of the varying quantity.
     """
 
     over: Callable[[FloatArray, RunTable], FloatArray]
@@ -53,7 +53,7 @@ def _one(size: float) -> FloatArray:
 
 
 def drift(table: RunTable, time_unit: str) -> Modulation:
-    """In proportion to time as printed: a t."""
+    """Linear drift in time as recorded: a t."""
     return Modulation(
         over=lambda theta, rows: theta[:, :1] * rows.time_s,
         marginals=lambda size: {"a": HeavyTailed(size)},
@@ -65,7 +65,7 @@ def drift(table: RunTable, time_unit: str) -> Modulation:
 
 
 def column(name: str, table: RunTable) -> Modulation:
-    """In proportion to a column, counted from its mean over the recording: a (C - mean C)."""
+    """Variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     values = table.covariates[name]
     middle = float(np.nanmean(values))
 
@@ -83,7 +83,7 @@ def column(name: str, table: RunTable) -> Modulation:
 
 
 def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
-    """At a change point: a 1(t > t0), by time where it was recorded, else by row."""
+    """Step at a change point: a 1(t > t0), in time if recorded, else in row number."""
     by_row = not table.has_time
     along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
     stride = -(-(len(along) - 1) // _MOST_MOMENTS)
@@ -109,7 +109,7 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
 
 
 def per_run(table: RunTable) -> Modulation:
-    """From run to run: a_run, in a run that the recording does not hold 0."""
+    """One value per run: a_run; 0 for runs outside the recording."""
     names = table.scan_names
 
     def over(theta: FloatArray, rows: RunTable) -> FloatArray:
@@ -134,7 +134,7 @@ def per_run(table: RunTable) -> Modulation:
 
 
 def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES, rows_each: int = 2) -> FloatArray:
-    """Lay out waves per unit of a covariate: up to one in `rows_each` rows, twice as many as its reach tells apart."""
+    """Return trial wave numbers along a covariate: up to one wave in `rows_each` rows, twice as dense as resolvable."""
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
     gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
@@ -145,7 +145,7 @@ def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES,
 
 
 def wave_joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Join the amounts of sine and cosine into amplitude and phase; the number of waves stays."""
+    """Convert the amounts of sine and cosine to amplitude and phase; the wave number is unchanged."""
     size = entry[0, 0]
     sine, cosine = amounts[0] * size, amounts[1] * size
     return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])

@@ -1,4 +1,4 @@
-"""Forms on the parameters: constants that are none."""
+"""Forms on the parameters: parameters that vary instead of being constant."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["forms_on_parameters"]
 
 
 def forms_on_parameters(about: About) -> Iterator[Form]:
-    """List how each parameter may vary: along time, at a change point, from run to run, with a column."""
+    """Yield the ways in which each parameter may vary: drift, step, per run, with a column."""
     system, table = about.system, about.table
     own = system.simulator
     values = system.parameters(about.theta, table)

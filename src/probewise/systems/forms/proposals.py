@@ -1,7 +1,7 @@
-"""Proposals: short expressions of columns and states, in the reading or in a rate, for physics that has no name.
+"""Proposals: short formulas of columns and states, in the reading or in a rate, for effects out of vocabulary.
 
-Each is one term with one amplitude. They are weighed like every other effect; what wins is out of vocabulary and is
-told as a formula.
+Each is one term with one amplitude. Their evidence is computed as for any other effect; a winning proposal counts as
+out of vocabulary and is reported as a formula.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from probewise.systems.table import RunTable
 
 __all__ = ["proposals"]
 
-_MOST_SWITCHES = 128  # values of a column that it may switch at
-_SAME = 0.9999  # cosine of two terms over the rows, beyond which the shorter one speaks for both
+_MOST_SWITCHES = 128  # thresholds of a switch in a column
+_SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept
 
 
 @dataclass(frozen=True)
 class _Atom:
-    """A column, a state or the level, counted from `middle` in units of `scale`."""
+    """A column, a state or the level, shifted by `middle` and scaled by `scale`."""
 
     name: str
     middle: float
@@ -49,7 +49,7 @@ class _Atom:
 
 @dataclass(frozen=True)
 class _Term:
-    """A function of some atoms: `text` with the amplitude left out, `size` what its unit is divided by."""
+    """A function of some atoms; `text` is its formula without the amplitude, `scale` divides its values."""
 
     text: str
     atoms: tuple[_Atom, ...]
@@ -61,7 +61,7 @@ class _Term:
 
 
 def proposals(about: About) -> Iterator[Form]:
-    """List the terms that could be added to the reading, and to the rate of each state."""
+    """Yield the terms that could be added to the reading, and to the rate of each state."""
     yield from _of_reading(about)
     for name in _columns(about):
         yield from _switch(about, name)
@@ -125,7 +125,7 @@ def _of_reading(about: About) -> Iterator[Form]:
 
 
 def _switch(about: About, name: str) -> Iterator[Form]:
-    """Shift the reading where a column is beyond a value that is not known."""
+    """Shift the reading where a column is above an unknown threshold."""
     own, values = about.system.simulator, np.unique(about.table.covariates[name])
     if len(values) <= 2:
         return
@@ -175,12 +175,12 @@ def _of_rate(about: About, state: str) -> Iterator[Form]:
 
 
 def term_names(term: _Term) -> tuple[str, ...]:
-    """Names of what a term is made of."""
+    """Return the names in a term."""
     return tuple(dict.fromkeys(atom.name for atom in term.atoms))
 
 
 def _is_new(shape: FloatArray, known: list[FloatArray]) -> bool:
-    """Tell whether a term is no constant and no other term again; keep it in mind."""
+    """Return whether a term is neither constant nor a duplicate, and add it to `known`."""
     centred = shape - shape.mean()
     size = float(np.linalg.norm(centred))
     if not np.isfinite(size) or size <= 1e-9 * float(np.linalg.norm(shape)):

@@ -23,11 +23,11 @@ _MOST_WAVES = 64
 _N_SIZES = 9
 
 Of = Callable[[Any, Any], Any]
-"""The state whose rate it is in, and another state, to a term of amplitude one."""
+"""Function of the state whose rate it is in and another state; returns a term of unit amplitude."""
 
 
 def forms_on_rates(about: About) -> Iterator[Form]:
-    """List what may be missing from the rate of each state."""
+    """Yield the terms that may be missing from the rate of each state."""
     for state, values in about.states.items():
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"
@@ -180,7 +180,7 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
 
 
 def _rate_scale(about: About, state: str) -> float:
-    """Rms rate of a state, from its values at the rows."""
+    """Return the rms rate of a state, from its values at the rows."""
     values, time = about.states[state], about.table.time_s
     rates = []
     for rows in about.table.rows_by_scan():

@@ -1,4 +1,4 @@
-"""Forms on the reading: what adds to it, scales it, bends it, holds it back."""
+"""Forms on the reading: offsets, gains, lag, delay, hysteresis, bend, saturation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def modulated(
     unit: str,
     covariates: tuple[str, ...] = (),
 ) -> Iterator[Form]:
-    """Bind a modulation to what `act` adds it to; nothing where the readings do not change."""
+    """Bind a modulation to the quantity that `act` changes; yield nothing if the readings do not change."""
     entries = how.entries(guess)
     typical = about.typical(stage, act, entries, guess)
     if typical is not None and np.isfinite(typical) and typical > 0:
@@ -52,7 +52,7 @@ def modulated(
 
 
 def forms_on_readings(about: About) -> Iterator[Form]:
-    """List every form of the reading that this table could show."""
+    """Yield every form of the reading that could be detectable in this table."""
     table, unit, zero = about.table, about.unit, about.system.simulator.noise.zero
     reading = about.system.simulator.reading
     span = float(np.ptp(about.predicted)) or about.sd
@@ -99,7 +99,7 @@ def _scaling(how: Modulation, zero: float) -> Act:
 
 
 def since_start_of_run(table: RunTable) -> FloatArray:
-    """Time since the first row of each row's run, (n_points,)."""
+    """Return the time since the first row of each row's run, (n_points,)."""
     first = np.array([table.time_s[rows].min() if rows.size else 0.0 for rows in table.rows_by_scan()])
     return np.asarray(table.time_s - first[table.scan])
 
@@ -189,9 +189,9 @@ def _delay(about: About) -> Iterator[Form]:
 
 
 def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
-    """Look values (1 or n_samples, n) of times (n,) up as they were earlier `by` (n_samples,), on straight lines.
+    """Interpolate values (1 or n_samples, n) at times (n,) linearly to times earlier by `by` (n_samples,).
 
-    Before the first time they are as at the first.
+    Before the first time, the first value holds.
     """
     if len(time) < 2:
         return np.broadcast_to(values, (len(by), len(time)))
@@ -205,7 +205,7 @@ def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
 
 
 def way(values: FloatArray, table: RunTable) -> FloatArray:
-    """Give the sign of motion of values (n_samples, n_points) within runs; a rest keeps the last, a start the next."""
+    """Return the sign of change of values (n_samples, n_points) within runs; rests keep the last, starts the next."""
     out = np.zeros_like(values)
     for rows in table.rows_by_scan():
         if len(rows) < 2:
@@ -285,7 +285,8 @@ def _ceiling(about: About) -> Iterator[Form]:
     readings = about.table.columns[about.system.simulator.reading]
     least, most = (float(end(readings[np.isfinite(readings)])) for end in (np.min, np.max))
 
-    # Readings that are cut off end where they are: what ends in their upper half is a ceiling, in the lower a floor.
+    # Clipped readings end at the limit: a limit in the upper half of their range is a ceiling, in the lower half a
+    # floor.
     middle = 0.5 * (least + most)
 
     def cut(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -146,5 +146,5 @@ def test_a_brick_that_is_not_there_is_told_of_with_status_1(tmp_path, capsys):
 def test_a_recording_is_not_overwritten(tmp_path, capsys):
     (tmp_path / "r.csv").write_text("mine")
     error = said(capsys, "arm", "record", "paper", "--out", tmp_path / "r.csv", "--arm", "nxt:/none", status=2).err
-    assert "--resume to go on with it" in error
+    assert "--resume to continue it" in error
     assert (tmp_path / "r.csv").read_text() == "mine"

@@ -45,7 +45,7 @@ def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
     assert run("investigate", *options, "--seed", 1) == 0
     before = (out / "rounds" / "1.csv").read_bytes()
     assert run("investigate", *options, "--seed", 1) == 2
-    assert "--resume to go on with it" in capsys.readouterr().err
+    assert "--resume to continue it" in capsys.readouterr().err
     assert run("investigate", *options, "--seed", 2, "--resume") == 2
     assert "seed '1'" in capsys.readouterr().err
     assert (out / "rounds" / "1.csv").read_bytes() == before

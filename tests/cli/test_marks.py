@@ -79,7 +79,7 @@ def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, cap
     assert "nxt:PORT or emulator:TRUE.toml" in capsys.readouterr().err
     (tmp_path / "a.marks.csv").write_text("")
     assert main(["arm", "fit-geometry", "--out", out, "--arm", "emulator"]) == 2
-    assert "--resume to go on with it" in capsys.readouterr().err
+    assert "--resume to continue it" in capsys.readouterr().err
 
 
 def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():

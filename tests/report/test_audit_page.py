@@ -24,7 +24,7 @@ def test_the_matrix_marks_the_row_that_is_taken_for_the_column_and_leaves_out_wh
     (circle,) = zip(*matrix.lines[0].get_data(), strict=True)
     assert circle == (columns.index("backlash"), rows.index("lag"))
     assert "row: the effect present" in matrix.get_title(loc="left")
-    assert matrix.get_xlabel() == "effect that it may be taken for"
+    assert matrix.get_xlabel() == "effect it may be mistaken for"
 
 
 @pytest.mark.parametrize(

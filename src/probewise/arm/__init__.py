@@ -1,4 +1,4 @@
-"""Where readings come from: one interface, simulated arm and LEGO arm behind it (paper, "Robotic Arm Test Bed")."""
+"""Instruments that take readings: one interface, a simulated arm and the LEGO arm (paper, "Robotic Arm Test Bed")."""
 
 from probewise.arm.carry_out import Request, carry_out, readings_of, recorded
 from probewise.arm.geometry import Geometry, Joint

@@ -1,4 +1,4 @@
-"""What the arm and the brick below it both speak of: a clock, and the side that a move comes from."""
+"""Types that arm and brick share: a clock, and the side from which a joint arrives."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Literal, Protocol, TypeAlias
 __all__ = ["Clock", "Side"]
 
 Side: TypeAlias = Literal[-1, 1]
-"""Arriving with the count going down, or up."""
+"""Direction of arrival: -1 with the count decreasing, 1 increasing."""
 
 
 class Clock(Protocol):
-    """A clock that can be waited for; the module `time` is one."""
+    """A clock with `sleep`; the module `time` is one."""
 
     def monotonic(self) -> float:
-        """Seconds since some moment."""
+        """Return seconds since an arbitrary time."""
         ...
 
     def sleep(self, seconds: float, /) -> None:
-        """Wait."""
+        """Wait for some seconds."""
         ...

@@ -1,4 +1,4 @@
-"""Carry out a plan with an arm: row after row, with a person who turns the sensor and changes the pattern."""
+"""Carry out a plan with an arm, row by row; a person turns the sensor and changes the pattern."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 
 
 class Request(str):
-    """What a person at the bench is asked to do, as a sentence; a simulated bench does what it is about.
+    """A request to the person at the bench, as a sentence; a simulated bench uses its attributes.
 
     Attributes
     ----------
     pattern
-        The pattern to be laid under the arm, by its name; None: none.
+        Name of the pattern to be laid under the arm, or None.
     turned_rad
-        How the sensor is to be turned on its mount; None: as it is.
+        Angle to which the sensor is to be turned on its mount; None: unchanged.
     """
 
     __slots__ = ("pattern", "turned_rad")
@@ -42,7 +42,7 @@ class Request(str):
     turned_rad: float | None
 
     def __new__(cls, text: str, *, pattern: str | None = None, turned_rad: float | None = None) -> Request:
-        """Make one of a sentence."""
+        """Build a request from its sentence."""
         request = super().__new__(cls, text)
         request.pattern, request.turned_rad = pattern, turned_rad
         return request
@@ -58,34 +58,34 @@ def carry_out(
 ) -> Iterator[Reading]:
     """Take a plan's readings, in order.
 
-    The LEGO arm's orientation follows from the arm; the person turns its sensor on its mount by right angles,
-    to come as near to the planned orientation as that allows. The sensor of an instrument of one's own that does not
-    turn by itself is turned by the person too, to the planned orientation. The reading tells the true one.
+    The LEGO arm's orientation follows from its pose; the person turns the sensor on its mount by right angles to come
+    as close to the planned orientation as possible. With a user's own instrument that does not turn its sensor, the
+    person turns it to the planned orientation. The reading holds the true orientation.
 
     Parameters
     ----------
     arm
         The arm, entered already; or any object with a `measure(pose)`, see `instrument_of`.
     plan
-        Where to read and over what.
+        The plan.
     origin_mm
-        Where on the field the plan's origin lies, lab frame.
+        Place of the plan's origin on the field, lab frame.
     ask
-        Asks a person to do something, and returns when it is done: a `Request` is a text.
+        Function that shows a `Request` (a str) to a person and returns when it is done.
     first
-        Row to start at: rows before it have been taken.
+        First row to read; earlier rows have been taken.
 
     Yields
     ------
-    A reading for each row, in the plan's frame, at the place that the arm knows to be the true one: a motor stops
-    within a count of its goal, and its counter says where. Where an instrument knows none better it is the plan's.
+    A reading for each row, in the plan's frame, at the true place if the arm measures it (a motor stops within a count
+    of its goal, and its counter says where), otherwise at the planned place.
 
     Raises
     ------
     ReachError
         If the arm cannot take some row; nothing moves.
     ParameterError
-        If the plan commands what this arm has not: another height, the LED off.
+        If the plan needs what this arm lacks: another height, the LED off.
     """
     arm = instrument_of(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
@@ -112,14 +112,14 @@ def carry_out(
 
 
 def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], first: int = 0) -> float:
-    """Tell how long a plan takes, about: what the arm needs for its readings, and half a minute by hand each time.
+    """Estimate the duration of a plan: time of the arm's readings, and half a minute per step by hand.
 
     Parameters
     ----------
     arm
         The arm, entered.
     plan, origin_mm, first
-        As of `carry_out`.
+        As for `carry_out`.
     """
     places = (np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm))[first:]
     turns, lying = plan.orientation_rad[first:], plan.pattern[first:]
@@ -132,7 +132,7 @@ def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], f
 
 
 def _in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
-    """Give the place of a reading in the plan's frame, rounded to a micron; the plan's own where that was met."""
+    """Return the place of a reading in the plan's frame, rounded to a micron; the planned place if it was reached."""
     x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
     if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
         return x_mm, y_mm
@@ -140,7 +140,7 @@ def _in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, flo
 
 
 class _Lego:
-    """The LEGO arm: its sensor turns with its base, and on its mount by right angles."""
+    """The LEGO arm: its sensor turns with the base, and by hand on its mount by right angles."""
 
     from_where = "anticlockwise seen from above, from where the geometry has it"
 
@@ -149,19 +149,19 @@ class _Lego:
         arm.turned_rad = 0.0
 
     def turns(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor is to be turned by hand for each row, (n_points,)."""
+        """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
         off = plan.orientation_rad - self._arm.orientation_rad(places_mm)
         return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
 
     def measure(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Take the reading of a row, its place in the lab frame."""
+        """Take the reading of a row, with its place in the lab frame."""
         self._arm.turned_rad = turned_rad
         standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
         return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
 
 
 class _Own:
-    """A person's own instrument, or the simulated arm: it turns its sensor itself, or a person does."""
+    """A user's own instrument, or the simulated arm: the sensor is turned by the instrument or by hand."""
 
     from_where = "anticlockwise seen from above, from how it stands by itself"
 
@@ -170,33 +170,33 @@ class _Own:
         self._turns, self._lifts = _skills(arm)
 
     def turns(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor is to be turned by hand for each row, (n_points,)."""
+        """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
         if self._turns:
             return np.zeros(len(plan))
         off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
         return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
 
     def measure(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Take the reading of a row, its place in the lab frame."""
+        """Take the reading of a row, with its place in the lab frame."""
         height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
 
 def _skills(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
-    """Tell whether an arm turns its sensor itself, and reads at a height that is asked for."""
+    """Return whether an arm can turn its sensor, and whether it can read at a requested height."""
     return (True, True) if isinstance(arm, SimulatedArm) else (arm.turns, arm.lifts)
 
 
 def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
-    """Write down what was read: the plan's first rows with true place and orientation, time, battery, height of each.
+    """Build a recording of the plan's first rows with true places, orientations, times, battery voltage and heights.
 
     Parameters
     ----------
     plan
         The plan.
     readings
-        Those of its first rows, one or more, as `carry_out` yields them.
+        Readings of its first rows, one or more, as `carry_out` yields them.
     """
     rows = plan.take(np.arange(len(readings)))
     names = sorted({name for reading in readings for name in reading.covariates})
@@ -213,7 +213,7 @@ def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
 
 
 def readings_of(recording: Recording) -> list[Reading]:
-    """Read back what `recorded` wrote down: each row's reading with its place, time and covariates."""
+    """Convert a recording from `recorded` to readings with place, time and covariates."""
     rows = recording.plan
     return [
         Reading(
@@ -227,7 +227,7 @@ def readings_of(recording: Recording) -> list[Reading]:
 
 
 def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
-    """Take what says where an arm can put its sensor."""
+    """Return the object that defines the reach of an arm."""
     match arm:
         case LegoArm():
             return arm.geometry

@@ -1,8 +1,7 @@
-"""Fit an arm's geometry to marks that its sensor was brought to: home angles, links, base.
+"""Calibrate an arm's geometry from marks to which its sensor was brought: home angles, links, base.
 
-Each mark gives the place and, where it was touched, the height of the sensor beside the angles by which its motors
-have turned the joints from home. What the file says of the arm so far counts as a measurement by ruler and eye
-(`RULER_SDS`); the rest is least squares.
+Each mark gives the sensor's place and, if touched, its height, with the angles of the joints from home. The current
+geometry file counts as a measurement by ruler and eye (`RULER_SDS`); the fit is by least squares.
 """
 
 from __future__ import annotations
@@ -22,28 +21,28 @@ from probewise.errors import ParameterError, ProbewiseError, ShapeError
 
 __all__ = ["FittedGeometry", "MarksDisagreeError", "fit_geometry"]
 
-LEAST_P = 1e-3  # marks that fit by chance no better than this disagree
-MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # of a geometry that the marks determine
+LEAST_P = 1e-3  # p-value below which the marks disagree
+MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # largest sds of a geometry that counts as determined by the marks
 
 
 class MarksDisagreeError(ProbewiseError, ValueError):
-    """Report marks that no geometry explains."""
+    """Raised for marks that no geometry explains."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedGeometry:
-    """A geometry and what speaks for it.
+    """A fitted geometry with its residuals and errors.
 
     Parameters
     ----------
     geometry
-        With its accuracy.
+        The geometry, with its accuracy.
     before, values, sds
-        What is fitted, before and after, and its sd, (9,) in the order of `FITTED`.
+        Parameters before and after the fit, and their sds, (9,) in the order of `FITTED`.
     residuals_mm
-        Mark minus fitted place and height, (n_marks, 3); NaN where no height was taken.
+        Mark minus fitted place and height, (n_marks, 3); NaN without a height.
     p_value
-        How often marks as good as they are said to be fit worse.
+        Probability that marks of the stated accuracy fit worse.
     """
 
     geometry: Geometry
@@ -54,7 +53,7 @@ class FittedGeometry:
     p_value: float
 
     def summary(self) -> str:
-        """Say what changed, by how much, and how well it is known."""
+        """Return a text table of each parameter's change and sd."""
         lines = []
         for k, name in enumerate(FITTED):
             angle = k < 3
@@ -84,20 +83,20 @@ def fit_geometry(
     Parameters
     ----------
     geometry
-        The arm as it is known so far.
+        The current geometry.
     turned_rad
-        By how much each joint had turned from home at each mark, (n_marks, 3): base, shoulder, elbow.
+        Angle of each joint from home at each mark, (n_marks, 3): base, shoulder, elbow.
     marks_mm
-        Where the sensor's face then was, (n_marks, 3): lab frame, and height; NaN: no height was taken.
+        Place of the sensor's face at each mark, (n_marks, 3): lab frame, and height; NaN: no height.
     touch_mm
-        Sd of a mark's place and height, of hand and eye and of the motors.
+        Sd of a mark's place and height, from positioning by eye and from the motors.
 
     Raises
     ------
     ShapeError
-        If there is not one row of three a mark.
+        If there is not one row of three numbers per mark.
     ParameterError
-        If there are too few marks, or they lie so that they do not determine the geometry.
+        If the marks are too few, or their places do not determine the geometry.
     MarksDisagreeError
         If no geometry explains them.
     """
@@ -134,7 +133,7 @@ def fit_geometry(
 def _solve(
     geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Find the most probable numbers, the sum of squares there, and the slopes, (n_residuals, 9)."""
+    """Return the most probable parameters, the sum of squares there, and the Jacobian, (n_residuals, 9)."""
     known = np.isfinite(marks)
 
     def misses(scaled: FloatArray) -> FloatArray:
@@ -153,7 +152,7 @@ def _disagreement(
     touch_mm: float,
     residuals: FloatArray,
 ) -> str:
-    """Say which mark does not fit the others, where leaving it out makes peace."""
+    """Build the error message; name the mark, if any, without which the others agree."""
     rms = np.sqrt(np.nanmean(residuals**2))
     off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
@@ -174,7 +173,7 @@ def _accuracy(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accur
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
     slopes = slopes_mm(geometry, places)
     variances = np.einsum("nik,kl,nil->ni", slopes, covariance, slopes)
-    # How the whole field is stretched: the mean of what displaces places away from their middle.
+    # Scale error of the whole field: the mean radial displacement from its centre.
     arms = places - places.mean(axis=0)
     stretch = np.einsum("nik,ni->k", slopes[:, :2], arms) / float((arms**2).sum())
     return Accuracy(
@@ -187,7 +186,7 @@ def _accuracy(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accur
 
 
 def _with_values(geometry: Geometry, values: Sequence[float] | FloatArray) -> Geometry:
-    """Put fitted numbers in; limits and stops are angles as the motors count them, so that they move with home."""
+    """Return the geometry with fitted values; limits and stops are counted by the motors, so they shift with home."""
     joints = []
     for joint, home in zip(geometry.joints, values[:3], strict=True):
         by = float(home) - joint.home_rad

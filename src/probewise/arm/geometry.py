@@ -1,4 +1,4 @@
-"""The arm's geometry as a value: from joint angles to a place and back, and how far each may go.
+"""The arm's geometry: forward and inverse kinematics, and the limits of the joints.
 
 A base turns about a vertical axis; an upper and a lower link move in the vertical plane that
 turns with it. Parallelograms carry the sensor's attitude from the base to the wrist, so that it
@@ -24,7 +24,7 @@ JOINTS = ("base", "shoulder", "elbow")
 """The joints in the order of the columns of all arrays of angles."""
 
 ROOM_COUNTS = 110
-"""How far a motor may have to go beyond a place, to come back to it from the right side."""
+"""Counts that a motor may have to overshoot, to approach a place from the right side."""
 
 
 @dataclass(frozen=True)
@@ -34,17 +34,17 @@ class Joint:
     Parameters
     ----------
     port
-        The motor's, 0 to 2 for A to C.
+        Port of the motor, 0 to 2 for A to C.
     gear_ratio
-        Turns of the motor for one of the joint; negative where they turn against each other.
+        Turns of the motor per turn of the joint; negative if they turn in opposite directions.
     home_rad
-        Where it stands when the motor's counter is 0.
+        Angle at which the motor's counter is 0.
     low_rad, high_rad
-        As far as it may ever go.
+        Limits of the angle.
     play_rad
-        How far it can be moved while the motor holds; 0 where its weight keeps it on one side.
+        Play: range of the joint while the motor holds; 0 if its weight keeps it on one side.
     stop_rad
-        Where a mechanical stop ends its way, at or beyond a limit; None where there is none to find home by.
+        Angle of a mechanical stop, at or beyond a limit, used to find home; None without one.
     """
 
     port: int
@@ -80,43 +80,43 @@ class Joint:
 
     @property
     def counts_per_rad(self) -> float:
-        """Counts of the motor, degrees of its shaft, for one radian of the joint."""
+        """Motor counts (degrees of its shaft) per radian of the joint."""
         return math.degrees(self.gear_ratio)
 
     @property
     def stop_side(self) -> Side | None:
-        """Direction in which its stop lies; None where it has none."""
+        """Direction of its stop; None without one."""
         if self.stop_rad is None:
             return None
         return 1 if self.stop_rad >= self.high_rad else -1
 
     @property
     def stop_counts(self) -> int:
-        """Count of a motor that holds the joint against its stop.
+        """Motor count with the joint at its stop.
 
         Raises
         ------
         ParameterError
-            If it has none.
+            If it has no stop.
         """
         if self.stop_rad is None or self.stop_side is None:
             raise ParameterError("stop_deg", None, "an angle: without one the joint has no stop to be found")
         return self.counts_at(self.stop_rad, self.stop_side)
 
     def counts_at(self, angle_rad: float, side: int = 0) -> int:
-        """Count to which the motor must turn, arriving upwards (1) or downwards (-1), for the joint to be at an angle.
+        """Return the motor count that puts the joint at an angle, approached upwards (1) or downwards (-1).
 
         The joint lags behind by half the play; with side 0 it is in the middle of it, as at home.
         """
         return round((angle_rad + side * self.play_rad / 2 - self.home_rad) * self.counts_per_rad)
 
     def angle_at(self, counts: float, side: int = 0) -> float:
-        """Angle of the joint whose motor arrived at a count; see `counts_at`."""
+        """Return the joint angle at a motor count; see `counts_at`."""
         return self.home_rad + counts / self.counts_per_rad - side * self.play_rad / 2
 
 
 UNMEASURED_RAD = math.radians(2.0)
-"""So far off may the home angles of links be that were set by eye."""
+"""Largest error of home angles of the links set by eye."""
 
 N_FITTED = 9  # numbers of a geometry that marks determine
 
@@ -125,7 +125,7 @@ FIELD_STEPS = 12  # places along each side of the field at which errors are work
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How well a geometry is known, from marks that it was fitted to.
+    """Accuracy of a geometry fitted to marks.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class Accuracy:
     place_sd_mm
         Sd of the sensor's place along x and y, root mean square over the field.
     height_sd_mm
-        Sd of its height where that is known least.
+        Largest sd of its height on the field.
     scale_sd
         Sd of the ratio of lengths on the field to lengths as the arm measures them.
     covariance
@@ -166,32 +166,32 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Every number of the arm as built; `read_geometry` takes them from a file.
+    """All dimensions of the arm; `read_geometry` reads them from a file.
 
     Parameters
     ----------
     field_mm
         Width and height of the field, whose lower left corner is the lab frame's origin.
     axis_mm
-        Where the base's vertical axis stands.
+        Place of the base's vertical axis.
     shoulder_mm
-        From that axis forward to the shoulder's, and from the surface up to it.
+        Distance from that axis forward to the shoulder's axis, and height of the latter above the surface.
     links_mm
         Shoulder to elbow, elbow to wrist.
     elbow_is_relative
-        Whether the elbow's angle is that between the links; otherwise that of the lower link from the horizontal.
+        Whether the elbow's angle is measured between the links, or from the horizontal.
     sensor_port
         0 to 3, for inputs 1 to 4.
     sensor_mm
-        From the wrist forward to the sensor's origin, and down to its face.
+        Distance from the wrist forward to the sensor's origin, and down to its face.
     mounting_rad
         The sensor's orientation is this plus the base's angle minus a right angle.
     read_height_mm, travel_height_mm, lowest_mm
-        Height of the sensor's face above the surface when it reads and when the arm moves, and the least ever.
+        Height of the sensor's face above the surface: when reading, when moving, and the lowest allowed.
     base, shoulder, elbow
         The joints.
     whole_percent
-        Whether readings are cut to whole percent, as the brick shows them.
+        Whether readings are truncated to whole percent, as the brick shows them.
     accuracy
         How well all this is known; None: nobody has fitted it to marks.
     light_per_mm
@@ -254,12 +254,12 @@ class Geometry:
 
     @property
     def nearest_mm(self) -> float:
-        """How near to the axis the sensor can read."""
+        """Smallest distance from the axis at which the sensor can read."""
         return float(self._ring_mm()[0])
 
     @property
     def farthest_mm(self) -> float:
-        """How far from the axis the sensor can read."""
+        """Largest distance from the axis at which the sensor can read."""
         return float(self._ring_mm()[1])
 
     @property
@@ -271,9 +271,9 @@ class Geometry:
 
     @property
     def height_doubt_mm(self) -> float:
-        """By how much the sensor may hang lower than it is told to, where that is most.
+        """Largest amount by which the sensor may be lower than commanded.
 
-        Two sds of a fitted geometry; else what home angles of both links cost that are two degrees off.
+        Two sds of a fitted geometry; otherwise the effect of an error of two degrees in both links' home angles.
         """
         if self.accuracy is not None:
             return 2 * self.accuracy.height_sd_mm
@@ -282,13 +282,13 @@ class Geometry:
 
     @property
     def spread_mm(self) -> FloatArray:
-        """Places spread over the field that the sensor can read at, (n, 2)."""
+        """Places all over the field at which the sensor can read, (n, 2)."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
         return places[self.holds(places)]
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
-        """Place the sensor's face, lab frame and height: joint angles (n, 3) to (n, 3)."""
+        """Forward kinematics: joint angles (n, 3) to place and height of the sensor's face in the lab frame, (n, 3)."""
         return placed_mm(
             angles_rad,
             self.links_mm,
@@ -299,7 +299,7 @@ class Geometry:
         )
 
     def rise_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
-        """Tell how the sensor rises with each joint's angle: joint angles (n, 3) to (n, 3), mm a radian."""
+        """Return the derivative of the sensor's height with each joint angle: (n, 3) to (n, 3), mm per radian."""
         _, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
         lower = shoulder + elbow if self.elbow_is_relative else elbow
         upper_rise, lower_rise = self.links_mm[0] * np.cos(shoulder), self.links_mm[1] * np.cos(lower)
@@ -307,22 +307,22 @@ class Geometry:
         return np.stack([np.zeros_like(both), both, lower_rise], axis=-1)
 
     def angles_rad(self, places_mm: FloatArray, height_mm: float) -> FloatArray:
-        """Find the joint angles that put the sensor there, elbow up.
+        """Inverse kinematics, elbow up.
 
         Parameters
         ----------
         places_mm
             Places, shape (n, 2), lab frame.
         height_mm
-            Of the sensor's face above the surface.
+            Height of the sensor's face above the surface.
 
         Returns
         -------
-        Angles, shape (n, 3); NaN in a row whose place is too far, too near, or beyond a joint's limits.
+        Joint angles, shape (n, 3); NaN for places too far, too near, or beyond a joint's limits.
         """
         places = _columns(places_mm, 2)
         dx, dy = places[:, 0] - self.axis_mm[0], places[:, 1] - self.axis_mm[1]
-        # Any turn that lies within the base's limits will do: -190 and 170 degrees are one direction.
+        # Any equivalent angle within the base's limits will do: -190 and 170 degrees are one direction.
         base = self.base.low_rad + np.mod(np.arctan2(dy, dx) - self.base.low_rad, 2 * math.pi)
         out = np.hypot(dx, dy) - self.shoulder_mm[0] - self.sensor_mm[0]
         up = height_mm + self.sensor_mm[1] - self.shoulder_mm[1]
@@ -338,13 +338,13 @@ class Geometry:
         return angles
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n, 2), are on the field and leave the motors room to arrive: shape (n,)."""
+        """Return which places, shape (n, 2), are on the field with room for the motors to approach: shape (n,)."""
         places = _columns(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
         return np.asarray(on_field & self._leaves_room(places))
 
     def allows(self, angles_rad: FloatArray) -> BoolArray:
-        """Tell which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
+        """Return which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
         angles = _columns(angles_rad, 3)
         low = np.array([joint.low_rad for joint in self.joints])
         high = np.array([joint.high_rad for joint in self.joints])
@@ -352,7 +352,7 @@ class Geometry:
             return np.asarray(((angles >= low) & (angles <= high)).all(axis=-1))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n, 2): shape (n,), -pi to pi.
+        """Return the sensor's orientation at each place, (n, 2): shape (n,), -pi to pi.
 
         It turns with the base: mounting + base - a right angle.
         """
@@ -361,7 +361,7 @@ class Geometry:
         return wrapped(self.mounting_rad + base - math.pi / 2)
 
     def sentence(self) -> str:
-        """Say where a place may be."""
+        """Describe the allowed places in words."""
         (width, height), (x_mm, y_mm) = self.field_mm, self.axis_mm
         return (
             f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {self.nearest_mm:.0f} to "
@@ -369,14 +369,14 @@ class Geometry:
         )
 
     def _leaves_room(self, places_mm: FloatArray) -> BoolArray:
-        """Tell over which places, shape (n, 2), the motors have room to arrive, reading and travelling: shape (n,)."""
+        """Return over which places, (n, 2), the motors have room to approach at both heights, shape (n,)."""
         room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
         read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
         roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
         return np.asarray(np.all(roomy, axis=0))
 
     def _ring_mm(self) -> tuple[float, float]:
-        """Least and greatest distance from the axis, in whole mm, at which the motors have room; NaN where none is."""
+        """Smallest and largest distance from the axis, in whole mm, with room for the motors; NaN if there is none."""
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
@@ -393,7 +393,7 @@ def placed_mm(
     *,
     elbow_is_relative: bool,
 ) -> FloatArray:
-    """Place the sensor's face of an arm of these lengths, lab frame and height: joint angles (n, 3) to (n, 3)."""
+    """Forward kinematics for given lengths: joint angles (n, 3) to place and height in the lab frame, (n, 3)."""
     base, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
     lower = shoulder + elbow if elbow_is_relative else elbow
     away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + sensor_mm[0]
@@ -402,7 +402,7 @@ def placed_mm(
 
 
 def wrapped(angle_rad: FloatArray) -> FloatArray:
-    """Bring angles, of any shape, into -pi to pi."""
+    """Wrap angles, of any shape, to -pi to pi."""
     return np.asarray(np.mod(angle_rad + math.pi, 2 * math.pi) - math.pi)
 
 

@@ -1,4 +1,4 @@
-"""An arm's geometry on file: TOML that a person can measure and write, every number checked."""
+"""The file format of an arm's geometry: TOML, written by hand, with every number checked."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LARGEST = 1e6
 
 
 def shipped_geometry() -> Path:
-    """Find the file that comes with the package: a LEGO arm over the paper's field, numbers plausible, not measured."""
+    """Return the path of the shipped file: a LEGO arm over the paper's field, with plausible, not measured, values."""
     return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
 
 
@@ -35,8 +35,8 @@ def read_geometry(path: str | Path) -> Geometry:
     Raises
     ------
     FileError
-        If the file is missing or no TOML, a number is missing or not allowed, or a name is not known:
-        it names the file and the entry, what stood there and what is allowed.
+        If the file is missing or not TOML, a number is missing or not allowed, or a name is unknown; the message gives
+        file, entry, content and what is allowed.
     """
     path = require_path("path", path)
     text = read_text(path, "an arm's geometry, TOML in UTF-8")
@@ -90,14 +90,14 @@ def read_geometry(path: str | Path) -> Geometry:
 
 
 def with_fitted(text: str, geometry: Geometry) -> str:
-    """Put the numbers that a fit changes, and how well they are known, into the text of a geometry's file.
+    """Replace the fitted values and their accuracy in the text of a geometry file.
 
     Parameters
     ----------
     text
-        The file that the fit began with; its comments stay.
+        Text of the file before the fit; its comments are kept.
     geometry
-        The fitted one.
+        The fitted geometry.
     """
     numbers: dict[tuple[str, str], float] = {
         ("base", "x_mm"): geometry.axis_mm[0],
@@ -140,7 +140,7 @@ def with_fitted(text: str, geometry: Geometry) -> str:
 
 
 class _Table:
-    """One table of the file; entries are taken one by one, and none may be left."""
+    """One table of the file; entries are removed as they are read, and none may remain."""
 
     def __init__(self, path: Path, where: str, content: dict[str, Any]) -> None:
         self.path, self.where, self.content = path, where, content

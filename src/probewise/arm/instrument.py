@@ -1,4 +1,4 @@
-"""The one interface that readings come through, simulated arm or LEGO NXT."""
+"""The interface of all instruments, and poses and readings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Instrument", "Pose", "Reading", "require_pose"]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the sensor is to stand, lab frame; `height_mm` above the surface, None: where the arm reads by default."""
+    """A pose of the sensor in the lab frame; `height_mm` above the surface, None: the arm's default."""
 
     x_mm: float
     y_mm: float
@@ -32,7 +32,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Reading:
-    """What the sensor returned, where and when: the pose that was asked for, or a better one that the arm knows of."""
+    """A sensor reading with time and pose: the commanded pose, or the true one if the arm measures it."""
 
     value: float
     pose: Pose
@@ -53,7 +53,7 @@ def require_pose(pose: object, more: str = "") -> None:
 
 
 class Instrument(Protocol):
-    """Move, lower, read. Leaving the `with` block brings it to rest, after an exception too."""
+    """An instrument that moves and reads a sensor; leaving the `with` block stops it, also after an exception."""
 
     def __enter__(self) -> Self: ...
 
@@ -62,27 +62,27 @@ class Instrument(Protocol):
     ) -> None: ...
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), the arm can take: shape (n_places,)."""
+        """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n_places, 2), where nothing turns it: shape (n_places,).
+        """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).
 
-        A sensor whose arm turns with its base has no choice: this is the orientation of every pose there.
+        For an arm whose sensor turns with its base, this is the only possible orientation.
         """
         ...
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Seconds to move to each place and read there, shape (n_places,)."""
+        """Return the seconds to move to each place and read there, shape (n_places,)."""
         ...
 
     def measure(self, pose: Pose) -> Reading:
-        """Move there, lower, read, raise.
+        """Move to a pose, lower, read, raise.
 
         Raises
         ------
         ReachError
-            If the arm cannot take the pose.
+            If the arm cannot reach the pose.
         LinkError
             If the instrument does not answer.
         """

@@ -1,4 +1,4 @@
-"""The LEGO arm as an instrument: over the field at travel height, down to read, up again (paper, test bed)."""
+"""The LEGO arm as an instrument: it moves at travel height, lowers to read, and rises again (paper, test bed)."""
 
 from __future__ import annotations
 
@@ -24,59 +24,59 @@ from probewise.errors import LinkError, ReachError
 __all__ = ["LegoArm", "in_lego_units"]
 
 BASE, SHOULDER, ELBOW = range(3)
-N_RISES = 3  # rough moves, of which the first one or two may stop short
-NEAR_TRAVEL_MM = 10.0  # a sensor not farther below the height of travel is raised
-CLEAR_MM = 1.0  # a way may lead so much lower than its end
-N_STEPS_DOWN = 5  # of the first lowering
-N_TRIED = 361  # angles looked at for the way up
+N_RISES = 3  # coarse moves, of which the first one or two may stop short
+NEAR_TRAVEL_MM = 10.0  # depth below travel height up to which the sensor counts as raised
+CLEAR_MM = 1.0  # depth below its end that a path may reach
+N_STEPS_DOWN = 5  # steps of the first lowering
+N_TRIED = 361  # angles tried for the path up
 SAME_TURN_RAD = math.radians(1.0)
-# A measurement takes about so long, on the emulator: joints move one after another, and each takes time to stop.
+# Duration of a measurement, measured on the emulator: joints move one after another, and each takes time to stop.
 COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.6
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where a joint is to go: the count of its motor, and the side from which its angle arrives (1 upwards)."""
+    """Target of a joint: the count of its motor, and the direction of approach (1 upwards)."""
 
     counts: int
     side: Side
 
 
 def in_lego_units(percent: float, geometry: Geometry) -> float:
-    """Convert what the light sensor reads, 0 to 100 in all its steps, to what recordings hold: LEGO units."""
+    """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, as in recordings."""
     if geometry.whole_percent and math.isfinite(percent):
-        percent = math.floor(percent)  # the brick cuts fractions off
+        percent = math.floor(percent)  # the brick truncates fractions
     return LegoScale(step=1.0 if geometry.whole_percent else None).convert(percent)
 
 
 class LegoArm:
-    """An arm of two links on a turning base, its sensor straight down: an Instrument.
+    """An instrument: an arm of two links on a turning base, with its sensor looking straight down.
 
     Parameters
     ----------
     machine
-        What moves it; entered and left with the arm.
+        The machine that moves it; entered and exited with the arm.
     geometry
-        The arm as built.
+        Dimensions of the arm.
     clock
-        What readings are stamped with.
+        Clock for the times of readings.
     start_s
-        What the stamps start at, to go on where an earlier run ended.
+        Time at the start, for resuming an earlier run.
 
     Attributes
     ----------
     turned_rad
-        How far the sensor has been turned on its mount, by hand, from where the geometry has it.
+        Angle by which the sensor has been turned by hand on its mount, relative to the geometry.
     first_down
-        Asked before each step of the first lowering, with the height that the sensor should have by then, and returns
-        when a person has seen that it does; None: the arm comes down in one go.
+        Function called before each step of the first lowering with the height that the sensor should have; it returns
+        when a person has confirmed it. None: the arm lowers in one move.
     """
 
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
         self._machine, self.geometry, self._clock = machine, geometry, clock
         self._zero_s = clock.monotonic() - start_s
         self._is_down = False
-        self._arrived: list[int] = [0, 0, 0]  # from which side each joint came to where it stands
+        self._arrived: list[int] = [0, 0, 0]  # the direction from which each joint reached its position
         self.turned_rad = 0.0
         self.first_down: Callable[[float], None] | None = None
 
@@ -87,7 +87,7 @@ class LegoArm:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Raise the sensor where it is down, then let the machine release the motors; after an exception only that."""
+        """Raise the sensor if it is down, then release the motors; after an exception, only release them."""
         try:
             if error is None and self._is_down:
                 self.rise()
@@ -98,25 +98,25 @@ class LegoArm:
 
     @property
     def angles_rad(self) -> FloatArray:
-        """Where the joints stand by their motors' counters, shape (3,)."""
+        """Joint angles by the motors' counters, shape (3,)."""
         joints, counts = self.geometry.joints, self._machine.limits.counts
         return np.array([joints[k].angle_at(counts[k], self._arrived[k]) for k in (BASE, SHOULDER, ELBOW)])
 
     @property
     def position_mm(self) -> FloatArray:
-        """Where the sensor's face is, lab frame and height, shape (3,)."""
+        """Place of the sensor's face in the lab frame, and its height, shape (3,)."""
         return np.asarray(self.geometry.position_mm(self.angles_rad[None, :])[0])
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n_places, 2): shape (n_places,)."""
+        """Return the sensor's orientation at each place, (n_places, 2): shape (n_places,)."""
         return wrapped(self.geometry.orientation_rad(places_mm) + self.turned_rad)
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), the arm can take: shape (n_places,)."""
+        """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         return self.geometry.holds(places_mm)
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Seconds, about, to move from `start` to each place and read there, shape (n_places,); NaN out of reach."""
+        """Estimate the seconds to move from `start` to each place and read, shape (n_places,); NaN out of reach."""
         there = self.geometry.angles_rad(places_mm, self.geometry.travel_height_mm)
         here = self.geometry.angles_rad(np.array([[start.x_mm, start.y_mm]]), self.geometry.travel_height_mm)
         counts = np.abs(there - here) * [abs(joint.counts_per_rad) for joint in self.geometry.joints]
@@ -124,17 +124,16 @@ class LegoArm:
         return np.asarray(moves.sum(axis=-1) + READ_S)
 
     def measure(self, pose: Pose) -> Reading:
-        """Move there, lower, read, raise.
+        """Move to a pose, lower, read, raise.
 
         Returns
         -------
-        The reading, with the pose that the motors' counters show (counts are whole, and an arm stops where it can),
-        and the covariates `height_mm`, `battery_mv`.
+        The reading, with the actual pose by the motors' counters, and the covariates `height_mm`, `battery_mv`.
 
         Raises
         ------
         ReachError
-            If the arm cannot take the pose; nothing moves.
+            If the arm cannot reach the pose; nothing moves.
         LinkError
             If the brick does not answer, or a motor does not move.
         """
@@ -152,23 +151,23 @@ class LegoArm:
                 f"{stands:.4f} at this place: this arm has no wrist, its sensor turns with the base",
             )
         self.go_down(pose.x_mm, pose.y_mm)
-        battery_mv = self._machine.battery_mv()  # before the light: from then on nothing is asked that could lose it
+        battery_mv = self._machine.battery_mv()  # first, so that no failure loses the reading
         value = self.read_here()
         time_s = self._clock.monotonic() - self._zero_s
         covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
         there = self._pose()
-        # The reading is here. A line that dies now shows at the next move, which starts with raising.
+        # The reading is complete. A connection lost now is noticed at the next move, which starts with raising.
         with contextlib.suppress(LinkError):
             self.rise()
         return Reading(value=value, pose=there, time_s=time_s, covariates=covariates)
 
     def go_over(self, x_mm: float, y_mm: float) -> None:
-        """Bring the sensor over a place, at about the height of travel.
+        """Move the sensor over a place, at about travel height.
 
         Raises
         ------
         ReachError
-            If the arm cannot take the place.
+            If the place is out of reach.
         """
         goals = self._goals(x_mm, y_mm, self.geometry.travel_height_mm)
         self.rise()
@@ -177,14 +176,14 @@ class LegoArm:
             self._near(joint, goals[joint].counts)
 
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
-        """Bring the sensor over a place and down to a height, by default that of reading.
+        """Move the sensor over a place and lower it, by default to reading height.
 
-        Until `first_down` has let it down once, it comes down in steps.
+        The first lowering is in steps, each confirmed by `first_down`.
 
         Raises
         ------
         ReachError
-            If the arm cannot take the place, or not at that height.
+            If the place is out of reach at that height.
         """
         read_mm, travel_mm = self.geometry.read_height_mm, self.geometry.travel_height_mm
         if self.first_down is not None and height_mm is None:
@@ -203,7 +202,7 @@ class LegoArm:
             self._arrive(joint, goals[joint])
 
     def rise(self) -> None:
-        """Raise the sensor to about the height of travel where it is lower, by the link that turns least for it.
+        """Raise the sensor to about travel height, if it is lower, by the link that needs the smaller turn.
 
         Raises
         ------
@@ -222,9 +221,9 @@ class LegoArm:
         self._is_down = False
 
     def home(self) -> None:
-        """Bring all joints to where their counters are 0; those that have a stop find it first, and count from it.
+        """Move all joints home (counter 0); joints with a stop find it first to set their counters.
 
-        The links go to their stops before the base does, so that the sensor is up when that turns.
+        The links find their stops before the base, so that the sensor is up when the base turns.
 
         Raises
         ------
@@ -247,7 +246,7 @@ class LegoArm:
             self._machine.reset(stopped)
 
     def set_home(self) -> None:
-        """Take where the arm stands for home: a person has brought it there."""
+        """Define the current position, set by hand, as home."""
         self._machine.reset((BASE, SHOULDER, ELBOW))
 
     def release(self) -> None:
@@ -255,7 +254,7 @@ class LegoArm:
         self._machine.release()
 
     def read_here(self) -> float:
-        """Read the sensor where it stands, in LEGO units: what recordings hold."""
+        """Read the sensor at its current place, in LEGO units, as in recordings."""
         return in_lego_units(self._machine.read_percent(), self.geometry)
 
     def brightness(self) -> float:
@@ -267,17 +266,17 @@ class LegoArm:
         return self._machine.battery_mv()
 
     def keep_awake(self) -> None:
-        """Keep the brick from falling asleep: to be called now and then while nothing else happens for minutes."""
+        """Keep the brick from falling asleep; call it now and then during minutes of inactivity."""
         self._machine.keep_awake()
 
     def turn(self, joint: int, by_rad: float) -> None:
-        """Turn one joint by an angle from where it stands, behind the guard."""
+        """Turn one joint by an angle, subject to the limits."""
         angles = self.angles_rad
         angles[joint] += by_rad
         self._arrive(joint, self._goals_at(angles)[joint])
 
     def _pose(self) -> Pose:
-        """Where the sensor is by the motors' counters."""
+        """Return the sensor's pose by the motors' counters."""
         angles = self.angles_rad
         x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0]
         standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
@@ -296,19 +295,19 @@ class LegoArm:
         ]
 
     def _sides(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
-        """Choose the side from which each joint arrives at these angles, (3,).
+        """Choose the direction from which each joint approaches these angles, (3,).
 
-        The links come down on a place, so that nothing ever comes up from below it, and their weight and their
-        motors lay the play on the same flank; the base could come from either side.
+        The links approach a place from above, so that their weight and their motors take up the play in the same
+        direction; the base could approach from either side.
         """
         _, shoulder, elbow = self.geometry.rise_mm_rad(angles_rad[None, :])[0]
         return 1, (-1 if shoulder > 0 else 1), (-1 if elbow > 0 else 1)
 
     def _order(self, goals: Sequence[Goal]) -> tuple[int, int]:
-        """Order the two links so that the sensor stays highest while one moves after the other.
+        """Choose the order of the two links in which the sensor stays highest.
 
-        While the lower link swings through the vertical the sensor is far down. Where neither order leaves
-        it room, the upper link goes up first and comes down last.
+        The sensor is far down while the lower link swings through the vertical. If neither order leaves enough room,
+        the upper link goes up first and comes down last.
         """
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
@@ -320,7 +319,7 @@ class LegoArm:
         return ELBOW, SHOULDER
 
     def _heights_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
-        """Heights of the sensor along a way, from where the motors stand to one count after another."""
+        """Return the heights of the sensor along a path from the current counts through successive counts."""
         counts = list(self._machine.limits.counts)
         heights = []
         for joint, goal in way:
@@ -329,7 +328,7 @@ class LegoArm:
         return np.concatenate(heights)
 
     def _way_up(self, joint: int) -> tuple[int, int, int] | None:
-        """Find how one link alone can raise the sensor: counts to turn, joint, count to turn to."""
+        """Find how one link alone can raise the sensor: counts to turn, joint, target count."""
         mechanics, stand = self.geometry.joints[joint], self.angles_rad
         up = mechanics.low_rad if self._sides(stand)[joint] > 0 else mechanics.high_rad
         angles = np.tile(stand, (N_TRIED, 1))
@@ -339,7 +338,7 @@ class LegoArm:
             return None
         here = self._machine.limits.counts[joint]
         way = mechanics.counts_at(float(angles[high_enough[0], joint]), self._arrived[joint]) - here
-        # A rough move shorter than a motor runs on would not be made.
+        # A coarse move shorter than the motor's overrun would not be made.
         far = int(math.copysign(max(abs(way), ROOM_COUNTS), way))
         end = sorted(mechanics.counts_at(angle) - here for angle in (mechanics.low_rad, mechanics.high_rad))
         return abs(way), joint, here + min(max(far, end[0]), end[1])

@@ -1,4 +1,4 @@
-"""The guard: no motor goes where a joint or the sensor must not be, whoever asks."""
+"""Soft limits: refuse every motor command that would take a joint or the sensor out of its allowed range."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from probewise.errors import ReachError
 
 __all__ = ["SoftLimits"]
 
-N_STOPS = 33  # places looked at along a move
+N_STOPS = 33  # points checked along a move
 
 
 class SoftLimits:
-    """Know where the motors stand, and refuse every move that leaves what the geometry allows.
+    """Tracks the motors' positions, and refuses moves that the geometry does not allow.
 
     Parameters
     ----------
     geometry
-        The joints' limits, and how low the sensor may come.
+        Limits of the joints, and the lowest height of the sensor.
     """
 
     def __init__(self, geometry: Geometry) -> None:
@@ -30,26 +30,26 @@ class SoftLimits:
         self._counts = [0, 0, 0]
 
     def stands(self, joint: int, counts: int) -> None:
-        """Take note of where a joint's motor stands."""
+        """Record the count of a joint's motor."""
         self._counts[joint] = counts
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Where the motors stand."""
+        """Counts of the motors."""
         base, shoulder, elbow = self._counts
         return base, shoulder, elbow
 
     def heights_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
-        """Tell how high the sensor is while one joint moves from where all motors stand: shape (n_stops,).
+        """Return the sensor's height along a move of one joint: shape (n_stops,).
 
         Parameters
         ----------
         counts
-            Where the motors stand.
+            Counts of all motors at the start.
         joint, to
-            The joint that moves, and to which count.
+            The joint that moves, and its target count.
         here
-            Where it starts, if not at its count.
+            Starting count of that joint, if different.
         """
         joints = self._geometry.joints
         way = np.empty((N_STOPS, 3))
@@ -59,9 +59,9 @@ class SoftLimits:
         return np.asarray(self._geometry.position_mm(way)[:, 2])
 
     def check(self, joint: int, here: int, to: int) -> None:
-        """Refuse a move of one joint, all others standing still, that ends or passes where it must not.
+        """Refuse a move of one joint, the others at rest, that leaves the allowed range.
 
-        A joint that is outside already may move back.
+        A joint that is already outside may move back.
 
         Raises
         ------

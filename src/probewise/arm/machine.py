@@ -1,4 +1,4 @@
-"""What moves the arm's joints and reads its sensor: a seam, and a rehearsal that only says what it would do."""
+"""The interface to the arm's motors and sensor, and a dry run that only prints the moves."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Machine(Protocol):
     ) -> None: ...
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Turn a joint's motor to a count, arriving in direction `side`, and hold it."""
+        """Turn a joint's motor to a count, approaching in direction `side`, and hold it."""
         ...
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Turn a joint's motor to about a count, and hold it."""
+        """Turn a joint's motor approximately to a count, and hold it."""
         ...
 
     def release(self) -> None:
@@ -38,15 +38,15 @@ class Machine(Protocol):
         ...
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint gently in direction `side` until it meets its stop, and take its counts from there."""
+        """Turn a joint gently in direction `side` to its stop, and set its counter there."""
         ...
 
     def reset(self, joints: Sequence[int]) -> None:
-        """Take where these joints' motors stand for 0."""
+        """Set the counters of these joints' motors to 0."""
         ...
 
     def read_percent(self) -> float:
-        """Read the light sensor, LED on: 0 to 100 in all steps that it has."""
+        """Read the light sensor with the LED on: 0 to 100, with fractions."""
         ...
 
     def battery_mv(self) -> float:
@@ -54,19 +54,19 @@ class Machine(Protocol):
         ...
 
     def keep_awake(self) -> None:
-        """Be called now and then while nothing else happens for minutes."""
+        """Keep the machine awake; to be called now and then during minutes of inactivity."""
         ...
 
 
 class Rehearsal:
-    """A machine of words: says every move that it is asked for, and reads nothing.
+    """A dry run: prints every commanded move, and reads nothing.
 
     Parameters
     ----------
     geometry
-        The arm's.
+        Geometry of the arm.
     say
-        Gets a line a move.
+        Function called with one line per move.
     """
 
     def __init__(self, geometry: Geometry, say: Callable[[str], None]) -> None:
@@ -82,39 +82,39 @@ class Rehearsal:
         self.release()
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Say it."""
+        """Print the command."""
         self._move(joint, goal, "up" if side > 0 else "down")
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Say it."""
+        """Print the command."""
         self._move(joint, goal, "roughly")
 
     def release(self) -> None:
-        """Say it."""
+        """Print the command."""
         self._say("release all motors")
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Say it."""
+        """Print the command."""
         self.limits.stands(joint, self._geometry.joints[joint].stop_counts)
         self._say(f"{JOINTS[joint]:<8} {'up' if side > 0 else 'down'} to its stop")
 
     def reset(self, joints: Sequence[int]) -> None:
-        """Take where these stand for 0."""
+        """Print that these counters are set to 0."""
         for joint in joints:
             self.limits.stands(joint, 0)
         self._say(f"set to 0 the counters of {', '.join(JOINTS[joint] for joint in joints)}")
 
     def read_percent(self) -> float:
-        """Say it; nothing is read."""
+        """Print the command; nothing is read."""
         self._say("read the light sensor")
         return math.nan
 
     def battery_mv(self) -> float:
-        """No battery."""
+        """Return NaN: there is no battery."""
         return math.nan
 
     def keep_awake(self) -> None:
-        """Nobody falls asleep."""
+        """Do nothing."""
 
     def _move(self, joint: int, goal: int, how: str) -> None:
         here = self.limits.counts[joint]

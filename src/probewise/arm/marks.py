@@ -1,4 +1,4 @@
-"""Where on the field the marks lie that an arm's geometry is fitted to."""
+"""Places of the marks for calibrating an arm's geometry."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from probewise.errors import ReachError
 __all__ = ["LEAST_MARKS", "marks_of"]
 
 LEAST_MARKS = 5
-"""So many marks, with place and height each, determine the nine numbers of the geometry."""
+"""Least number of marks, with place and height, that determine the nine parameters of the geometry."""
 
 _COLUMNS, _ROWS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.12, 0.45, 0.75)
 _STEP_MM = 10.0
 
 
 def marks_of(geometry: Geometry) -> FloatArray:
-    """Choose places spread over the field and within the arm's reach, in whole steps of 10 mm.
+    """Choose places spread over the arm's reach on the field, in whole steps of 10 mm.
 
     Returns
     -------
-    Shape (n_marks, 2), nine or fewer, in the order of taking.
+    Shape (n_marks, 2), at most nine, in the order of use.
 
     Raises
     ------
@@ -30,7 +30,7 @@ def marks_of(geometry: Geometry) -> FloatArray:
         If fewer than five are within reach.
     """
     width, height = geometry.field_mm
-    # Every second place of a grid, as on a chessboard: no two rows show the same angles of the base.
+    # Every second place of a grid, as on a chessboard, so that no two rows have the same base angles.
     grid = [
         (x * width, y * height)
         for row, y in enumerate(_ROWS)

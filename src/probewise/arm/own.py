@@ -1,4 +1,4 @@
-"""A person's own instrument: whatever has a `measure(pose)`, made what the loop asks for."""
+"""A user's own instrument: adapts any object with `measure(pose)` to the Instrument interface."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ __all__ = ["Measures", "OwnInstrument", "instrument_of", "require_measures"]
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
-_TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # columns of a recording that no covariate may be called
+_TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # names of a recording's columns, not allowed for covariates
 _LONGEST = 200
 
 
 class Measures(Protocol):
-    """The least that an instrument of one's own has; see `instrument_of` for what else it may have."""
+    """The minimal interface of a user's own instrument; see `instrument_of` for optional methods."""
 
     def measure(self, pose: Pose, /) -> Any:
-        """Go there and read: a number, or a dict with "value" and what else is known."""
+        """Move to a pose and read; return a number, or a dict with "value" and further numbers."""
         ...
 
 
 class OwnInstrument:
-    """An Instrument made of a person's own object.
+    """An Instrument that wraps a user's own object.
 
     Parameters
     ----------
     connect
-        Gives the object; called once, when the instrument is entered.
+        Function that returns the object; called once, when the instrument is entered.
     source
-        The file that it comes from. Errors inside are then told as a `LinkError` in one line, with the line of the
-        file; without, they pass through as they are.
+        The file that it comes from. Errors inside become a one-line `LinkError` with the file's line number; without
+        `source`, they pass through.
     start_s
-        What the clock starts at, to go on where an earlier run ended.
+        Time at the start, for resuming an earlier run.
     clock
-        What stamps readings that bring no time of their own.
+        Clock for readings without a time.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class OwnInstrument:
 
     @classmethod
     def from_file(cls, path: str | Path, *, start_s: float = 0.0, clock: Clock = time) -> Self:
-        """Read a person's file, whose function `connect()` returns the instrument; it is called on entering.
+        """Load a user's file, whose function `connect()` returns the instrument; it is called on entering.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class OwnInstrument:
         return cls(connect, source=str(path), start_s=start_s, clock=clock)
 
     def __enter__(self) -> Self:
-        """Connect; what cannot measure is closed again and refused."""
+        """Connect; an object without `measure` is closed and refused."""
         with self._telling("connect"):
             own = self._connect() if self._own is None else self._own
             if hasattr(own, "__enter__") and hasattr(own, "__exit__"):
@@ -103,7 +103,7 @@ class OwnInstrument:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave or close what was connected, once; after an exception an error in doing so is only warned of."""
+        """Exit or close the connected object, once; if an exception is pending, errors here become warnings."""
         own, self._own = self._own, None
         leave = getattr(own, "__exit__", None)
         close = getattr(own, "close", None)
@@ -120,20 +120,20 @@ class OwnInstrument:
 
     @property
     def turns(self) -> bool:
-        """Whether it turns its sensor to `pose.orientation_rad` itself: it says so by `turns = True`."""
+        """Whether it turns its sensor to `pose.orientation_rad`, as declared by `turns = True`."""
         return bool(getattr(self._own, "turns", False))
 
     @property
     def lifts(self) -> bool:
-        """Whether it reads at `pose.height_mm` where that is given: it says so by `lifts = True`."""
+        """Whether it reads at a given `pose.height_mm`, as declared by `lifts = True`."""
         return bool(getattr(self._own, "lifts", False))
 
     def sentence(self) -> str:
-        """Say where a place may be."""
+        """Describe the allowed places in words."""
         return f"places that reachable of {self.source or 'the instrument'} allows"
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), the instrument can take, all by default: shape (n_places,)."""
+        """Return which places, shape (n_places, 2), are reachable, by default all: shape (n_places,)."""
         own = getattr(self._own, "reachable", None)
         if own is None:
             return np.ones(len(places_mm), dtype=np.bool_)
@@ -144,18 +144,18 @@ class OwnInstrument:
             return held.astype(np.bool_)
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
-        """Say the same by the name that every arm's bounds have."""
+        """Return `reachable`; the name is part of the Bounds interface."""
         return self.reachable(places_mm)
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n_places, 2), 0 by default: shape (n_places,)."""
+        """Return the sensor's orientation at each place, (n_places, 2), by default 0: shape (n_places,)."""
         own = getattr(self._own, "orientation_rad", 0.0)
         with self._telling("orientation_rad"):
             angles = own(places_mm) if callable(own) else own
             return _finite("orientation_rad", angles, len(places_mm), "a finite number of radians")
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Seconds to move from `start` to each place and read there, by distance by default: shape (n_places,)."""
+        """Return the seconds to move from `start` to each place and read; default: from distance: shape (n_places,)."""
         own = getattr(self._own, "travel_s", None)
         if own is None:
             away = np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm)
@@ -169,12 +169,12 @@ class OwnInstrument:
             return seconds
 
     def measure(self, pose: Pose) -> Reading:
-        """Measure, and make a Reading of what comes back: stamped by the clock, where it was asked for, unless it says.
+        """Measure and return a Reading; by default with the clock's time and the commanded pose.
 
         Raises
         ------
         ParameterError, LinkError
-            If it is nothing that a reading could be made of: LinkError for an instrument of a file.
+            If the result is not a valid reading; LinkError for an instrument from a file.
         """
         with self._telling("measure"):
             return self._reading(self._own.measure(pose), pose)
@@ -197,9 +197,9 @@ class OwnInstrument:
 
     @contextlib.contextmanager
     def _telling(self, what: str) -> Iterator[None]:
-        """Tell in one line, with the line of the person's file, of what goes wrong inside `what`.
+        """Convert errors inside `what` to a one-line error with the line number of the user's file.
 
-        What a file prints goes to standard error, where it does not mix with results.
+        Output that the file prints goes to standard error, separate from results.
         """
         aside = contextlib.redirect_stdout(sys.stderr) if self.source else contextlib.nullcontext()
         try:
@@ -213,7 +213,7 @@ class OwnInstrument:
     def _told(self, what: str, error: BaseException) -> str:
         frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
         where = f"{self.source}, line {frames[-1]}" if frames else self.source
-        if isinstance(error, ParameterError | ShapeError) and not frames:  # what came back, not what was raised
+        if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
             return f"{where}: {error}"
         return f"{where}: {what} raises {type(error).__name__}: {_briefly(error)}".rstrip(": ")
 
@@ -221,32 +221,32 @@ class OwnInstrument:
 def instrument_of(
     own: Instrument | Measures, *, start_s: float = 0.0, name: str = "instrument"
 ) -> OwnInstrument | LegoArm | SimulatedArm:
-    """Make an Instrument of any object with a `measure(pose)`; those of this package are handed back as they are.
+    """Adapt any object with `measure(pose)` to an Instrument; instruments of this package are returned unchanged.
 
     Parameters
     ----------
     own
-        Its `measure(pose)` goes to `pose.x_mm`, `pose.y_mm`, turned to `pose.orientation_rad`, `pose.height_mm` up
-        where that is not None, and returns a number; or a dict with "value" and what is known of the reading:
-        `x_mm`, `y_mm`, `orientation_rad` where it was really taken, `time_s`, and any other numbers, which are kept
-        as covariates. It may also have `reachable(places_mm)`, True or False for each place (n_places, 2);
-        `travel_s(start, places_mm)`, seconds from a pose to each; `orientation_rad(places_mm)`, how the sensor stands
-        at each; one value stands for all places. `close()`, or `__exit__`, is called at the end, whatever ends it.
+        Its `measure(pose)` moves to `pose.x_mm`, `pose.y_mm`, orientation `pose.orientation_rad` and, if not None,
+        height `pose.height_mm`, and returns a number; or a dict with "value" and optionally the true pose `x_mm`,
+        `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates. It may also have
+        `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`, seconds from a
+        pose to each place; `orientation_rad(places_mm)`, the sensor's orientation at each place; a single value applies
+        to all places. `close()`, or `__exit__`, is always called at the end.
     start_s
-        What the clock starts at, to go on where an earlier run ended.
+        Time at the start, for resuming an earlier run.
     name
-        What messages call it.
+        Name for messages.
 
     Raises
     ------
     ParameterError
-        If it cannot measure.
+        If it has no `measure`.
     """
     if isinstance(own, OwnInstrument | LegoArm | SimulatedArm):
         return own
     require_measures(name, own)
     made = OwnInstrument(lambda: own, start_s=start_s)
-    made._own = own  # it may have been entered already: what is asked of it before `with` is answered too
+    made._own = own  # it may have been entered already, so its methods work before `with` too
     return made
 
 
@@ -258,7 +258,7 @@ def require_measures(name: str, own: object) -> None:
 
 
 def _value(name: str, found: object) -> float:
-    """Take a reading: a number, also one of NumPy's or an array of none but it."""
+    """Return a reading as a float; NumPy scalars and arrays of one element are accepted."""
     number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
     if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
         raise ParameterError(name, found, _A_READING)
@@ -266,7 +266,7 @@ def _value(name: str, found: object) -> float:
 
 
 def _known(name: object, number: object) -> float:
-    """Take a number beside a reading; NaN where it is missing."""
+    """Return a further number of a reading as a float; NaN if missing."""
     if not isinstance(name, str) or not name.isprintable() or name != name.strip() or name in ("", *_TAKEN):
         taken = "no name that a recording has a column for" if name in _TAKEN else "a printable text"
         raise ParameterError("a name in what measure returned", name, f"{taken}; of an angle: orientation_rad")
@@ -277,7 +277,7 @@ def _known(name: object, number: object) -> float:
 
 
 def _per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
-    """Take one value for each place, or one for all, as an array (n_places,)."""
+    """Return one value per place, or one for all, as an array (n_places,)."""
     array = np.asarray(found)
     if array.ndim == 0:
         array = np.full(n_places, array)

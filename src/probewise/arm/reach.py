@@ -1,4 +1,4 @@
-"""Where an arm that turns about a vertical axis and stretches can put its sensor."""
+"""The reach of an arm that turns about a vertical axis and extends."""
 
 from __future__ import annotations
 
@@ -18,56 +18,56 @@ FIELD_MM = (1048.0, 520.0)
 
 
 class Bounds(Protocol):
-    """Where an arm can put its sensor."""
+    """The set of reachable places of an arm."""
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), can be taken: shape (n_places,)."""
+        """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         ...
 
     def sentence(self) -> str:
-        """Say where a place may be."""
+        """Describe the allowed places in words."""
         ...
 
 
 class Workspace(Protocol):
-    """Where an arm can put its sensor, and how the sensor then stands: a `Reach`, or the `Geometry` of a real arm."""
+    """Reachable places of an arm, and the sensor's orientation there: a `Reach`, or the `Geometry` of a real arm."""
 
     @property
     def rest_mm(self) -> tuple[float, float]:
-        """Where the sensor rests."""
+        """Rest position of the sensor."""
         ...
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), can be taken: shape (n_places,)."""
+        """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n_places, 2), where nothing turns it: shape (n_places,)."""
+        """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,)."""
         ...
 
     def sentence(self) -> str:
-        """Say where a place may be."""
+        """Describe the allowed places in words."""
         ...
 
 
 def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
-    """Refuse places of which one is out of reach, before anything moves.
+    """Raise ReachError if any place is out of reach, before anything moves.
 
     Parameters
     ----------
     workspace
-        The arm's.
+        Reach of the arm.
     places_mm
         Shape (n_places, 2).
     of
-        What a place belongs to, such as "reading", and what the places are together, such as "of the plan".
+        Words for messages: the owner of a place, such as "reading", and of all places, such as "of the plan".
     way_out
-        What to do, where there is more to do than to choose other places.
+        Advice besides choosing other places, if there is any.
 
     Raises
     ------
     ReachError
-        If a place is out of reach: it names the first, counts the others, and says what is in reach.
+        If a place is out of reach; the message names the first, counts the others, and describes the reach.
     """
     held = workspace.holds(places_mm)
     if held.all():
@@ -85,11 +85,11 @@ def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out:
 
 @dataclass(frozen=True)
 class Reach:
-    """A ring about the arm's axis, cut by the field.
+    """A ring about the arm's axis, intersected with the field.
 
     The axis stands beyond the middle of the field's upper long side. The default is the reach of the LEGO arm whose
-    geometry ships with the package. It leaves out 2 % of the field: the two corners farthest from the axis, at the
-    bottom of the paper's entropy map, and the places nearest to it, where the arm cannot fold.
+    geometry ships with the package. It excludes 2 % of the field: the two corners farthest from the axis, at the bottom
+    of the paper's entropy map, and the places nearest to the axis, where the arm cannot fold.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Reach:
     axis_beyond_mm
         Distance of the axis from the field.
     nearest_mm, farthest_mm
-        How near to the axis and how far from it the sensor can stand.
+        Smallest and largest distance of the sensor from the axis.
 
     Raises
     ------
@@ -134,35 +134,35 @@ class Reach:
 
     @classmethod
     def everywhere(cls, field_mm: tuple[float, float] = FIELD_MM) -> Self:
-        """Make an arm long enough for the whole field."""
+        """Return the reach of an arm long enough for the whole field."""
         width, height = field_mm
         beyond = 60.0
         return cls(field_mm, beyond, 0.0, math.hypot(width / 2, height + beyond) + 1.0)
 
     @property
     def axis_mm(self) -> tuple[float, float]:
-        """Where the axis stands, lab frame."""
+        """Place of the axis, lab frame."""
         return self.field_mm[0] / 2, self.field_mm[1] + self.axis_beyond_mm
 
     @property
     def rest_mm(self) -> tuple[float, float]:
-        """Below the axis, as near to it as the arm folds (or, with the axis far off, at the field's side)."""
+        """Rest position: as near below the axis as the arm folds (with a distant axis, at the edge of the field)."""
         x_mm, y_mm = self.axis_mm
         return x_mm, max(0.0, min(self.field_mm[1], y_mm - self.nearest_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n_places, 2): never turned, shape (n_places,)."""
+        """Return the sensor's orientation at each place, (n_places, 2): always 0, shape (n_places,)."""
         return np.zeros(len(places_mm))
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), are within reach and on the field: shape (n_places,)."""
+        """Return which places, shape (n_places, 2), are within reach and on the field: shape (n_places,)."""
         x_mm, y_mm = places_mm[:, 0], places_mm[:, 1]
         away = np.hypot(x_mm - self.axis_mm[0], y_mm - self.axis_mm[1])
         on_field = (x_mm >= 0) & (x_mm <= self.field_mm[0]) & (y_mm >= 0) & (y_mm <= self.field_mm[1])
         return on_field & (away >= self.nearest_mm) & (away <= self.farthest_mm)
 
     def sentence(self) -> str:
-        """Say where a place may be."""
+        """Describe the allowed places in words."""
         (width, height), (x_mm, y_mm) = self.field_mm, self.axis_mm
         return (
             f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {self.nearest_mm:g} to "

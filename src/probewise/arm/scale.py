@@ -1,4 +1,4 @@
-"""The scale that both arms read in: LEGO units, whole numbers from 1 to 100 (paper, "Robotic Arm Test Bed")."""
+"""The scale of both arms' readings: LEGO units, whole numbers from 1 to 100 (paper, "Robotic Arm Test Bed")."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class LegoScale:
             raise ParameterError("step", self.step, "greater than 0, or None")
 
     def convert(self, value: float) -> float:
-        """Round to a step, then keep within the scale; NaN, a reading that did not come, stays NaN."""
+        """Round to a step, then clip to the scale; NaN, a missing reading, stays NaN."""
         if math.isnan(value):
             return value
         value = min(max(value, self.low), self.high)

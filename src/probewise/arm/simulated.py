@@ -1,4 +1,4 @@
-"""An arm made of arithmetic, behind the same interface as the real one."""
+"""A simulated arm with the interface of the real one."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ __all__ = ["Light", "SimulatedArm", "Speed"]
 LEGO = LegoScale()
 
 Light: TypeAlias = Callable[[Pose, float, float], float]
-"""What the sensor would read at a pose, at a time in s, at a height in mm."""
+"""Function of pose, time (s) and height (mm); returns the sensor's reading."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """How long things take: moving at `move_mm_s`, then settling, lowering and reading, `read_s` together."""
+    """Speed of an arm: it moves at `move_mm_s`; settling, lowering and reading take `read_s` together."""
 
     move_mm_s: float = 100.0
     read_s: float = 1.2
@@ -40,24 +40,22 @@ class Speed:
 
 
 class SimulatedArm:
-    """Move, lower to 14 mm, read, raise: an Instrument whose clock is advanced, never slept.
+    """An Instrument that simulates moving, lowering to 14 mm, reading and raising, with a simulated clock.
 
     Parameters
     ----------
     light
-        What the sensor would read at a pose, a time and a height, before the brick's conversion.
+        Function of pose, time and height that returns the reading before the brick's conversion.
     reach
-        Where the sensor can be put, and how it then stands: a `Reach`, whose sensor never turns by itself, or
-        the `Geometry` of a real arm.
+        Reachable places and orientations: a `Reach`, whose sensor does not turn, or the `Geometry` of a real arm.
     speed
-        How long moving and reading take.
+        Speed of moving and reading.
     scale
         The conversion to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
     height_mm
-        Height of the sensor above the surface when it reads and the pose does not say.
+        Height of the sensor above the surface when reading, unless the pose gives one.
     last
-        The reading that an earlier run took last: the arm stands where that was taken, and its clock goes on from
-        there. None: it rests, and its clock shows 0.
+        Last reading of an earlier run: the arm starts at its pose and time. None: it starts at rest, at time 0.
     """
 
     def __init__(
@@ -87,21 +85,21 @@ class SimulatedArm:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Bring the arm back to where it rests."""
+        """Return the arm to its rest position."""
         self._pose = self._home
 
     @property
     def pose(self) -> Pose:
-        """Where the sensor stands."""
+        """Current pose of the sensor."""
         return self._pose
 
     @property
     def time_s(self) -> float:
-        """What the arm's clock shows."""
+        """Time of the simulated clock."""
         return self._time_s
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
-        """Tell which places, shape (n_places, 2), the arm can take: shape (n_places,).
+        """Return which places, shape (n_places, 2), are reachable: shape (n_places,).
 
         Raises
         ------
@@ -111,7 +109,7 @@ class SimulatedArm:
         return self.reach.holds(_pairs(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Tell how the sensor stands at each place, (n_places, 2), where nothing turns it: shape (n_places,).
+        """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).
 
         Raises
         ------
@@ -121,7 +119,7 @@ class SimulatedArm:
         return self.reach.orientation_rad(_pairs(places_mm))
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Seconds to move from `start` to each place (n_places, 2) and read there, shape (n_places,).
+        """Return the seconds to move from `start` to each place (n_places, 2) and read there, shape (n_places,).
 
         Raises
         ------
@@ -133,12 +131,12 @@ class SimulatedArm:
         return np.asarray(away / self.speed.move_mm_s + self.speed.read_s, dtype=np.float64)
 
     def measure(self, pose: Pose) -> Reading:
-        """Move there, lower, read, raise; the reading is stamped with the time at which it was complete.
+        """Move to a pose, lower, read, raise; the reading's time is that of its completion.
 
         Raises
         ------
         ReachError
-            If the arm cannot take the pose; it stays where it is.
+            If the arm cannot reach the pose; it does not move.
         """
         require_pose(pose)
         place = np.array([[pose.x_mm, pose.y_mm]])

@@ -1,4 +1,4 @@
-"""Marks that a sensor was brought to, on file: a row each, how far the joints had turned from home and where it was."""
+"""File format of the marks for calibrating the geometry: one row each, joint angles from home and place."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LARGEST = 1e4
 
 @dataclass(frozen=True)
 class Touched:
-    """One mark: how far each joint had turned from home, where the sensor's face was; a height of NaN: not taken."""
+    """One mark: joint angles from home, and place of the sensor's face; a height of NaN: not measured."""
 
     turned_rad: tuple[float, float, float]
     place_mm: tuple[float, float, float]
@@ -34,7 +34,7 @@ def read_touched(path: Path) -> tuple[FloatArray, FloatArray]:
     Raises
     ------
     FileError
-        If a column is missing or a cell is no number; `height_mm` alone may be empty.
+        If a column is missing or a cell is not a number; only `height_mm` may be empty.
     """
     table = read_table(path)
     table.require(*_TURNED, *_PLACE)
@@ -44,7 +44,7 @@ def read_touched(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def write_touched(marks: Sequence[Touched], path: Path) -> None:
-    """Write marks, all at once or not at all."""
+    """Write marks atomically."""
     turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
     place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)
     columns = dict(zip((*_TURNED, *_PLACE), np.concatenate([turned, place], axis=1).T.tolist(), strict=True))

@@ -342,7 +342,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
     if not chosen.is_lego:
         raise ParameterError("--arm", arguments.arm, "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted")
     if kept.exists() and not arguments.resume:
-        raise FileError(kept, "a file stands there", "--resume to go on with it, or another --marks")
+        raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
     taken: list[Touched] = []
     if kept.exists():
         rows = zip(*(array.tolist() for array in read_touched(kept)), strict=True)
@@ -557,7 +557,7 @@ def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Rea
         return []
     if not resume:
         if out.exists():
-            raise FileError(out, "a file stands there", "--resume to go on with it, or another --out")
+            raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
         return []
     before = read_recording(out)
     rows, first = before.plan, plan.take(np.arange(min(len(before), len(plan))))

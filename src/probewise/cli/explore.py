@@ -257,7 +257,7 @@ def _before(journal: Path, *, resume: bool) -> Journal | None:
     if not journal.exists():
         return None
     if not resume:
-        raise FileError(journal, "a run's journal stands there", "--resume to go on with it, or another --out")
+        raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
     return read_journal(journal)
 
 

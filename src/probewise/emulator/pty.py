@@ -35,7 +35,7 @@ class Terminal:
 
     def __init__(self, link: Path | None = None) -> None:
         if link is not None and link.exists() and not link.is_symlink():
-            raise FileError(link, "something stands there", "a new name, or a symbolic link to replace")
+            raise FileError(link, "the path exists already", "a new name, or a symbolic link to replace")
         self._link = link
         self._open()
 

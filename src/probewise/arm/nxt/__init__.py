@@ -1,7 +1,7 @@
 """The LEGO NXT brick over Bluetooth: telegrams, their line, motors and light sensor (paper, "Robotic Arm Test Bed").
 
-Telegrams are pure values and bytes; the link asks and hears; motor, light sensor and brick say
-what a person means. Each can be used and tested without those above it.
+Telegrams are pure values and bytes; the link sends and receives them; motor, light sensor and brick are the high-level
+interface. Each layer can be used and tested without those above it.
 """
 
 from probewise.arm.nxt.brick import Brick

@@ -1,4 +1,4 @@
-"""The brick as a person sees it: motors, a light sensor, a battery, and nothing left running or lit at the end."""
+"""The brick: motors, light sensor and battery, with all motors stopped and LEDs off at the end."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ from probewise.errors import LinkError, LowBatteryWarning
 __all__ = ["LOW_MV", "Brick"]
 
 LOW_MV = 6000
-"""Below this six cells are nearly empty: motors slow down, and the brick soon switches itself off."""
+"""Voltage below which six cells are nearly empty: motors slow down, and the brick soon switches itself off."""
 
-STEP_MV = 50  # a battery's voltage changes by less from one question to the next
+STEP_MV = 50  # largest plausible change of the battery's voltage between two questions
 N_ASKED = 6
 NO_PROGRAM = 0xEC
 
 
 class Brick:
-    """A LEGO NXT; use it in a `with` block, whose end stops and releases all motors.
+    """A LEGO NXT; use it in a `with` block, which stops and releases all motors at its end.
 
     Parameters
     ----------
     link
-        The line to it.
+        The connection to it.
     clock
-        What is waited with.
+        Clock used for waiting.
     """
 
     def __init__(self, link: Link, *, clock: Clock = time) -> None:
@@ -59,7 +59,7 @@ class Brick:
 
     @classmethod
     def open(cls, path: str) -> Self:
-        """Open the line at a serial port: /dev/rfcomm0, COM5, a pseudo-terminal.
+        """Open the connection at a serial port: /dev/rfcomm0, COM5, a pseudo-terminal.
 
         Raises
         ------
@@ -74,12 +74,12 @@ class Brick:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop and release the motors, switch the LEDs off, close the line; a signal waits until that is done.
+        """Stop and release the motors, switch the LEDs off and close the connection; signals are deferred until then.
 
         Raises
         ------
         LinkError
-            If that could not be made sure of, and nothing else went wrong before.
+            If this could not be confirmed, and no other exception is pending.
         """
         with deferred():
             try:
@@ -99,14 +99,14 @@ class Brick:
         return self._lights.setdefault(port, Light(self.link, port, clock=self._clock))
 
     def battery_mv(self) -> int:
-        """Read the battery's voltage; warn, once, where it is low.
+        """Read the battery's voltage; warn once if it is low.
 
-        A voltage far from the last one is believed when the next is like it: the line has no checksum.
+        A voltage far from the last one must be confirmed by a second reading, since the protocol has no checksum.
 
         Raises
         ------
         LinkError
-            If the brick does not answer, or with another voltage every time.
+            If the brick does not answer, or answers with a different voltage every time.
 
         Warns
         -----
@@ -118,7 +118,7 @@ class Brick:
             if before is not None and abs(self._last_mv - before) <= STEP_MV:
                 break
         else:
-            raise LinkError(f"the NXT on {self.link.name} tells another battery voltage each of {N_ASKED} times")
+            raise LinkError(f"the NXT on {self.link.name} reports a different battery voltage each of {N_ASKED} times")
         if self._last_mv < LOW_MV and not self._told_low:
             self._told_low = True
             warnings.warn(
@@ -130,15 +130,15 @@ class Brick:
         return self._last_mv
 
     def name(self) -> str:
-        """Ask for its name."""
+        """Return its name."""
         return self.link.ask(GetDeviceInfo()).brick_name
 
     def version(self) -> FirmwareVersion:
-        """Ask for the versions of its firmware and protocol."""
+        """Return the versions of its firmware and protocol."""
         return self.link.ask(GetFirmwareVersion())
 
     def program(self) -> str | None:
-        """Ask which program runs on it, whose commands to motors and sensors would cross this one's; None: none."""
+        """Return the program running on it, which could interfere with motors and sensors, or None."""
         try:
             return self.link.ask(GetCurrentProgramName()).file
         except BrickError as error:
@@ -147,9 +147,9 @@ class Brick:
             raise
 
     def _come_to_rest(self) -> None:
-        """Release the motors and switch the LEDs off, each whether or not the others could be.
+        """Release the motors and switch the LEDs off, each even if another fails.
 
-        First all without an answer, which works even where answers are missing or late; then make sure.
+        First send all commands without waiting for answers, which may be missing or late; then confirm.
         """
         commands: list[Request[Done]] = [
             SetOutputState(ALL_OUTPUTS, 0, OutputMode.IDLE, Regulation.IDLE, 0, RunState.IDLE, 0),

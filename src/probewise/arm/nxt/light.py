@@ -1,4 +1,4 @@
-"""The light sensor 9844: LED on or off, and its counts converted as the brick's firmware converts them."""
+"""The light sensor 9844: its LED, and conversion of its counts as in the brick's firmware."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from probewise.errors import LinkError, ParameterError
 __all__ = ["Light", "LightReading", "SensorError", "normalized_of"]
 
 AD_MAX = 1023
-N_INVALID = 3  # readings at least, for a slow line may take all the time that there is for one
-_BRIGHT_COUNTS = 200  # 800 mV of 5000 mV, as the firmware's whole numbers have it: 5 V is 1023 counts
-_SPAN_PERCENT = 68  # share of the converter's range that lies between bright and dark
+N_INVALID = 3  # least number of attempts, since one may use up the allowed time on a slow connection
+_BRIGHT_COUNTS = 200  # 800 mV of 5000 mV in the firmware's integer arithmetic: 5 V is 1023 counts
+_SPAN_PERCENT = 68  # share of the converter's range between bright and dark, in percent
 
 
 class SensorError(LinkError):
-    """Report a sensor that gives no reading that can be used."""
+    """Raised for a sensor that gives no usable reading."""
 
 
 def normalized_of(raw_counts: int) -> int:
-    """Convert counts of the converter, more light fewer of them, to 0 (dark) to 1023 (bright).
+    """Convert A/D counts, which fall with brightness, to 0 (dark) to 1023 (bright).
 
-    The firmware's arithmetic for types 05 and 06, in whole numbers: only 697 of the 1024 values occur.
+    The firmware's integer arithmetic for types 05 and 06: only 697 of the 1024 values occur.
 
     Raises
     ------
@@ -42,23 +42,23 @@ def normalized_of(raw_counts: int) -> int:
 
 @dataclass(frozen=True)
 class LightReading:
-    """One reading, as the converter's counts."""
+    """One reading, in A/D counts."""
 
     raw_counts: int
 
     @property
     def normalized(self) -> int:
-        """0 (dark) to 1023 (bright)."""
+        """Brightness from 0 (dark) to 1023 (bright)."""
         return normalized_of(self.raw_counts)
 
     @property
     def percent(self) -> int:
-        """0 to 100 in whole steps, as the brick shows it: the paper's LEGO units."""
+        """Whole percent from 0 to 100, as the brick shows it: the paper's LEGO units."""
         return self.normalized * 100 // AD_MAX
 
     @property
     def fine_percent(self) -> float:
-        """0 to 100 in all steps that the converter has, about seven to one percent."""
+        """Percent from 0 to 100 at the converter's resolution, about seven steps per percent."""
         return self.normalized * 100 / AD_MAX
 
 
@@ -68,13 +68,13 @@ class Light:
     Parameters
     ----------
     link
-        The line to the brick.
+        The connection to the brick.
     port
         0 to 3, for 1 to 4.
     clock
         What is waited with.
     valid_s
-        For so long after a change the brick may call its readings invalid.
+        Seconds after a change during which the brick may mark its readings as invalid.
     """
 
     def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:
@@ -87,14 +87,14 @@ class Light:
         self._link.ask(SetInputMode(self.port, self._type, Mode.RAW))
 
     def read(self) -> LightReading:
-        """Read once, with the LED as it was last set; on, where it never was.
+        """Read once, with the LED as last set (by default on).
 
         Raises
         ------
         SensorError
-            If the brick calls every reading invalid.
+            If the brick marks every reading as invalid.
         TelegramError
-            If what the brick says contradicts itself, however often it is asked.
+            If the brick's answers remain inconsistent after repeated questions.
         """
         if self._type is None:
             self.light_up()
@@ -102,7 +102,7 @@ class Light:
         for number in itertools.count(1):
             values = self._link.ask(GetInputValues(self.port), check=_require_sense)
             as_set = (values.type, values.mode) == (self._type, Mode.RAW)
-            # An invalid reading still shows the old values.
+            # An invalid reading still holds the old values.
             if as_set and values.valid:
                 return LightReading(values.raw)
             if number >= N_INVALID and self._clock.monotonic() > deadline:
@@ -110,21 +110,20 @@ class Light:
                     f"input {self.port + 1} gave no valid reading for {self._valid_s:g} s; "
                     "is the light sensor plugged in?"
                 )
-            if not as_set:  # a program that starts or stops takes all settings back
+            if not as_set:  # a program that starts or stops resets all settings
                 self.light_up(self._type == SensorType.LIGHT_ACTIVE)
         raise AssertionError("a count has no end")  # pragma: no cover
 
     @property
     def off(self) -> SetInputMode:
-        """The command that switches the LED off and lets the brick forget the sensor."""
+        """Return the command that switches the LED off and unconfigures the input."""
         return SetInputMode(self.port, SensorType.NONE, Mode.RAW)
 
 
 def _require_sense(values: InputValues) -> None:
-    """Refuse values that the firmware never sends: it says each reading four times, converted in one go.
+    """Refuse values that the firmware never sends: each reading comes in four consistent conversions.
 
-    The radio line has no checksum that this program could see. A byte that was changed on its way breaks the
-    agreement of the four, or changes nothing that is used.
+    The protocol has no checksum. A corrupted byte makes the four values inconsistent, or changes none that is used.
     """
     if values.valid not in (0, 1) or values.calibrated or values.raw > AD_MAX:
         raise TelegramError(

@@ -1,10 +1,9 @@
-"""Ask the brick and hear it: telegrams over a stream of bytes that may come in pieces, late, or not at all.
+"""Exchange telegrams with the brick over a byte stream whose data may come in pieces, late, or not at all.
 
-Order on the line is kept, so one rule makes answers certain. A command whose answer did not
-come stays *owed*; before anything else is asked, the line is drained and a fence is put up: a
-harmless question with another opcode. When its answer comes, whatever was owed has either been
-read and dropped or will never come. So a late answer is never taken for the next one's. The same
-is done where something lies on the line before a question is sent: an answer that came twice, say.
+The stream keeps the order of bytes, so one rule assigns answers reliably. A command whose answer did not come stays
+*owed*; before the next question, the stream is drained and a fence is sent: a harmless question with another opcode.
+When its answer comes, any owed answer has either been read and dropped or will never come, so a late answer is never
+taken for the next one. The same is done if data are waiting before a question is sent, such as a duplicated answer.
 """
 
 from __future__ import annotations
@@ -35,24 +34,24 @@ __all__ = ["ByteStream", "Link", "NoAnswerError", "Timing"]
 A = TypeVar("A", bound=Answer)
 
 FENCES: tuple[Request[Answer], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
-UNKNOWN = -1  # whatever another program asked before this one began
+UNKNOWN = -1  # a question sent by another program before this one began
 
 
 class ByteStream(Protocol):
-    """A line to the brick, open: a serial port, or whatever stands in for one."""
+    """An open connection to the brick: a serial port or a substitute."""
 
     @property
     def name(self) -> str:
-        """What the line is called, for messages."""
+        """Name of the connection, for messages."""
         ...
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Return up to `size` bytes, fewer where no more come within `timeout_s`.
+        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`.
 
         Raises
         ------
         LinkError
-            If the line is cut.
+            If the connection is lost.
         """
         ...
 
@@ -62,33 +61,33 @@ class ByteStream(Protocol):
         Raises
         ------
         LinkError
-            If the line is cut.
+            If the connection is lost.
         """
         ...
 
     def close(self) -> None:
-        """Let go of the line."""
+        """Close the connection."""
         ...
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long things take on the line, in seconds.
+    """Timeouts and delays of the connection, in seconds.
 
     Parameters
     ----------
     answer_s
-        A command whose answer takes longer has none: stalls beyond 2 s are known, and better cut.
+        Timeout of an answer; stalls of over 2 s occur and are best treated as lost.
     turn_s
-        The radio's time to turn round; a question and its answer turn it twice.
+        Turnaround time of the radio; a question with its answer takes two.
     gap_s
-        From a telegram without an answer to the next.
+        Pause after a telegram without an answer.
     silence_s
-        A line on which nothing came for so long is drained.
+        Silence after which the stream counts as drained.
     keep_awake_s
-        The brick is told to stay awake at least as often as this, or a third of its limit.
+        Longest interval between keep-alive commands, or a third of the brick's sleep limit if shorter.
     n_repeats
-        How often a question without a good answer is asked again, where asking twice does no harm.
+        Number of repeats of a question without a valid answer, if repeating it is harmless.
     """
 
     answer_s: float = 2.0
@@ -108,32 +107,32 @@ class Timing:
 
     @property
     def longest_s(self) -> float:
-        """The longest that a question can take, its repeats and fences included, on a line that never falls silent."""
+        """Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
         draining_s = self.answer_s + self.silence_s
         waiting_s = 2 * self.turn_s + self.answer_s
         return (1 + self.n_repeats) * (waiting_s + draining_s + len(FENCES) * (waiting_s + draining_s))
 
 
 class NoAnswerError(LinkError):
-    """Report that the brick did not answer a command in time: it may have carried it out or not."""
+    """Raised if the brick did not answer a command in time; it may or may not have executed it."""
 
 
 class Link:
-    """A line to a brick, one question at a time.
+    """A connection to a brick, one question at a time.
 
     Parameters
     ----------
     stream
-        The open line.
+        The open connection.
     clock
-        What is waited with; a test's own never waits.
+        Clock used for waiting; a fake clock in tests.
     timing
         Deadlines and pauses.
 
     Attributes
     ----------
     n_asked, n_told
-        How many questions were sent, and how many commands without an answer.
+        Numbers of questions sent, and of commands without an answer.
     """
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
@@ -145,32 +144,31 @@ class Link:
 
     @property
     def name(self) -> str:
-        """What the line is called."""
+        """Name of the connection."""
         return self._stream.name
 
     def ask(self, request: Request[A], *, check: Callable[[A], None] | None = None) -> A:
         """Send a command and return the answer.
 
-        A command that may be repeated is, where no answer comes, a garbled one, or a refusal; any other is
-        sent once.
+        A repeatable command is repeated if the answer is missing, corrupted or a refusal; others are sent once.
 
         Parameters
         ----------
         request
             The command.
         check
-            Raises TelegramError where the answer cannot be true; None: any is taken.
+            Function that raises TelegramError for an impossible answer; None: any answer is accepted.
 
         Raises
         ------
         BrickError
             If the brick refuses it.
         NoAnswerError
-            If the brick did not answer, though it may yet answer other questions.
+            If the brick did not answer, although the connection may still work.
         TelegramError
-            If what came is no answer.
+            If the received bytes are not an answer.
         LinkError
-            If the line is dead.
+            If the connection is dead.
         """
         self.keep_awake()
         for n_left in reversed(range(1 + self._timing.n_repeats if request.repeatable else 1)):
@@ -193,30 +191,30 @@ class Link:
         raise AssertionError("a question is asked at least once")  # pragma: no cover
 
     def tell(self, request: Request[A]) -> None:
-        """Send a command without wanting an answer; whether the brick took it is not known."""
+        """Send a command without requesting an answer; whether the brick executed it is unknown."""
         self._send(encode(request, wants_reply=False))
         self.n_told += 1
         self._free_at = self._clock.monotonic() + self._timing.gap_s
 
     def keep_awake(self) -> None:
-        """Start the brick's sleep timer anew where it is time to; `ask` does it too.
+        """Reset the brick's sleep timer if it is due; `ask` does so too.
 
-        To be called now and then by whoever lets the line rest for minutes.
+        Call it now and then if the connection is idle for minutes.
         """
         if self._clock.monotonic() < self._awake_until:
             return
-        # Set first: asking comes back here.
+        # Set first: `ask` calls this method.
         self._awake_until = self._clock.monotonic() + self._timing.keep_awake_s
         limit_s = self.ask(KeepAlive()).limit_ms / 1000
         if limit_s > 0:
             self._awake_until = self._clock.monotonic() + min(self._timing.keep_awake_s, limit_s / 3)
 
     def close(self) -> None:
-        """Let go of the line."""
+        """Close the connection."""
         self._stream.close()
 
     def _exchange(self, request: Request[A]) -> Reply:
-        """Send a command and wait for its reply; until that is here it is owed, whatever happens."""
+        """Send a command and wait for its reply, which counts as owed until it is received."""
         self._owed.add(request.OPCODE)
         self._send(encode(request))
         self.n_asked += 1
@@ -228,7 +226,7 @@ class Link:
         return reply
 
     def _clear(self) -> None:
-        """Make sure that no answer to an earlier command can come any more."""
+        """Ensure that no answer to an earlier command can still arrive."""
         self._drain()
         for fence in FENCES:
             if fence.OPCODE in self._owed:
@@ -243,7 +241,7 @@ class Link:
         raise LinkError(f"the NXT on {self.name} does not answer any more; is it on, charged and near?")
 
     def _drain(self) -> None:
-        """Read on until nothing comes for a while: late answers, torn ones."""
+        """Read and drop bytes until the stream is silent: late or incomplete answers."""
         deadline = self._clock.monotonic() + self._timing.answer_s
         while self._clock.monotonic() < deadline and self._stream.read(LONGEST, self._timing.silence_s):
             pass
@@ -263,7 +261,7 @@ class Link:
             try:
                 reply = decode(telegram)
             except TelegramError:
-                continue  # a program on the brick may send something of its own
+                continue  # a program on the brick may send telegrams too
             if reply.opcode == request.OPCODE:
                 return reply
             if reply.opcode not in self._owed:
@@ -276,7 +274,7 @@ class Link:
         return self._exactly(length, request, deadline)
 
     def _exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
-        """Read so many bytes, in whatever pieces they come."""
+        """Read exactly `size` bytes, in any number of pieces."""
         got = b""
         while len(got) < size:
             left_s = deadline - self._clock.monotonic()

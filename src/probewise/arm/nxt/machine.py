@@ -1,4 +1,4 @@
-"""The machine that is a brick: the arm's three motors behind the guard, and its light sensor."""
+"""The machine interface on a brick: the arm's three motors with their soft limits, and its light sensor."""
 
 from __future__ import annotations
 
@@ -18,21 +18,25 @@ __all__ = ["BrickMachine"]
 
 
 class BrickMachine:
-    """A brick as the arm's geometry says it is wired.
+    """A brick wired as in the arm's geometry.
 
     Parameters
     ----------
     brick
         The brick.
     geometry
-        Which motor and sensor is where, and what the guard refuses.
+        Ports of motors and sensor, and the limits.
     """
 
     def __init__(self, brick: Brick, geometry: Geometry) -> None:
         self.brick = brick
         self.limits = SoftLimits(geometry)
         self._joints = geometry.joints
-        self._zeros = [0, 0, 0]  # counts at which the joints are at home; not 0 from a stop found to the next reset
+        self._zeros = [
+            0,
+            0,
+            0,
+        ]  # counts at home; not 0 between finding a stop and the next reset
         self._motors = [brick.motor(joint.port, guard=partial(self._check, k)) for k, joint in enumerate(self._joints)]
         self._light = brick.light(geometry.sensor_port)
 
@@ -40,7 +44,7 @@ class BrickMachine:
         self.brick.__enter__()
         try:
             for joint, motor in enumerate(self._motors):
-                # A session that a dead line ended may have left it turning.
+                # An earlier session that lost its connection may have left a motor turning.
                 self.limits.stands(joint, motor.rest())
             self._light.light_up()
         except BaseException as error:
@@ -55,22 +59,22 @@ class BrickMachine:
         self.brick.__exit__(kind, error, trace)
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Turn a joint's motor to a count, arriving in direction `side`, and hold it; see `Motor.move_to`."""
+        """Turn a joint's motor to a count, approaching in direction `side`, and hold it; see `Motor.move_to`."""
         with self._watched(joint) as motor:
             motor.move_to(goal + self._zeros[joint], side)
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Turn a joint's motor to about a count, and hold it; see `Motor.move_near`."""
+        """Turn a joint's motor approximately to a count, and hold it; see `Motor.move_near`."""
         with self._watched(joint) as motor:
             motor.move_near(goal + self._zeros[joint])
 
     def release(self) -> None:
-        """Let all motors turn freely; where they are turned to by hand shows at the next move."""
+        """Let all motors turn freely; turns by hand are noticed at the next move."""
         for motor in self._motors:
             motor.release()
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint against its stop; from then on its counts are those of the geometry."""
+        """Turn a joint to its stop; from then on its counts agree with the geometry."""
         mechanics = self._joints[joint]
         motor = self._motors[joint]
         with_gears: Side = side if mechanics.gear_ratio > 0 else -side
@@ -81,7 +85,7 @@ class BrickMachine:
         self.limits.stands(joint, at_stop)
 
     def reset(self, joints: Sequence[int]) -> None:
-        """Take where these joints' motors stand for 0."""
+        """Set the counters of these joints' motors to 0."""
         for joint in joints:
             self._motors[joint].reset()
             self._zeros[joint] = 0
@@ -101,7 +105,7 @@ class BrickMachine:
 
     @contextlib.contextmanager
     def _watched(self, joint: int) -> Iterator[Motor]:
-        """Yield a motor, and tell the guard where it stands in the end, also where the move failed half way."""
+        """Yield a motor, and update the limits with its final count, also after a failed move."""
         motor = self._motors[joint]
         try:
             yield motor
@@ -109,5 +113,5 @@ class BrickMachine:
             self.limits.stands(joint, motor.last_counts - self._zeros[joint])
 
     def _check(self, joint: int, here: int, to: int) -> None:
-        """Ask the guard, which counts from home."""
+        """Check a move against the limits, whose counts are from home."""
         self.limits.check(joint, here - self._zeros[joint], to - self._zeros[joint])

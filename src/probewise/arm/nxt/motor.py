@@ -1,13 +1,10 @@
-"""Turn a motor to a count and keep it there, given what the brick's firmware does with a limit.
+"""Turn a motor to a count and hold it there, given how the brick's firmware treats a limit.
 
-The firmware counts a limited move from its own running *target*, not from where the motor
-stands; at the target it lets go, and the motor runs on, *coasts*, by some counts. So the
-target is kept track of here, the coast is learned by direction and power, and every move is
-worked out from the count that was read last: a fast move that stops short, slow ones for the
-rest, always arriving from the same side, so that the play in the gears always lies on the same flank.
-
-No telegram has a checksum. A state that surprises is therefore asked for again, and believed once two in a
-row say the same.
+The firmware counts a limited move from its own running *target*, not from the motor's position; at the target it cuts
+the power, and the motor *coasts* by some counts. So the target is tracked here, the coast is learned by direction and
+power, and every move is computed from the last count: a fast move that stops short, then slow ones, always approaching
+from the same side, so that the play of the gears is always taken up in the same direction. Telegrams have no checksum:
+an unexpected state is read again, and accepted once two successive answers agree.
 """
 
 from __future__ import annotations
@@ -35,45 +32,45 @@ from probewise.errors import LinkError, ParameterError
 __all__ = ["Drive", "Guard", "Motor", "MotorError"]
 
 Guard: TypeAlias = Callable[[int, int], None]
-"""Raises ReachError where the motor may not go from one rotation count to another."""
+"""Function that raises ReachError if the motor must not go from one rotation count to another."""
 
-COUNTS_S = 10.0  # that one unit of power stands for
+COUNTS_S = 10.0  # counts per second and unit of power
 STUCK, BEYOND = "is stuck at", "runs on beyond its goal, to"
-FAINT_POWER = 1  # a motor needs some 8 to overcome its own friction
+FAINT_POWER = 1  # a motor needs about 8 to overcome its own friction
 BRAKED = OutputMode.ON | OutputMode.BRAKE
 DRIVEN = BRAKED | OutputMode.REGULATED
-N_ASKED = 6  # so often at most, until two states in a row say the same
-N_UNTAKEN = 3  # so many moves in a row that the brick does not take end it
+N_ASKED = 6  # largest number of queries until two successive states agree
+N_UNTAKEN = 3  # successive commands ignored by the brick after which a move fails
 
 
 class MotorError(LinkError):
-    """Report a motor that does not get where it is sent: stuck, slipping, or not plugged in."""
+    """Raised for a motor that does not reach its target: stuck, slipping, or not plugged in."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How a motor is driven; counts are degrees of its shaft.
+    """Parameters of driving a motor; counts are degrees of its shaft.
 
     Parameters
     ----------
     fast_power, slow_power
-        Power of the way, and of the last counts, 1 to 100: about 10 counts/s each.
+        Power of fast moves, and of the final approach, 1 to 100; each unit is about 10 counts/s.
     seek_power
-        Power, unregulated, with which it turns towards a mechanical stop: no more than that presses on it.
+        Unregulated power towards a mechanical stop, which limits the force on it.
     coast_counts
-        First guess of how far it runs on after a fast move; slow ones in proportion.
+        First estimate of the coast after a fast move; for slow moves in proportion.
     tolerance_counts
-        A count so near to the goal is there.
+        Largest distance from the goal that counts as reached.
     lead_counts
-        How far to go back, at least, to arrive from the right side: more than the play.
+        Least distance to back off, to approach from the right side; more than the play.
     runaway_counts
-        A motor that goes so much farther than it should is stopped.
+        Overrun at which a motor is stopped.
     settle_s
-        Wait before a count is taken for that of a motor at rest.
+        Waiting time before a motor counts as at rest.
     stuck_s
-        A running motor whose count does not change for so long is stuck.
+        Time without a change of count after which a running motor is stuck.
     n_moves
-        So many moves must do for one goal.
+        Largest number of moves for one goal.
     """
 
     fast_power: int = 60
@@ -110,20 +107,20 @@ class Motor:
     Parameters
     ----------
     link
-        The line to the brick.
+        The connection to the brick.
     port
         0 to 2, for A to C.
     guard
-        Asked before every move that a command could cause; None: anything goes.
+        Checked before every possible move; None: no limits.
     drive
-        How it is driven; None: as a motor under a light load is.
+        Driving parameters; None: those of a lightly loaded motor.
     clock
         What is waited with.
 
     Attributes
     ----------
     last_counts
-        The rotation counter as it was last read.
+        Last value of the rotation counter.
     """
 
     def __init__(
@@ -132,15 +129,15 @@ class Motor:
         self._link, self.port, self._guard, self._clock = link, port, guard, clock
         self.drive = Drive() if drive is None else drive
         self.last_counts = 0
-        self._target: int | None = None  # the firmware's, in rotation counts; None: not known
+        self._target: int | None = None  # the firmware's target, in rotation counts; None: unknown
         self._datum: tuple[int, int] | None = None  # tacho counter minus rotation and minus block counter
         self._n_untaken = 0  # moves in a row
-        self._arrived: Side | None = None  # from which side it came to where it stands
+        self._arrived: Side | None = None  # the direction of its last approach
         self._coast: dict[tuple[int, Side], float] = {}
 
     @property
     def letter(self) -> str:
-        """The port as it is written on the brick."""
+        """The port's letter on the brick."""
         return "ABC"[self.port]
 
     def counts(self) -> int:
@@ -148,7 +145,7 @@ class Motor:
         return self._state().rotation_counts
 
     def reset(self) -> None:
-        """Take where it stands for 0."""
+        """Set its counter to 0."""
         state = self._state()
         self._link.ask(ResetMotorPosition(self.port, 0))
         if self._target is not None:
@@ -156,7 +153,7 @@ class Motor:
         self._datum = state.tacho_counts, state.tacho_counts - state.block_counts
 
     def hold(self) -> None:
-        """Keep it where it is, against a load."""
+        """Hold its position against a load."""
         self._link.ask(self._command(0, 0))
 
     def rest(self) -> int:
@@ -171,7 +168,7 @@ class Motor:
         self._arrived = None
 
     def move_to(self, goal: int, side: Side) -> int:
-        """Turn to a count, arriving in direction `side`, and hold it there.
+        """Turn to a count, approaching in direction `side`, and hold it there.
 
         Returns
         -------
@@ -182,7 +179,7 @@ class Motor:
         ReachError
             If the guard refuses a move; nothing moves then.
         MotorError
-            If it does not get there.
+            If it does not reach the goal.
         """
         here = self.counts()
         for _ in range(self.drive.n_moves):
@@ -202,7 +199,7 @@ class Motor:
         )
 
     def move_near(self, goal: int) -> int:
-        """Turn to the neighbourhood of a count, by one fast move if it is not there, and hold; see `move_to`."""
+        """Turn approximately to a count, by one fast move if needed, and hold; see `move_to`."""
         here = self.counts()
         side: Side = 1 if goal >= here else -1
         if self._target is None:
@@ -213,14 +210,14 @@ class Motor:
         return here
 
     def find_stop(self, side: Side, farthest: int) -> int:
-        """Turn in a direction until something stops it, gently, and hold it there; no guard is asked.
+        """Turn gently in a direction until a stop is met, and hold; limits are not checked.
 
         Parameters
         ----------
         side
             The direction.
         farthest
-            It must be stopped within so many counts.
+            Largest distance to the stop, in counts.
 
         Returns
         -------
@@ -252,19 +249,19 @@ class Motor:
         return self._target
 
     def _approach(self, goal: int, side: Side, here: int) -> int:
-        """Go on towards the goal: fast to a place well short of it, or slowly all the way."""
+        """Move towards the goal: fast to well short of it, or slowly all the way."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
         target = goal - side * self._coasts(slow, side)
         if side * self._known_target >= side * target:
-            here = self._synchronise()  # left there by a move the other way, it would lead beyond the goal
-        least = max(side * here, side * self._known_target) + 1  # a target behind this moves nothing
+            here = self._synchronise()  # a target left by a move in the other direction would lead beyond the goal
+        least = max(side * here, side * self._known_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coasts(fast, side))
         if side * short > least + self.drive.lead_counts:
             return self._go(short, side, fast, here)
         return self._go(side * max(side * target, least), side, slow, here)
 
     def _back_off(self, goal: int, side: Side, here: int) -> int:
-        """Go back behind the goal, far enough for a slow move to get going and take up the play."""
+        """Back off behind the goal, far enough for a slow move to start and take up the play."""
         back: Side = 1 if side == -1 else -1
         fast, slow = self.drive.fast_power, self.drive.slow_power
         behind = goal - side * (self._coasts(slow, side) + 2 * self.drive.lead_counts)
@@ -279,7 +276,7 @@ class Motor:
         return round(self._coast.get((power, side), share * self.drive.coast_counts))
 
     def _go(self, target: int, side: Side, power: int, here: int) -> int:
-        """Make one limited move to a target of the firmware's, and read where it led."""
+        """Make one limited move to a firmware target, and read the resulting count."""
         stop = target + side * self._coasts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
@@ -295,24 +292,24 @@ class Motor:
             )
         ran_on = side * (here - target)
         if ran_on < -self.drive.tolerance_counts:
-            self._target = None  # it stopped short of the target, which must lie elsewhere
+            self._target = None  # it stopped short of the target, which must be elsewhere
             return here
         learned = self._coast.get((power, side), ran_on)
         self._coast[power, side] = (learned + ran_on) / 2
         return here
 
     def _start(self, target: int, side: Side, command: SetOutputState) -> bool:
-        """Order a limited move, once and no more; tell whether the brick took it.
+        """Command a limited move exactly once; return whether the brick accepted it.
 
         Raises
         ------
         LinkError
-            If it took none of several in a row.
+            If several successive commands were not accepted.
         """
         try:
             self._link.ask(command)
         except (NoAnswerError, TelegramError, BrickError) as error:
-            # Holding sets the limit to 0 after every move: this one's is the brick's own word that it took it.
+            # Holding sets the limit to 0 after every move, so this limit confirms that the brick accepted the command.
             took = self._state(lambda state: False).limit_counts == command.limit_counts
             if not took or self._target is None:
                 self._n_untaken += 1
@@ -325,10 +322,9 @@ class Motor:
         return True
 
     def _synchronise(self) -> int:
-        """Stop the motor and learn the firmware's target, which follows a motor that is driven without a limit.
+        """Stop the motor and find the firmware's target, which follows a motor that is driven without a limit.
 
-        It is driven with a power that does not turn it, so that nothing happens if the line dies here, and
-        that sending it twice does no harm.
+        It is driven with too little power to turn, so that a lost connection or a repeated command does no harm.
         """
 
         def is_faint(state: OutputState) -> bool:
@@ -344,11 +340,11 @@ class Motor:
         return self.rest()
 
     def _await_idle(self, start: int, farthest: int, target: int) -> str:
-        """Wait for a limited move to end; say what is wrong where it sticks, or goes farther than it may."""
+        """Wait for a limited move to end; return a description of the trouble if it sticks or overruns."""
         side = 1 if farthest > 0 else -1
 
         def is_likely(state: OutputState) -> bool:
-            # The firmware lets go of a motor at its target and not before.
+            # The firmware releases a motor at its target, not before.
             return state.run_state == RunState.RUNNING or side * (state.rotation_counts - target) >= 0
 
         here, changed_at = start, self._clock.monotonic()
@@ -363,22 +359,22 @@ class Motor:
         return ""
 
     def _state(self, is_likely: Callable[[OutputState], bool] = lambda state: True) -> OutputState:
-        """Ask what the motor is doing; where that is not likely, or a counter jumped, until two in a row agree.
+        """Read the motor's state; if it is implausible or a counter jumped, read until two successive states agree.
 
-        A byte that was changed on its way shifts one of the three counters against the others.
+        A corrupted byte shifts one of the three counters against the others.
         """
         state, before = self._asked(), None
         n_asked = 1
         while (_datum_of(state) != self._datum or not is_likely(state)) and _essence(state) != before:
             if n_asked == N_ASKED:
                 raise MotorError(
-                    f"motor {self.letter} is told of differently each of {N_ASKED} times; is the brick near?"
+                    f"motor {self.letter} is reported differently each of {N_ASKED} times; is the brick near?"
                 )
             before, state = _essence(state), self._asked()
             n_asked += 1
         self.last_counts = state.rotation_counts
         if _datum_of(state) != self._datum:
-            # Somebody else set a counter back: what was known of the target is void.
+            # Another program reset a counter: the known target is void.
             self._target, self._datum = None, _datum_of(state)
         return state
 
@@ -390,10 +386,10 @@ class Motor:
 
 
 def _datum_of(state: OutputState) -> tuple[int, int]:
-    """Return how far the counters are apart, which no turning changes."""
+    """Return the differences of the counters, which motion does not change."""
     return state.tacho_counts - state.rotation_counts, state.tacho_counts - state.block_counts
 
 
 def _essence(state: OutputState) -> tuple[object, ...]:
-    """Return all that two states of a motor that turns have in common."""
+    """Return the fields that do not change while a motor turns."""
     return _datum_of(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts

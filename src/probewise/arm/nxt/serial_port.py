@@ -1,4 +1,4 @@
-"""The line itself: a serial port by pyserial, which only this file knows."""
+"""A serial port, by pyserial, which only this file imports."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SerialPort:
 
     @classmethod
     def open(cls, path: str) -> Self:
-        """Open a port, for this program alone.
+        """Open a port exclusively.
 
         Raises
         ------
@@ -54,7 +54,7 @@ class SerialPort:
         return str(self._port.name)
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Return up to `size` bytes, fewer where no more come within `timeout_s`."""
+        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`."""
         try:
             self._port.timeout = timeout_s
             return bytes(self._port.read(size))
@@ -69,7 +69,7 @@ class SerialPort:
             raise self._cut(error) from error
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         self._port.close()
 
     def _cut(self, error: OSError) -> LinkError:
@@ -77,6 +77,6 @@ class SerialPort:
 
 
 def _reason(error: Exception) -> str:
-    """Say what the system says, without what pyserial puts around it."""
+    """Return the system's message, without pyserial's additions."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error)

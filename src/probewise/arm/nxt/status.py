@@ -1,4 +1,4 @@
-"""What the status byte of a reply means, and the error that it becomes."""
+"""Status bytes of replies, and the error for a refusal."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ MEANINGS: Mapping[int, str] = {
     0xFB: "the brick is out of memory",
     0xFF: "bad arguments",
 }
-"""Status bytes by what they mean; 00 is success."""
+"""Meanings of status bytes; 00 is success."""
 
 
 class BrickError(LinkError):
-    """Report that the brick refused a command; `status` is its status byte."""
+    """Raised if the brick refused a command; `status` is its status byte."""
 
     def __init__(self, command: str, status: int) -> None:
         self.command, self.status = command, status

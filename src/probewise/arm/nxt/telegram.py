@@ -1,10 +1,9 @@
-"""The brick's telegrams as values and back: pure functions, no input or output.
+"""Encode and decode the brick's telegrams: pure functions without input or output.
 
 A telegram is a type byte, an opcode and a body; on Bluetooth its length goes before it
 (`framed`). One class per command holds the body's fields in the order of the bytes; its
-`REPLY` is what a successful answer holds. A value out of bounds cannot be made, so nothing
-wrong can be sent, and bytes that are no answer raise TelegramError. Only the commands that the
-arm needs are here.
+`REPLY` is the class of a successful answer. Values out of bounds are refused on construction, and bytes that are not an
+answer raise TelegramError. Only the commands that the arm needs are here.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ ALL_OUTPUTS = 0xFF
 
 
 class SensorType(IntEnum):
-    """What is plugged into an input."""
+    """Type of the sensor at an input."""
 
     NONE = 0x00
     LIGHT_ACTIVE = 0x05  # its LED on
@@ -71,13 +70,13 @@ class SensorType(IntEnum):
 
 
 class Mode(IntEnum):
-    """How an input is read."""
+    """Reading mode of an input."""
 
     RAW = 0x00
 
 
 class OutputMode(IntFlag):
-    """How a motor is driven."""
+    """Driving mode of a motor."""
 
     IDLE = 0x00
     ON = 0x01
@@ -86,14 +85,14 @@ class OutputMode(IntFlag):
 
 
 class Regulation(IntEnum):
-    """What is regulated."""
+    """Regulated quantity of a motor."""
 
     IDLE = 0x00
     SPEED = 0x01
 
 
 class RunState(IntEnum):
-    """What a motor is doing; the brick shows others in passing."""
+    """Run state of a motor; the brick also reports transient ones."""
 
     IDLE = 0x00
     RUNNING = 0x20
@@ -101,39 +100,39 @@ class RunState(IntEnum):
 
 @dataclass(frozen=True)
 class Done(Answer):
-    """The brick has taken the command."""
+    """Confirmation of a command, without content."""
 
 
 @dataclass(frozen=True)
 class Request(Fields, Generic[A_co]):
-    """A command; `A_co` is what a successful answer holds."""
+    """A command; `A_co` is the type of a successful answer."""
 
     OPCODE: ClassVar[int]
     REPLY: ClassVar[type[Answer]] = Done
 
     @property
     def repeatable(self) -> bool:
-        """Whether sending it twice does no more than sending it once."""
+        """Whether the command is idempotent."""
         return True
 
     @property
     def name(self) -> str:
-        """The command's name, as LEGO writes it."""
+        """Name of the command in LEGO's documentation."""
         return type(self).__name__.upper()
 
     def answer(self, reply: Reply) -> A_co:
-        """Read the answer to this command.
+        """Decode the answer to this command.
 
         Raises
         ------
         BrickError
-            If the brick refused it: the status says why.
+            If the brick refused it; the status gives the reason.
         TelegramError
-            If the reply is one to another command, or about another port, or its length is wrong.
+            If the reply belongs to another command or port, or its length is wrong.
         """
         if reply.opcode != self.OPCODE:
             raise TelegramError(f"a reply to opcode {reply.opcode:02X} came for {self.name}, {self.OPCODE:02X}")
-        # A refusal has the full length with zeros, or none: its status says all there is.
+        # A refusal is padded with zeros, or empty: only its status matters.
         if reply.status != OK:
             raise BrickError(self.name, reply.status)
         said = self.REPLY.unpack(reply.body)
@@ -144,7 +143,7 @@ class Request(Fields, Generic[A_co]):
 
 @dataclass(frozen=True)
 class SetOutputState(Request[Done]):
-    """Drive a motor, or all with port 255; a limit of 0 counts is none."""
+    """Drive a motor, or all with port 255; a limit of 0 counts means no limit."""
 
     OPCODE = 0x04
     port: int = field_of(Whole("B", 0, 2, (ALL_OUTPUTS,)))
@@ -157,13 +156,13 @@ class SetOutputState(Request[Done]):
 
     @property
     def repeatable(self) -> bool:
-        """Limits add up: a move sent twice would go twice as far."""
+        """False for limited moves: limits add up, so a repeated move would go twice as far."""
         return self.limit_counts == 0
 
 
 @dataclass(frozen=True)
 class SetInputMode(Request[Done]):
-    """Say what is plugged into an input and how to read it."""
+    """Set the sensor type and the reading mode of an input."""
 
     OPCODE = 0x05
     port: int = field_of(_INPUT)
@@ -173,7 +172,7 @@ class SetInputMode(Request[Done]):
 
 @dataclass(frozen=True)
 class OutputState(Answer):
-    """What a motor is doing, and its three counters in counts (degrees of its shaft)."""
+    """State of a motor, and its three counters in counts (degrees of its shaft)."""
 
     LAYOUT = "BbBBbBIiii"
     port: int
@@ -190,7 +189,7 @@ class OutputState(Answer):
 
 @dataclass(frozen=True)
 class GetOutputState(Request[OutputState]):
-    """Ask what a motor is doing."""
+    """Read the state of a motor."""
 
     OPCODE = 0x06
     REPLY = OutputState
@@ -199,7 +198,7 @@ class GetOutputState(Request[OutputState]):
 
 @dataclass(frozen=True)
 class InputValues(Answer):
-    """What an input reads; of no use while `valid` is 0."""
+    """Values of an input; meaningless while `valid` is 0."""
 
     LAYOUT = "BBBBBHHhh"
     port: int
@@ -215,7 +214,7 @@ class InputValues(Answer):
 
 @dataclass(frozen=True)
 class GetInputValues(Request[InputValues]):
-    """Ask what an input reads."""
+    """Read the values of an input."""
 
     OPCODE = 0x07
     REPLY = InputValues
@@ -241,7 +240,7 @@ class BatteryLevel(Answer):
 
 @dataclass(frozen=True)
 class GetBatteryLevel(Request[BatteryLevel]):
-    """Ask for the battery's voltage."""
+    """Read the battery's voltage."""
 
     OPCODE = 0x0B
     REPLY = BatteryLevel
@@ -249,7 +248,7 @@ class GetBatteryLevel(Request[BatteryLevel]):
 
 @dataclass(frozen=True)
 class SleepLimit(Answer):
-    """After how long without keys or keep-alives the brick switches itself off; 0: never."""
+    """Time without keys or keep-alives after which the brick switches itself off; 0: never."""
 
     LAYOUT = "I"
     limit_ms: int
@@ -257,7 +256,7 @@ class SleepLimit(Answer):
 
 @dataclass(frozen=True)
 class KeepAlive(Request[SleepLimit]):
-    """Start the brick's sleep timer anew: no other command does."""
+    """Reset the brick's sleep timer, which no other command does."""
 
     OPCODE = 0x0D
     REPLY = SleepLimit
@@ -265,7 +264,7 @@ class KeepAlive(Request[SleepLimit]):
 
 @dataclass(frozen=True)
 class ProgramName(Answer):
-    """The file name of the program that runs."""
+    """File name of the running program."""
 
     LAYOUT = "20s"
     file: str
@@ -273,7 +272,7 @@ class ProgramName(Answer):
 
 @dataclass(frozen=True)
 class GetCurrentProgramName(Request[ProgramName]):
-    """Ask which program runs."""
+    """Read the name of the running program."""
 
     OPCODE = 0x11
     REPLY = ProgramName
@@ -292,7 +291,7 @@ class FirmwareVersion(Answer):
 
 @dataclass(frozen=True)
 class GetFirmwareVersion(Request[FirmwareVersion]):
-    """Ask for the versions of protocol and firmware."""
+    """Read the versions of protocol and firmware."""
 
     OPCODE = 0x88
     REPLY = FirmwareVersion
@@ -300,7 +299,7 @@ class GetFirmwareVersion(Request[FirmwareVersion]):
 
 @dataclass(frozen=True)
 class DeviceInfo(Answer):
-    """Who the brick is: its name."""
+    """Name of the brick."""
 
     LAYOUT = "15s15x"
     brick_name: str
@@ -308,7 +307,7 @@ class DeviceInfo(Answer):
 
 @dataclass(frozen=True)
 class GetDeviceInfo(Request[DeviceInfo]):
-    """Ask who the brick is."""
+    """Read the name of the brick."""
 
     OPCODE = 0x9B
     REPLY = DeviceInfo
@@ -316,7 +315,7 @@ class GetDeviceInfo(Request[DeviceInfo]):
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer as it comes: to which opcode, its status, its body still in bytes."""
+    """A raw reply: opcode, status, and body in bytes."""
 
     opcode: int
     status: int
@@ -324,18 +323,18 @@ class Reply:
 
 
 def encode(request: Request[Answer], *, wants_reply: bool = True) -> bytes:
-    """Write a command's telegram, without its length."""
+    """Encode a command as a telegram, without its length."""
     first = SYSTEM if request.OPCODE >= FIRST_SYSTEM_OPCODE else 0
     return bytes([first if wants_reply else first | NO_REPLY, request.OPCODE]) + request.pack()
 
 
 def decode(telegram: bytes) -> Reply:
-    """Read a reply, without its length.
+    """Decode a reply, without its length.
 
     Raises
     ------
     TelegramError
-        If the bytes are none.
+        If the bytes are not a reply.
     """
     if len(telegram) < 3 or telegram[0] != REPLY:
         raise TelegramError(f"a reply has the type 02, an opcode and a status; there is {shown(telegram)}")
@@ -343,5 +342,5 @@ def decode(telegram: bytes) -> Reply:
 
 
 def framed(telegram: bytes) -> bytes:
-    """Put a telegram's length before it, as on Bluetooth."""
+    """Prefix a telegram with its length, as on Bluetooth."""
     return struct.pack("<H", len(telegram)) + telegram

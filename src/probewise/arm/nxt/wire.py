@@ -1,4 +1,4 @@
-"""How the fields of a telegram stand in its bytes: whole numbers, little-endian, and texts."""
+"""Byte layout of a telegram's fields: little-endian integers, and texts."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = ["Answer", "Fields", "TelegramError", "Whole", "field_of", "shown"]
 
 
 class TelegramError(LinkError):
-    """Report bytes that are no telegram: what they were, what was expected."""
+    """Raised for bytes that are not a telegram; the message gives them and what was expected."""
 
 
 @dataclass(frozen=True)
 class Whole:
-    """A whole number: `code` as in the module struct, `low` to `high`, or one of `others`."""
+    """An integer field: `code` as in the module struct, range `low` to `high`, or one of `others`."""
 
     code: str
     low: int
@@ -27,7 +27,7 @@ class Whole:
     others: tuple[int, ...] = ()
 
     def check(self, name: str, value: Any) -> None:
-        """Take whole numbers within the bounds."""
+        """Raise ParameterError unless the value is an integer within the bounds."""
         plain = isinstance(value, int) and not isinstance(value, bool)
         if not plain or not (self.low <= value <= self.high or value in self.others):
             more = "".join(f" or {other}" for other in self.others)
@@ -35,20 +35,20 @@ class Whole:
 
 
 def field_of(kind: Whole) -> Any:
-    """Make a dataclass field with these bytes."""
+    """Make a dataclass field with this byte layout."""
     return dataclasses.field(metadata={"kind": kind})
 
 
 @dataclass(frozen=True)
 class Fields:
-    """What is sent: whole numbers one after another, each within its bounds."""
+    """Body of a command: successive integers, each within its bounds."""
 
     def __post_init__(self) -> None:
         for name, kind in self._kinds():
             kind.check(name, getattr(self, name))
 
     def pack(self) -> bytes:
-        """Write the fields."""
+        """Encode the fields."""
         return b"".join(struct.pack("<" + kind.code, getattr(self, name)) for name, kind in self._kinds())
 
     def _kinds(self) -> Iterator[tuple[str, Whole]]:
@@ -57,18 +57,18 @@ class Fields:
 
 @dataclass(frozen=True)
 class Answer:
-    """What is received: fields one after another; `LAYOUT` is that of the module struct."""
+    """Body of an answer: successive fields; `LAYOUT` as in the module struct."""
 
     LAYOUT: ClassVar[str] = ""
 
     @classmethod
     def unpack(cls, raw: bytes) -> Self:
-        """Read the fields; a text ends at its first NUL, and every byte of it is taken (Latin-1).
+        """Decode the fields; a text ends at its first NUL and is Latin-1.
 
         Raises
         ------
         TelegramError
-            If there are too few or too many bytes.
+            If the number of bytes is wrong.
         """
         try:
             values = struct.unpack("<" + cls.LAYOUT, raw)
@@ -79,7 +79,7 @@ class Answer:
 
 
 def shown(raw: bytes) -> str:
-    """Show bytes as a person compares them."""
+    """Format bytes in hexadecimal."""
     return raw.hex(" ").upper() or "no bytes"
 
 

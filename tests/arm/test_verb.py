@@ -86,7 +86,7 @@ def test_a_joint_can_be_jogged(capsys):
 
 
 def test_jog_down_asks_a_person_to_look(capsys):
-    assert "ask: look" in said(capsys, "arm", "jog", "300,200", "--down", "--dry-run").out
+    assert "ask: check" in said(capsys, "arm", "jog", "300,200", "--down", "--dry-run").out
 
 
 def test_home_here_sets_the_counters_where_a_person_brought_the_arm(capsys):

@@ -82,7 +82,7 @@ def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path
 
 
 def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):
-    assert "--sensor is 's.json'; allowed: nothing beside --simulator" in refused(
+    assert "--sensor is 's.json'; allowed: none with --simulator" in refused(
         capsys, tmp_path, FILE, "--sensor", "s.json"
     )
 

@@ -1,13 +1,12 @@
-"""The command line `probewise`: one file a verb.
+"""The command line `probewise`: one file per verb.
 
-The paper's road as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
-(sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can tell), `diagnose` (what the
-model leaves out), `predict` (eq. of the sensor model with its uncertainty) and `demo`, which does
-all of them at once; `sheets` draws what is printed for a bench, `arm` moves and reads the LEGO arm,
-`emulate-nxt` stands in for it.
+The steps of the paper as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
+(sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can detect), `diagnose` (what the model leaves out),
+`predict` (eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once; `sheets` draws
+patterns to print, `arm` moves and reads the LEGO arm, `emulate-nxt` emulates it.
 
 Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
-2: input that cannot be used, told in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).
+2: unusable input, reported in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).
 """
 
 from __future__ import annotations
@@ -82,11 +81,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     try:
         arguments = parser().parse_args(words)
-    except SystemExit as stop:  # argparse leaves this way after --help, --version and errors
+    except SystemExit as stop:  # argparse exits this way after --help, --version and errors
         return stop.code if isinstance(stop.code, int) else 2
     arguments.words = words
     verb = next(v for v in VERBS if v.name == arguments.verb)
-    os.environ["MPLBACKEND"] = "Agg"  # pictures go to files: no window, and no display needed
+    os.environ["MPLBACKEND"] = "Agg"  # figures go to files: no window and no display
     with warnings.catch_warnings():
         warnings.showwarning = _one_line_warning
         try:
@@ -99,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except (NotConvergedError, LinkError) as error:
             _complain(verb, str(error))
             return 1
-        except BrokenPipeError:  # the reader of a pipe left; what was written is complete
+        except BrokenPipeError:  # the reader of a pipe has closed it; written files are complete
             _forget_lost_reader()
             return 1
         except (ProbewiseError, OSError) as error:
@@ -108,12 +107,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _complain(verb: Verb, text: str) -> None:
-    with contextlib.suppress(OSError):  # of a terminal that was closed
+    with contextlib.suppress(OSError):  # the terminal was closed
         sys.stderr.write(f"probewise {verb.name}: {text}\n")
 
 
 def _forget_lost_reader() -> None:
-    """Throw away what cannot be written to standard output any more, which the interpreter would try again."""
+    """Discard output that can no longer be written, which the interpreter would otherwise try to flush."""
     try:
         sys.stdout.flush()
     except OSError:

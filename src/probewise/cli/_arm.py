@@ -1,4 +1,4 @@
-"""What the verbs that use an arm share: which arm, its geometry, how it is opened, a person to ask."""
+"""Options and helpers of the verbs that use an arm: its name, geometry, opening, prompts to a person."""
 
 from __future__ import annotations
 
@@ -46,19 +46,19 @@ __all__ = [
 ]
 
 ARMS = (
-    "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built otherwise than --geometry says; "
+    "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built differently from --geometry; "
     "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own"
 )
-"""How arms are named, the same in every verb."""
+"""Names of arms, the same in every verb."""
 
 SCENE = "600,250,80"
-"""What lies on the field of an emulated or simulated bench where nobody says otherwise: a circle, in mm."""
+"""Default target on the field of an emulated or simulated bench: a circle, in mm."""
 
-WAIT_S = 0.5  # where a wait for a person hears no signal, it lasts so long; the brick is then kept awake
+WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-alives of the brick
 
 
 def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that ships") -> None:
-    """Add --geometry, and say what stands for it where it is not given."""
+    """Add --geometry, with the default in its help."""
     parser.add_argument(
         "--geometry",
         type=a_path,
@@ -68,7 +68,7 @@ def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that 
 
 
 def geometry_of(arguments: argparse.Namespace) -> Geometry:
-    """Read the geometry that was asked for, or the shipped one."""
+    """Read the geometry given, or the shipped one."""
     from probewise.arm import read_geometry, shipped_geometry
 
     return read_geometry(arguments.geometry or shipped_geometry())
@@ -76,28 +76,28 @@ def geometry_of(arguments: argparse.Namespace) -> Geometry:
 
 @dataclass(frozen=True)
 class ArmName:
-    """Which arm: its kind, and the port or the file that it is behind; of an emulated one how it is really built."""
+    """The choice of an arm: its kind, and its port or file; for an emulated arm, the file of its true geometry."""
 
     kind: Literal["simulated", "emulator", "nxt", "file"]
     where: str = ""
 
     @property
     def is_lego(self) -> bool:
-        """Whether it is the LEGO arm, whose geometry says how far it reaches."""
+        """Whether it is the LEGO arm, whose reach follows from its geometry."""
         return self.kind in ("nxt", "emulator")
 
     @property
     def is_apart(self) -> bool:
-        """Whether it may be built otherwise than its geometry says."""
+        """Whether its true geometry may differ from the given one."""
         return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
 
     def built_as(self, geometry_file: Path | None) -> Path | None:
-        """Name the file that an emulated arm is built by; None: the shipped one."""
+        """Return the file of an emulated arm's true geometry; None: the shipped one."""
         return Path(self.where) if self.where else geometry_file
 
 
 def parse_arm(text: str) -> ArmName:
-    """Read the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py".
+    """Parse the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py".
 
     Raises
     ------
@@ -119,7 +119,7 @@ def parse_arm(text: str) -> ArmName:
 
 
 def open_own(path: str, *, start_s: float = 0.0) -> OwnInstrument:
-    """Read a person's file; what its `connect()` returns is the instrument, from when it is entered."""
+    """Load a user's file; its `connect()` returns the instrument when it is entered."""
     from probewise.arm import OwnInstrument
 
     return OwnInstrument.from_file(path, start_s=start_s)
@@ -134,9 +134,9 @@ def open_emulated(
     seed: int,
     start_s: float = 0.0,
 ) -> tuple[LegoArm, EmulatedBench]:
-    """Hang the LEGO arm on a brick in software, over a table; its clock runs as fast as it can.
+    """Open the LEGO arm on an emulated brick over a simulated table, with a clock that runs as fast as possible.
 
-    The emulator reads the geometry that it is built by itself: `geometry_file`, or the shipped one.
+    The emulator reads its own true geometry: `geometry_file`, or the shipped one.
     """
     from probewise.arm.nxt import Brick, BrickMachine, Link
     from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
@@ -152,7 +152,7 @@ def open_emulated(
 def emulated_arm(
     machine: Machine, geometry: Geometry, bench: EmulatedBench, *, clock: Clock, start_s: float
 ) -> LegoArm:
-    """Make the arm on an emulated bench, which tells in the end whether its sensor went through the table."""
+    """Return an arm on an emulated bench, which reports at the end if its sensor went through the table."""
     from probewise.arm import LegoArm
 
     class Emulated(LegoArm):
@@ -171,7 +171,7 @@ def emulated_arm(
 
 
 def warn_of_clearance(geometry: Geometry) -> None:
-    """Warn where the height to read at leaves less room than errors of the geometry may cost."""
+    """Warn if the reading height is smaller than the possible error of the geometry."""
     doubt_mm = geometry.height_doubt_mm
     if doubt_mm < geometry.read_height_mm:
         return
@@ -188,18 +188,18 @@ def warn_of_clearance(geometry: Geometry) -> None:
 
 
 def in_steps(arm: LegoArm) -> LegoArm:
-    """Let the first lowering of an arm be confirmed step by step."""
+    """Return the arm with its first lowering confirmed step by step."""
     ask = asker(arm)
 
     def confirm(height_mm: float) -> None:
-        ask(f"the sensor should be {height_mm:.0f} mm above the table; if it is, and it may go on down")
+        ask(f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further")
 
     arm.first_down = confirm
     return arm
 
 
 def parse_place(name: str, text: str) -> tuple[float, float]:
-    """Read "X,Y" in mm."""
+    """Parse "X,Y" in mm."""
     try:
         x_mm, y_mm = (float(cell) for cell in text.split(","))
     except ValueError:
@@ -210,7 +210,7 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
 
 
 def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
-    """Open the line to a brick, with the arm that hangs on it."""
+    """Connect to a brick with the arm attached."""
     from probewise.arm import LegoArm
     from probewise.arm.nxt import BrickMachine
 
@@ -218,14 +218,14 @@ def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
 
 
 def open_brick(port: str) -> Brick:
-    """Open the line to a brick."""
+    """Connect to a brick."""
     from probewise.arm.nxt import Brick
 
     return Brick.open(port)
 
 
 class Telling:
-    """An instrument that says where it moves before it does, and what it read: seconds pass on a real arm."""
+    """An instrument that reports each move before it starts, and each reading, since a real arm takes seconds."""
 
     def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
         self._instrument, self._moving, self._read = instrument, moving, read
@@ -243,7 +243,7 @@ class Telling:
         self._instrument.__exit__(kind, error, trace)
 
     def measure(self, pose: Pose) -> Reading:
-        """Say it, measure, say what was read."""
+        """Report the move, measure, report the reading."""
         self._moving(pose)
         reading = self._instrument.measure(pose)
         self._read(reading)
@@ -253,12 +253,12 @@ class Telling:
 def require_choices(
     arm: Instrument, orientations_deg: Sequence[float] | None, heights_mm: Sequence[float] | None
 ) -> None:
-    """Refuse poses that a person's instrument, entered already, does not say that it can take.
+    """Raise ParameterError for poses that a user's instrument (already entered) does not declare as possible.
 
     Raises
     ------
     ParameterError
-        If it neither turns its sensor nor lifts it, and is asked to.
+        If orientations or heights are given for an instrument that does not declare `turns` or `lifts`.
     """
     from probewise.arm import OwnInstrument
 
@@ -272,12 +272,12 @@ def require_choices(
         if values and not can:
             listed = ",".join(f"{value:g}" for value in values)
             raise ParameterError(
-                option, listed, f"none with {arm.source}: it does not say that it can {what} = True does"
+                option, listed, f"none with {arm.source}: it does not declare that it can {what} = True does"
             )
 
 
 def asker(arm: Instrument) -> Callable[[str], None]:
-    """Make what asks a person and waits for Enter, while an arm that may fall asleep is kept awake."""
+    """Return a function that prompts a person and waits for Enter, while keeping the arm awake."""
     answer_to = questioner(arm)
 
     def ask(text: str) -> None:
@@ -287,7 +287,7 @@ def asker(arm: Instrument) -> Callable[[str], None]:
 
 
 def _line() -> str:
-    """Read a line of standard input; "" where it has ended or cannot be read."""
+    """Read a line of standard input; "" if it has ended or cannot be read."""
     try:
         return "" if sys.stdin is None else sys.stdin.readline()
     except (OSError, ValueError):
@@ -295,14 +295,14 @@ def _line() -> str:
 
 
 def questioner(arm: Instrument) -> Callable[[str], str]:
-    """Make what asks a person for a line, while an arm that may fall asleep is kept awake."""
+    """Return a function that asks a person for a line, while keeping the arm awake."""
     keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
 
     def ask(text: str) -> str:
         sys.stderr.write(text)
         sys.stderr.flush()
         answers: queue.Queue[str] = queue.Queue()
-        # Reading a line cannot be cut short, so that it waits in a thread that the program need not wait for.
+        # Reading a line cannot be interrupted, so it runs in a daemon thread.
         threading.Thread(target=lambda: answers.put(_line()), daemon=True).start()
         while True:
             try:

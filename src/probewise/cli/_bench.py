@@ -1,4 +1,4 @@
-"""A bench of arithmetic for the tasks of `arm`: patterns lie down by themselves under a simulated arm."""
+"""A simulated bench for the tasks of `arm`, on which patterns are laid automatically."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Bench", "moved", "open_arm", "world_of"]
 
-_SEEN_MM = 0.5  # a person sees the sensor's middle beside a mark from here on
-_TOUCHES_MM = 0.5  # and a gap above the block
+_SEEN_MM = 0.5  # least offset of the sensor from a mark that a simulated person notices
+_TOUCHES_MM = 0.5  # least gap above the block that a simulated person notices
 
 
 class Bench:
@@ -38,15 +38,15 @@ class Bench:
     Parameters
     ----------
     world
-        How the sensor reads.
+        World of the sensor.
     scene
-        What lies there at first, as `emulate-nxt` takes it.
+        Initial target, in the format of `emulate-nxt`.
     scale
-        What the simulated arm's readings are rounded to and kept within.
+        Rounding and range of the simulated arm's readings.
     seed
-        Of the noise.
+        Seed of the noise.
     n_taken
-        Readings that an earlier go has taken: the noise goes on behind them.
+        Number of readings of an earlier session, after which the noise continues.
     """
 
     def __init__(self, world: World, scene: str, *, scale: LegoScale, seed: int, n_taken: int = 0) -> None:
@@ -55,7 +55,7 @@ class Bench:
         self._stand: Callable[[], Stand] | None = None
 
     def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
-        """Stand the simulated arm over it, which turns its sensor itself."""
+        """Return the simulated arm over it, which turns its sensor itself."""
         number = itertools.count(self._n_taken)
 
         def light(pose: Pose, time_s: float, height_mm: float) -> float:
@@ -68,19 +68,19 @@ class Bench:
         return make(last=Reading(math.nan, rest, start_s))
 
     def emulated(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
-        """Stand the LEGO arm over it, on a brick in software."""
+        """Return the LEGO arm over it, on an emulated brick."""
         surface, seed = self._table.surface, self._seed + self._n_taken
         arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
         self._table, self._stand = bench.table, bench.arm.stand
         return arm
 
     def look(self, look: Look) -> str:
-        """Answer as a person does who watches the emulated arm's sensor over a mark.
+        """Answer like a person who watches the emulated arm's sensor over a mark.
 
         Raises
         ------
         ParameterError
-            If the arm has no sensor to be seen.
+            If the arm is not an emulated one.
         """
         if self._stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm is where it says")
@@ -99,7 +99,7 @@ class Bench:
         return " ".join(words)
 
     def lay(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
-        """Do what `carry_out` asks of a person: lay a pattern with its origin there, or turn the sensor."""
+        """Carry out a request of `carry_out`: lay a pattern with its origin there, or turn the sensor."""
         if isinstance(request, Request) and request.pattern is not None:
             self._table.surface = moved(patterns[request.pattern], origin_mm)
         if isinstance(request, Request) and request.turned_rad is not None:
@@ -117,18 +117,18 @@ def open_arm(
     start_s: float = 0.0,
     n_taken: int = 0,
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
-    """Open any arm for a plan to be carried out, and the bench below it where that is simulated too.
+    """Open an arm to carry out a plan, with a simulated bench if it has one.
 
     Parameters
     ----------
     chosen
         Which.
     geometry, geometry_file
-        Of the LEGO arm, and the file that was asked for; given one, the simulated arm has its reach.
+        Geometry of the LEGO arm, and its file if given; with a file, the simulated arm has its reach.
     sensor, scene, seed
-        Of a simulated or emulated arm: the file of its sensor, what lies there at first, the seed of the noise.
+        For a simulated or emulated arm: the file of its sensor, the initial target, the seed of the noise.
     start_s, n_taken
-        What the clock starts at, and how many readings an earlier go has taken.
+        Time at the start, and number of readings of an earlier session.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def open_arm(
 
 
 def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:
-    """Take the world of a sensor.json and what it says of its readings, or the world of the shipped recordings."""
+    """Return the world and instrumentation of a sensor.json, or the world of the shipped recordings."""
     if sensor is None:
         from probewise.world.shipped import truth
 
@@ -165,7 +165,7 @@ def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:
 
 
 def moved(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
-    """Lay a pattern elsewhere: its origin at `by_mm`."""
+    """Return a pattern with its origin moved to `by_mm`."""
     x_mm, y_mm = by_mm
     match pattern:
         case Uniform():

@@ -1,4 +1,4 @@
-"""What every verb shares: options and what it says."""
+"""Options and messages that all verbs share."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ __all__ = [
     "seed_number",
 ]
 
-DEFAULT_SEED = 2013  # the year of the paper; printed with every run
+DEFAULT_SEED = 2013  # year of the paper; printed with every run
 
 
 @dataclass(frozen=True)
 class Verb:
-    """One subcommand: `add_arguments` fills its parser, `run` does it and returns the exit status."""
+    """One subcommand: `add_arguments` defines its options, `run` executes it and returns the exit status."""
 
     name: str
     summary: str
@@ -48,11 +48,11 @@ class Verb:
 
 
 class CommandError(ProbewiseError, ValueError):
-    """Report a command line that lacks something, and how to give it."""
+    """Raised for an incomplete command line; the message says how to complete it."""
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Report a wrong command line in one line, as every other bad input is, with what was perhaps meant."""
+    """An argument parser that reports errors in one line, with a suggestion for misspelt options."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -61,7 +61,7 @@ class OneLineParser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         words = sys.argv[1:] if args is None else list(args)
-        if self._subparsers is None:  # else words may be options of a verb
+        if self._subparsers is None:  # otherwise words may be options of a verb
             for word in itertools.takewhile(lambda word: word != "--", words):
                 self._require_known(word.partition("=")[0])
         parsed, surplus = super().parse_known_args(words, namespace)
@@ -106,19 +106,19 @@ def add_out_directory(parser: argparse.ArgumentParser) -> None:
         type=a_path,
         required=True,
         metavar="DIR",
-        help="directory for the results; made if missing, files of the same name are replaced",
+        help="directory for the results; made if missing, files of the same names are replaced",
     )
 
 
 def a_path(text: str) -> Path:
-    """Read a path, for argparse; nothing, such as an unset variable of a shell, is not the directory one is in."""
+    """Parse a path, for argparse; the empty string, such as an unset shell variable, is refused."""
     if not text:
         raise argparse.ArgumentTypeError("'' names no file or directory")
     return Path(text)
 
 
 def positive_int(text: str) -> int:
-    """Read an integer above zero, for argparse."""
+    """Parse an integer above zero, for argparse."""
     try:
         value = int(text)
     except ValueError:
@@ -129,7 +129,7 @@ def positive_int(text: str) -> int:
 
 
 def positive_number(unit: str) -> Callable[[str], float]:
-    """Make what reads a number above 0 of some unit, for argparse."""
+    """Return a parser of numbers above 0 with some unit, for argparse."""
 
     def read(text: str) -> float:
         try:
@@ -144,7 +144,7 @@ def positive_number(unit: str) -> Callable[[str], float]:
 
 
 def seed_number(text: str) -> int:
-    """Read a whole number from 0 on, for argparse."""
+    """Parse an integer of 0 or more, for argparse."""
     try:
         value = int(text)
     except ValueError:
@@ -155,20 +155,20 @@ def seed_number(text: str) -> int:
 
 
 def say(text: str, *, quiet: bool = False) -> None:
-    """Write a line of result to standard output."""
+    """Write a result to standard output."""
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
 
 
 def caution(text: str) -> None:
-    """Write a line of warning to standard error, also where nothing else is said."""
+    """Write a warning to standard error, even with --quiet."""
     sys.stderr.write(f"warning: {text}\n")
     sys.stderr.flush()
 
 
 def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
-    """Say how much of a run a file holds, and by which command, the same with these options, it goes on."""
+    """Return a message on how much of a run a file holds, and the command that resumes it."""
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"

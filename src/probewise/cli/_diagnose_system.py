@@ -1,4 +1,4 @@
-"""`probewise diagnose --simulator`: which physics a person's simulator leaves out of their table."""
+"""`probewise diagnose --simulator`: which physics a user's simulator leaves out."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
 
 
 def write_results(diagnosis: Diagnosis, folder: Path) -> None:
-    """Write diagnosis.json, the calibrated and the repaired simulator, and the rows to take next."""
+    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
     from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
     from probewise.systems import write_fitted_system, write_run_table
 
@@ -76,7 +76,7 @@ def write_results(diagnosis: Diagnosis, folder: Path) -> None:
 
 
 def _to_be_kept(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
-    """List what must not be lost: all that was read, and rows of an earlier run that were filled in with readings."""
+    """List files to keep: all input files, and the next.csv of an earlier run if readings were filled in."""
     from probewise.errors import FileError
     from probewise.recordings.table import read_table
 

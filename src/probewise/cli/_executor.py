@@ -1,4 +1,4 @@
-"""Who does a campaign's tasks: this process, some of its own, or the workers of a cluster."""
+"""Executors of a campaign: this process, worker processes, or a cluster."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def _executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield what does the tasks; None stands for this process."""
+    """Yield the executor; None for this process."""
     if arguments.scheduler is not None:
         with _cluster(arguments.scheduler) as executor:
             yield executor
@@ -44,7 +44,7 @@ def _executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
 def campaign_running(
     path: Path, noun: str, arguments: argparse.Namespace
 ) -> Iterator[tuple[Executor | None, Progress]]:
-    """Yield what does a campaign's tasks and where its progress is shown; a stop says what the file keeps."""
+    """Yield a campaign's executor and progress function; an interruption reports what the file holds."""
     from probewise._progress import progress_shown
 
     with (
@@ -56,7 +56,7 @@ def campaign_running(
 
 
 def campaign_keeps(path: Path, noun: str, arguments: argparse.Namespace) -> str:
-    """Say how many finished tasks a campaign's file holds, and how to go on."""
+    """Return a message on how many finished tasks a campaign's file holds, and how to resume."""
     from probewise.campaign import read_campaign
 
     return keeps(path, len(read_campaign(path).results), noun, arguments) if path.exists() else "nothing was written"

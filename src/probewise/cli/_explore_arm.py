@@ -1,4 +1,4 @@
-"""The arm that `probewise explore` reads with, and what a simulated one hides."""
+"""The arm of `probewise explore`, and the hidden shape of a simulated one."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ __all__ = ["Site", "open_site"]
 
 @dataclass(frozen=True)
 class Site:
-    """An arm over a field; what lies there, where it is simulated.
+    """An arm over a field, with the true shape if it is simulated.
 
-    `outline_mm` is the true outline, (n_points, 2), `known` the true values of the shape's parameters, by name, and
-    `about` what the journal keeps of them; None and empty with a real arm.
+    `outline_mm` is the true outline, (n_points, 2), `known` the shape's true parameters by name, and `about` the
+    entries for the journal; None and empty with a real arm.
     """
 
     arm: Instrument
@@ -35,7 +35,7 @@ class Site:
 
 
 def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> Site:
-    """Open the arm that was asked for, to go on after the readings `taken`.
+    """Open the chosen arm, to continue after the readings `taken`.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Readin
     chosen, geometry, start_s = inputs.arm, inputs.geometry, taken[-1].time_s if taken else 0.0
     if chosen.kind in ("nxt", "file"):
         if arguments.truth is not None:
-            raise ParameterError("--truth", arguments.truth, "none with a real arm: what lies there is for it to find")
+            raise ParameterError("--truth", arguments.truth, "none with a real arm, whose target is unknown")
         if chosen.kind == "file":
             return Site(open_own(chosen.where, start_s=start_s))
         assert geometry is not None

@@ -1,4 +1,4 @@
-"""What `probewise explore` is asked for, read and checked: the sensor, the field, what may lie there, the models."""
+"""Read and check the options of `probewise explore`: sensor, field, shapes, models."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ __all__ = ["Inputs", "inputs_of"]
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run starts from.
+    """Checked inputs of a run.
 
-    `other` is the experiment under the sensor model `other_model`, which --both-models shows beside the robot's; None
-    without it. `geometry` is None for an arm that is no LEGO arm.
+    `other` is the experiment under the sensor model `other_model`, which --both-models shows too; otherwise None.
+    `geometry` is None unless the arm is a LEGO arm.
     """
 
     arm: ArmName
@@ -48,13 +48,13 @@ class Inputs:
 
     @property
     def levels(self) -> tuple[float, float]:
-        """The readings over black and over white that the sensor model gives."""
+        """Readings over black and over white under the sensor model."""
         means = self.sensor.mean()
         return means["I_min"], means["I_max"]
 
 
 def inputs_of(arguments: argparse.Namespace) -> Inputs:
-    """Read and check what was asked for.
+    """Read and check the options.
 
     Raises
     ------
@@ -63,9 +63,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     """
     chosen = parse_arm(arguments.arm)
     if chosen.kind == "file" and arguments.geometry is not None:
-        raise ParameterError(
-            "--geometry", str(arguments.geometry), "none with FILE.py, which says itself what it reaches"
-        )
+        raise ParameterError("--geometry", str(arguments.geometry), "none with FILE.py, which defines its own reach")
     geometry = geometry_of(arguments) if chosen.is_lego or arguments.geometry is not None else None
     field = _field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
@@ -114,7 +112,7 @@ def _other(model: Model) -> Model:
 def _choices(
     arguments: argparse.Namespace, geometry: Geometry | None
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
-    """Take orientations in radians, heights and repeats that may be chosen, of an arm that can."""
+    """Return the orientations (radians), heights and repeats to choose from, if the arm supports them."""
     turns, heights_mm = arguments.orientations, arguments.heights
     asked = {"--orientations": turns, "--heights": heights_mm}
     refused = {}
@@ -124,7 +122,7 @@ def _choices(
             "--heights": f"none with the LEGO arm, which reads {geometry.read_height_mm:g} mm above the surface",
         }
     elif arguments.both_models:
-        refused = {"--heights": "none with --both-models, for the naive model knows no height"}
+        refused = {"--heights": "none with --both-models, since the naive model has no height"}
     for option, allowed in refused.items():
         if asked[option] is not None:
             raise ParameterError(option, ",".join(f"{value:g}" for value in asked[option]), allowed)
@@ -132,7 +130,7 @@ def _choices(
 
 
 def _field(text: str | None, geometry: Geometry | None) -> Field:
-    """Take the field that was asked for, which must be the geometry's where there is one."""
+    """Return the given field, which must agree with the geometry if there is one."""
     if geometry is None:
         return parse_field("1048,520" if text is None else text)
     own = Field(*geometry.field_mm)
@@ -144,7 +142,7 @@ def _field(text: str | None, geometry: Geometry | None) -> Field:
 def _levels(
     arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
 ) -> Naive | None:
-    """Take the paper's naive levels from the recording that is given; a simulated sensor reads them now."""
+    """Return the paper's naive levels from the given recording, or from readings of the simulated sensor."""
     if arguments.nested_stop is not None and arguments.method != "paper":
         raise ParameterError("--nested-stop", arguments.nested_stop, "none but with --method paper")
     wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)

@@ -1,4 +1,4 @@
-"""The pictures of `probewise explore`: one a step, the live page, and what is written at the end."""
+"""The pictures of `probewise explore`: one per step, the live page, and the final report."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["Pictures"]
 
 @dataclass
 class Pictures:
-    """Draw each step as it comes; steps and pictures are kept for the report."""
+    """Draws each step as it arrives, and keeps steps and pictures for the report."""
 
     out: Path
     inputs: Inputs
@@ -40,12 +40,12 @@ class Pictures:
     frames: list[bytes] = field(default_factory=list)
 
     def add(self, step: Step, shadow: Step | None) -> None:
-        """Draw a step, with what the other sensor model makes of it, and write its picture."""
+        """Draw a step, with the other sensor model's posterior if there is one, and write its picture."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
         self.frames.append(self._frame(step, shadow))
-        require_going_on()  # a signal may have spoilt the picture
+        require_going_on()  # a signal may have damaged the picture
         if step.number == 1 and not step.replayed:
             _remove_pictures(self.out)
         folder = self.out / "frames"
@@ -89,7 +89,7 @@ class Pictures:
 
 
 def _remove_pictures(out: Path) -> None:
-    """Remove what an earlier run has left in `out`, whose journal is gone, lest the pictures of two runs mix."""
+    """Remove files of an earlier run from `out`, if its journal is gone, so that two runs do not mix."""
     for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png"):
         for path in out.glob(pattern):
             path.unlink()

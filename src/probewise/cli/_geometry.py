@@ -1,4 +1,4 @@
-"""Read what a command line says of a field and of what lies on it."""
+"""Parse options that describe the field, cards and the true shape."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["parse_cards", "parse_field", "parse_truth"]
 
 
 def parse_field(text: str) -> Field:
-    """Read "WIDTH,HEIGHT" in mm."""
+    """Parse "WIDTH,HEIGHT" in mm."""
     try:
         width, height = (float(cell) for cell in text.split(","))
     except ValueError as error:
@@ -24,7 +24,7 @@ def parse_field(text: str) -> Field:
 
 
 def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
-    """Read each "X,Y,WIDTH,HEIGHT,ALBEDO": a card about (X, Y) in mm, which lies on the field."""
+    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card centred at (X, Y) in mm, which must be on the field."""
     cards = []
     for text in texts:
         try:
@@ -43,12 +43,12 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
 
 
 def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> Hidden:
-    """Read "[SHAPE:]V,V,...", the parameters of what lies there; without a text draw it from the prior.
+    """Parse "[SHAPE:]V,V,...", the parameters of the true shape; without a text, draw them from the prior.
 
     Raises
     ------
     ParameterError
-        If the text names no shape, lacks a number, or has one that the shape's prior excludes.
+        If the text names an unknown shape, lacks a number, or has one that the shape's prior excludes.
     """
     if text is None:
         return Hidden.drawn({name: SHAPES[name](field) for name in names}, rng=rng)

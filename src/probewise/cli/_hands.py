@@ -1,4 +1,4 @@
-"""A person at the bench who lays sheets and turns the sensor, and a look at each sheet once it lies."""
+"""Prompts to a person who lays sheets and turns the sensor, and a check of each sheet once it is laid."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ __all__ = ["Hands", "is_pty"]
 
 
 class Hands:
-    """Ask a person for what `carry_out` wants; look over the white and the black of a sheet before it is scanned.
+    """Pass the requests of `carry_out` to a person; check white and black of a sheet before it is scanned.
 
     Parameters
     ----------
     arm
         The arm, entered.
     plan, origin_mm
-        What is carried out, and where its origin lies.
+        The plan, and the place of its origin.
     watch
-        What judges readings.
+        Checks readings against the patterns.
     looks
-        Whether a sheet is looked at before it is scanned. An instrument of one's own takes the plan's readings alone.
+        Whether a sheet is checked before it is scanned; a user's own instrument takes only the plan's readings.
     typed
-        Whether the bench is an emulator's, so that what is to be done is typed in its terminal.
+        Whether the bench is an emulator, so that requests are carried out by typing in its terminal.
     """
 
     def __init__(
@@ -56,21 +56,21 @@ class Hands:
         self._answer = questioner(arm)
 
     def __call__(self, request: Request) -> None:
-        """Ask, and look at what was laid until it is right or the person goes on all the same."""
+        """Prompt, and check the sheet until it is right or the person overrides the check."""
         text = f"{request[0].upper()}{request[1:]}{self._to_type(request)}"
         self._answer(f"{text}, then press Enter: ")
         if request.pattern is None or not self._looks:
             return
         while (wrong := self._look(request.pattern)) is not None:
-            if sys.stdin is None or not sys.stdin.isatty():  # whoever answers from a file lays nothing right
+            if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
                 caution(f"{wrong}; is the right sheet there, the right way round?")
                 break
-            said = self._answer(f"{wrong}. Lay it right and press Enter, or type go to go on all the same: ")
+            said = self._answer(f"{wrong}. Correct it and press Enter, or type go to continue anyway:  ")
             if said.lower() == "go":
                 break
 
     def _to_type(self, request: Request) -> str:
-        """Say what to type in the emulator's terminal."""
+        """Return what to type in the emulator's terminal."""
         if not self._typed:
             return ""
         if request.turned_rad is not None:
@@ -94,5 +94,5 @@ class Hands:
 
 
 def is_pty(port: str) -> bool:
-    """Tell a pseudo-terminal, behind which there is an emulator, from a serial line."""
+    """Return whether a port is a pseudo-terminal, and hence an emulator."""
     return os.path.realpath(port).startswith(("/dev/pts/", "/dev/ttys"))

@@ -1,4 +1,4 @@
-"""The journal of an `explore` run as a recording over a shape that is not known."""
+"""The journal of an `explore` run as a recording over an unknown shape."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ __all__ = ["is_journal", "journal_recording", "journal_sensor", "refuse_journal"
 
 
 def is_journal(path: Path) -> bool:
-    """Tell a journal from a recording by its name."""
+    """Return whether a path is a journal, by its name."""
     return path.suffix == ".jsonl"
 
 
 def refuse_journal(path: Path) -> None:
-    """Refuse a journal where a plan or a recording is needed: what lay under its sensor is not known.
+    """Refuse a journal where a plan or a recording is needed, since the shape below its sensor is unknown.
 
     Raises
     ------
     FileError
-        If it is one.
+        If the path is a journal.
     """
     if is_journal(path):
         raise FileError(
@@ -41,12 +41,12 @@ def refuse_journal(path: Path) -> None:
 
 
 def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
-    """Read a journal: its readings, by that sensor, and what was believed to lie on the field.
+    """Read a journal: its readings by the given sensor, and the hypothesised shape.
 
     Raises
     ------
     FileError
-        If it is no journal, has no reading, or its shape is none that `explore` makes.
+        If it is not a journal, has no reading, or has a shape unknown to `explore`.
     """
     from probewise.experiment import read_journal
 
@@ -58,12 +58,12 @@ def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shap
 
 
 def journal_sensor(path: Path) -> Path:
-    """Find the sensor.json that a journal's run was made with: where it was, or beside the journal.
+    """Find the sensor.json of a journal's run, at its original path or beside the journal.
 
     Raises
     ------
     FileError
-        If the journal names none, or what stands there is another.
+        If the journal names none, or the file found is a different one.
     """
     from probewise.calibration import read_sensor
     from probewise.experiment import read_journal, sensor_named
@@ -82,7 +82,7 @@ def journal_sensor(path: Path) -> Path:
 
 
 def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:
-    """Take the sensor's, with the rounding and the range that the run declared."""
+    """Return the sensor's instrumentation, with the rounding and range that the run declared."""
     try:
         step = settings["options"]["step"]
         low, high = settings["options"]["reading_range"]
@@ -96,7 +96,7 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
 
 
 def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
-    """Build the shape that the first line names, by trying those of the command line."""
+    """Build the shape named in the first line, from those of the command line."""
     from probewise.experiment import shape_named
     from probewise.scene import SHAPES, Field
 

@@ -1,4 +1,4 @@
-"""Bring the sensor to marks on the field, told by a person who watches it."""
+"""Bring the sensor to marks on the field, guided by a person who watches it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Look", "bring"]
 
 STEP_MM = 5.0
-_MOST_MM = 60.0  # in one step
+_MOST_MM = 60.0  # largest step
 _HELP = (
     "Enter: 5 mm down; 'down 2', 'up 2', 'x 4', 'y -2.5' or several of them: mm; 'ok': it is over the cross and just "
     "touches; 'seen': it is over the cross, its height is not known; 'skip'"
@@ -25,14 +25,14 @@ _HELP = (
 
 
 class Look(str):
-    """What a person who watches the sensor is asked, as a sentence.
+    """A question to the person who watches the sensor, as a sentence.
 
     Attributes
     ----------
     mark_mm
-        Where the mark is.
+        Place of the mark.
     block_mm
-        How high what stands on it is.
+        Height of the block on it.
     """
 
     __slots__ = ("block_mm", "mark_mm")
@@ -41,7 +41,7 @@ class Look(str):
     block_mm: float
 
     def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> Look:
-        """Make one of a sentence."""
+        """Build a question from its sentence."""
         look = super().__new__(cls, text)
         look.mark_mm, look.block_mm = mark_mm, block_mm
         return look
@@ -56,9 +56,9 @@ def bring(
     *,
     named: str,
 ) -> Touched | None:
-    """Bring the sensor over a mark and down to the block on it, as a person says; None: the mark is left out.
+    """Bring the sensor over a mark and down to the block on it, as a person directs; None if the mark is skipped.
 
-    Every move goes over the place, turns the base and then comes down, as when the arm reads.
+    Every move turns the base first and then lowers, as in a reading.
 
     Parameters
     ----------
@@ -67,11 +67,11 @@ def bring(
     mark_mm, block_mm
         Place of the mark on the field, and height of the block.
     eyes
-        What answers: "ok", "seen", "skip", or how to move on.
+        Function that answers: "ok", "seen", "skip", or a move.
     tell
-        Where it is said why a move was not made.
+        Function that reports why a move was refused.
     named
-        What the mark is called.
+        Name of the mark.
     """
     from probewise.arm.touched import Touched
 
@@ -101,7 +101,7 @@ def bring(
 
 
 def _moved(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
-    """Say where an answer leads; None where it is none."""
+    """Return the place after the move of an answer; None if it is not a move."""
     words = answer.split() or ["down", str(STEP_MM)]
     x, y, height = at_mm
     if len(words) % 2:

@@ -1,9 +1,8 @@
-"""Where results go: checked before any work, put in place all or none, no input lost.
+"""Output files: checked before any work, written all or none, without losing any input.
 
-The files of a command are written into a hidden folder inside `--out`. When all are complete, a file
-`commit.json` there says so and lists them; only then are they moved. A process that is killed before that
-has changed nothing; one that is killed later has left the list, by which the next command with the same
-`--out` puts the rest in place before its own.
+The files of a command are written into a hidden folder inside `--out`. When all are complete, a file `commit.json`
+there lists them; only then are they moved. A process killed before that has changed nothing; after that, the next
+command with the same `--out` finds the list and moves the remaining files first.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from probewise.errors import FileError, ParameterError
 __all__ = ["Stage", "check_out_directory", "check_out_file", "staged"]
 
 _FOLDER, _COMMIT = ".writing", "commit.json"
-_PATIENCE_S = 600.0  # for another command that is writing its results just now
+_PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
 class Stage:
-    """An empty directory to write results into, and what was set aside for them.
+    """An empty directory to write results into, and the files that were renamed to make way for them.
 
     Attributes
     ----------
     folder
         The directory.
     kept
-        Where each file went that a result would have replaced, and that this run had read.
+        New name of each input file that a result would have replaced.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,18 +47,18 @@ class Stage:
 
     @property
     def notes(self) -> list[str]:
-        """What was set aside, in words."""
+        """The renamed files, in words."""
         return [f"what was {path} is now {now}" for path, now in self.kept.items()]
 
 
 def check_out_directory(path: Path) -> Path:
-    """Refuse, before any work, a place where no directory can be made."""
+    """Raise, before any work, if no directory can be made there."""
     if path.exists() and not path.is_dir():
         raise ParameterError("--out", str(path), "a directory, existing or new; this is a file")
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
     if not parent.is_dir():
         raise ParameterError("--out", str(path), f"a directory; {parent} is a file")
-    try:  # a permission says too little: nobody can write to /proc, or to a disk that is mounted for reading
+    try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=parent))
     except OSError as error:
         raise FileError(path, f"{parent} cannot be written to", "a directory you may write to") from error
@@ -67,7 +66,7 @@ def check_out_directory(path: Path) -> Path:
 
 
 def check_out_file(path: Path, *inputs: Path) -> Path:
-    """Refuse, before any work, a place where no file can be written, and one that would overwrite an input."""
+    """Raise, before any work, if no file can be written there or it would overwrite an input."""
     if path.is_dir():
         raise ParameterError("--out", str(path), "a file name; this is a directory")
     for taken in inputs:
@@ -79,7 +78,7 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
 
 @contextlib.contextmanager
 def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
-    """Yield an empty directory; move its files into `out` only when the block ends well.
+    """Yield an empty directory; move its files into `out` only if the block succeeds.
 
     An error or a signal before that leaves `out` as it was.
 
@@ -88,17 +87,17 @@ def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = 
     out
         Where the results go; made if missing.
     inputs
-        Files that this run had read: one that a result would replace is set aside under a name of its own.
+        Input files of this run: one that a result would replace is renamed.
     outdated
-        Patterns of files that an earlier run may have left in `out`: what this run did not write anew is removed.
+        Patterns of an earlier run's files in `out`, which are removed unless this run writes them.
 
     Raises
     ------
     FileError
-        If `out` cannot be made or written to, another process writes results there for long, or a
-        directory stands where a file has to go.
+        If `out` cannot be made or written to, another process writes there for too long, or a directory has the name of
+        a result.
     """
-    from probewise.recordings import locked, write_text_atomically  # here: the help does without
+    from probewise.recordings import locked, write_text_atomically  # imported here, since the help does not need it
 
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -129,7 +128,7 @@ def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = 
 
 @dataclass(frozen=True)
 class _Commit:
-    """What is to be done to `out`, names relative to it: `names` move in, what `aside` lists makes way for them."""
+    """Changes to make in `out`, with relative names: move `names` in after renaming `aside`, and delete `remove`."""
 
     names: Sequence[str]
     aside: Mapping[str, str]
@@ -149,9 +148,9 @@ def _commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[
 
 
 def _settle(out: Path) -> None:
-    """Finish what a complete list in `out` asks for; throw away what came to no list.
+    """Complete the changes of an interrupted commit in `out`; discard incomplete results.
 
-    Every step can be done twice, so that it does not matter where the process before this one was killed.
+    Every step is idempotent, so that it does not matter where the earlier process was killed.
     """
     folder = out / _FOLDER
     if not folder.exists():
@@ -183,7 +182,7 @@ def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
 
 
 def _aside(out: Path, names: Sequence[str]) -> dict[str, str]:
-    """Find for each file the first free NAME_kept, NAME_kept_2 ...; files of one name keep one name."""
+    """Find for each file the first free NAME_kept, NAME_kept_2 ...; files of one stem get the same ending."""
     aside: dict[str, str] = {}
     for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
         group = [Path(name) for name in names if Path(name).with_suffix("") == stem]

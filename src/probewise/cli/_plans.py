@@ -1,4 +1,4 @@
-"""A plan as an arm will read it: unit, range and step of its readings, and what of it can be commanded."""
+"""Adapt a plan to an arm: unit, range and step of its readings, and the columns that can be commanded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["commanded", "plan_named", "read_by_lego", "read_by_own"]
 
 
 def plan_named(text: str) -> Plan:
-    """Read a plan from its file, or take one that ships: paper, two_way."""
+    """Read a plan from its file, or return a shipped one: paper, two_way."""
     from probewise.recordings import paper_plan, read_plan, two_way_plan
 
     shipped = {"paper": paper_plan, "two_way": two_way_plan}
@@ -24,9 +24,9 @@ def plan_named(text: str) -> Plan:
 
 
 def read_by_own(plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None) -> Plan:
-    """Take the plan for what an instrument of one's own reads: as its JSON says, or the options do."""
+    """Return the plan with the instrumentation of a user's own instrument, from its JSON or the options."""
     said: dict[str, object] = {} if unit is None else {"unit": unit}
-    if unit is not None:  # what was declared was of another unit
+    if unit is not None:  # the declared values have another unit
         said |= {"min": None, "max": None, "step": None, "sensor": ""}
     if range_ is not None:
         said |= dict(zip(("min", "max"), _numbers("--range", range_, 2), strict=True))
@@ -36,7 +36,7 @@ def read_by_own(plan: Plan, *, unit: str | None = None, range_: str | None = Non
 
 
 def read_by_lego(plan: Plan, geometry: Geometry) -> Plan:
-    """Take the plan for what the LEGO arm reads: percent, at its height."""
+    """Return the plan with the instrumentation of the LEGO arm: percent, at its reading height."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
         unit="LEGO",
@@ -50,7 +50,7 @@ def read_by_lego(plan: Plan, geometry: Geometry) -> Plan:
 
 
 def commanded(plan: Plan) -> Plan:
-    """Keep of a plan's covariates those that can be commanded: others were read when it was carried out before."""
+    """Keep only the covariates that can be commanded; others are measurements of an earlier recording."""
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
 

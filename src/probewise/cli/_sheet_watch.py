@@ -1,4 +1,4 @@
-"""See at once whether what lies under the sensor is what a plan says: white bright, black dark."""
+"""Check during recording whether the sheets match the plan: white reads bright, black dark."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["SheetWatch"]
 
-_SEES_MM = 14.0  # so far around it the sensor sees
-_LOOK_MM = 25.0  # beside the plan's places a sheet still shows the pattern
-_SHARE = 0.05  # of the range of readings: white and black are at least so far apart
-_OFF = 0.35  # of the way from one level to the other: no noise leads so far
+_SEES_MM = 14.0  # radius of the sensor's view
+_LOOK_MM = 25.0  # margin around the plan's places within which a sheet shows its pattern
+_SHARE = 0.05  # least contrast of white and black, as a share of the range of readings
+_OFF = 0.35  # largest deviation from a level, as a share of the contrast; beyond any noise
 _FEWEST = 3
-_SPREAD_SHARE = 0.15  # of the range: readings of one shade lie closer together
+_SPREAD_SHARE = 0.15  # largest spread of readings of one shade, as a share of the range
 
 _AROUND_MM = np.stack(
     [
@@ -33,14 +33,14 @@ _AROUND_MM = np.stack(
 
 
 class SheetWatch:
-    """Compare readings with the shade that the sensor sees nothing but.
+    """Checks readings taken over uniform white or black.
 
     Parameters
     ----------
     plan
-        Its patterns, and the range of its readings.
+        The plan, with its patterns and the range of readings.
     white_is_bright
-        Whether white is known to read higher than black, as with the light sensor of the LEGO arm.
+        Whether white is known to read higher than black, as with the LEGO light sensor.
     """
 
     def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:
@@ -55,7 +55,7 @@ class SheetWatch:
             self._shades[rows] = shades(plan.patterns[name], places[rows])
 
     def heard(self, row: int, value: float) -> str | None:
-        """Take a reading of the plan's; say what is wrong with it, once a sheet and shade."""
+        """Check a reading of the plan; return the complaint, once per sheet and shade, or None."""
         shade = self._shades[row]
         if math.isnan(shade) or math.isnan(value):
             return None
@@ -71,7 +71,7 @@ class SheetWatch:
         return f"sheet {name!r} contradicts its pattern: at {place} it is {_shade(is_white)}, and {wrong}"
 
     def looked(self, name: str, values: dict[bool, float]) -> str | None:
-        """Judge readings taken over the white and the black of a sheet; keep them where they are right."""
+        """Check readings over the white and the black of a sheet, and keep them if they are right."""
         wrong = None
         if len(values) == 2:
             contrast = values[True] - values[False]
@@ -87,14 +87,14 @@ class SheetWatch:
         return None
 
     def places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
-        """Choose where to look at a sheet that was laid: over nothing but white and nothing but black, by shade.
+        """Choose places for checking a sheet: over uniform white and uniform black, by shade.
 
         Parameters
         ----------
         name
             The pattern.
         allowed
-            Tells which places, (n, 2) in the plan's frame, the arm can take.
+            Function that returns which places, (n, 2) in the plan's frame, are reachable.
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
@@ -134,7 +134,7 @@ class SheetWatch:
 
 
 def shades(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
-    """Tell what the sensor sees nothing but at each place, (n, 2): 1 white, 0 black, NaN both or grey; (n,)."""
+    """Return the uniform shade below the sensor at each place, (n, 2): 1 white, 0 black, NaN mixed or grey; (n,)."""
     seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
     albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
     low, high = albedo.min(axis=1), albedo.max(axis=1)

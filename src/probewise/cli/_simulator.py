@@ -1,4 +1,4 @@
-"""What verbs share that take a person's simulator: its file and tables read, and calls of it counted as they go."""
+"""Options and readers shared by the verbs that take a user's simulator."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_simulator(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
-    """Refuse options that only a light sensor has.
+    """Refuse options that apply only to light sensors.
 
     Raises
     ------
@@ -38,18 +38,18 @@ def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
         value = getattr(arguments, name)
         if value is not None and value is not False:
             option = f"--{name.replace('_', '-')}"
-            raise ParameterError(option, str(value), "nothing beside --simulator, which takes its place")
+            raise ParameterError(option, str(value), "none with --simulator, which replaces it")
 
 
 def read_tables(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
-    """Read tables of one system as one, with what is to be noted of their columns.
+    """Read and join tables of one system; also return notes on their columns.
 
     Raises
     ------
     FileError
-        If one cannot be read, lacks a column that the simulator names, or holds something that cannot be used.
+        If one cannot be read, lacks a column that the simulator names, or has unusable content.
     ParameterError
-        If two are the same.
+        If two tables are the same.
     """
     from probewise.systems import join_tables, read_run_table
 

@@ -1,9 +1,9 @@
-"""One way to stop a command, whichever signal asks for it: Ctrl-C, `kill`, a closed terminal.
+"""Interrupt a command in one way for all signals: Ctrl-C, `kill`, a closed terminal.
 
-The first signal raises `Stopped` where the program stands, so that `with` blocks release the motors and
-remove what is half written. More signals within a second are the same request; a later one raises again,
-which cuts a clean-up short. Libraries may swallow an exception that arises inside them, or turn it into
-another: `require_going_on` raises again, and whatever ends a command after a signal counts as the stop.
+The first signal raises `Stopped` in the main thread, so that `with` blocks release the motors and remove incomplete
+files. More signals within a second count as the same request; a later one raises again, which cuts clean-up short.
+Libraries may swallow or convert an exception: `require_going_on` raises it again, and any exception that ends a command
+after a signal counts as the interruption.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["Stopped", "require_going_on", "saying_what_is_kept", "stoppable"]
 
 
 class Stopped(KeyboardInterrupt):
-    """Report that a signal, its `number`, has asked the program to end; the text says what is kept."""
+    """Raised after a signal, its `number`; the text says what is kept."""
 
     def __init__(self, number: int = signal.SIGINT, kept: str = "") -> None:
         self.number = number
@@ -30,12 +30,12 @@ class Stopped(KeyboardInterrupt):
 
     @property
     def status(self) -> int:
-        """The exit status that shells expect of a program that a signal has ended."""
+        """The exit status that shells expect after a signal."""
         return 128 + self.number
 
 
 class _Request:
-    """Whether the program has been asked to stop: by which signal, and when last."""
+    """The last request to stop: signal number and time."""
 
     number: int | None = None
     at_s: float = 0.0
@@ -46,7 +46,7 @@ _request = _Request()
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
-    """Let signals stop the block; whatever it raises after one leaves it as `Stopped`.
+    """Let signals interrupt the block; any exception after a signal becomes `Stopped`.
 
     A signal that is ignored, as under `nohup`, stays ignored.
     """
@@ -70,21 +70,21 @@ def stoppable() -> Iterator[None]:
 
 
 def require_going_on() -> None:
-    """Raise `Stopped` where a signal has come whose exception somebody swallowed."""
+    """Raise `Stopped` again if a signal's exception was swallowed."""
     if _request.number is not None:
         raise Stopped(_request.number)
 
 
 @contextlib.contextmanager
 def saying_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
-    """Add to the last words of a run that a signal or a dead line ends what of it is on the disk.
+    """Add what is kept on disk to the final message of a run that a signal or a lost connection ends.
 
     Parameters
     ----------
     kept
-        Says it.
+        Function that returns that message.
     results
-        The run is over and writes its results: add it to what is wrong with a file too.
+        Whether the run is over and writes its results, so that file errors get the message too.
     """
     try:
         yield
@@ -108,7 +108,7 @@ def _ask(number: int, frame: FrameType | None) -> None:
 
 
 def _asked(error: BaseException) -> Stopped | None:
-    """Read the request to stop that an exception is the outcome of; None where it has another cause."""
+    """Return the stop request that caused an exception, or None."""
     if isinstance(error, Stopped):
         return error
     if _request.number is not None:

@@ -1,4 +1,4 @@
-"""Processes of our own, which end with the command, also when it is stopped."""
+"""Worker processes, which end with the command, also if it is interrupted."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 def workers(n: int) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of `n` processes with one thread of linear algebra each.
 
-    Processes are spawned, not forked, so that it works alike on every system.
+    Processes are spawned, not forked, for the same behaviour on every system.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -38,5 +38,5 @@ def _quiet_worker() -> None:
 
     from probewise.errors import DoubtfulResultWarning
 
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # end at once on Ctrl-C; the command says what was kept
-    warnings.simplefilter("ignore", DoubtfulResultWarning)  # the results hold the reasons, and the report shows them
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # end at once on Ctrl-C; the command reports what was kept
+    warnings.simplefilter("ignore", DoubtfulResultWarning)  # the results hold the warnings, and the report shows them

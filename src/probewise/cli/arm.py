@@ -1,4 +1,4 @@
-"""`probewise arm`: the arm at the bench, one task at a time."""
+"""`probewise arm`: tasks at the bench with the arm."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ __all__ = ["TASKS", "VERB"]
 PAPER = "paper"
 MARKS = "marks"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
-_MOST_READINGS = 100_000  # of one scan
-_OFF_PLAN_MM = 5.0  # an instrument of one's own may know better where it read
+_MOST_READINGS = 100_000  # limit of one scan
+_OFF_PLAN_MM = 5.0  # tolerance in mm, since a user's own instrument may report the true place
 BLOCK_MM = 32.0
 WHITE = "uniform:1"
 _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
@@ -63,13 +63,13 @@ UNITS = "LEGO units (1 dark to 100 bright)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
 
-    check = _task(tasks, "check", "Check a geometry file, and a brick; say and draw how far the arm reaches.")
+    check = _task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
     _add_arm(check)
-    check.add_argument("--out", type=a_path, metavar="REACH.png", help="where the drawing goes (default: none is made)")
-    check.add_argument("--drawing", type=a_path, metavar="ARM.png", help="draw the arm with its lengths there")
+    check.add_argument("--out", type=a_path, metavar="REACH.png", help="file of the drawing (default: none)")
+    check.add_argument("--drawing", type=a_path, metavar="ARM.png", help="file of a drawing with the arm's lengths")
 
     jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
     jog.add_argument(
@@ -105,9 +105,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_number("mm"),
         default=TOUCH_MM,
         metavar="MM",
-        help=f"how well a mark is met, sd of place and height (default {TOUCH_MM:g})",
+        help=f"accuracy of a mark, sd of place and height (default {TOUCH_MM:g})",
     )
-    fit.add_argument("--resume", action="store_true", help="go on behind the marks that MARKS.csv holds")
+    fit.add_argument("--resume", action="store_true", help="continue after the marks in MARKS.csv")
 
     home = _task(tasks, "home", "Bring all joints to where their counters are 0.", moves=True)
     home.add_argument(
@@ -151,20 +151,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y",
         help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)",
     )
-    own = record.add_argument_group("with FILE.py", "what its readings are, where the plan's JSON does not say it")
+    own = record.add_argument_group("with FILE.py", "properties of the readings, if not in the plan's JSON")
     own.add_argument("--unit", metavar="UNIT", help="unit of a reading, such as V or counts")
-    own.add_argument("--range", metavar="LOW,HIGH", help="least and greatest reading there is, such as 0,1023")
-    own.add_argument("--step", metavar="STEP", help="what readings are whole multiples of, such as 1")
+    own.add_argument("--range", metavar="LOW,HIGH", help="smallest and largest possible reading, such as 0,1023")
+    own.add_argument("--step", metavar="STEP", help="rounding step of the readings, such as 1")
     for task, scene in ((scan, True), (record, False)):
         simulated = task.add_argument_group("with simulated and emulator")
         simulated.add_argument(
             "--sensor", type=a_path, metavar="S.json", help="its sensor (default: that of the shipped recordings)"
         )
-        simulated.add_argument("--seed", type=seed_number, metavar="N", help=f"of its noise (default {DEFAULT_SEED})")
+        simulated.add_argument("--seed", type=seed_number, metavar="N", help=f"seed of noise (default {DEFAULT_SEED})")
         if scene:
-            simulated.add_argument("--scene", metavar="X,Y,R", help="what lies there, as emulate-nxt takes it")
+            simulated.add_argument("--scene", metavar="X,Y,R", help="target on the field, as for emulate-nxt")
     record.set_defaults(scene=None)
-    record.add_argument("--resume", action="store_true", help="go on behind the readings that REC.csv holds")
+    record.add_argument("--resume", action="store_true", help="continue after the readings in REC.csv")
 
 
 def _task(
@@ -178,7 +178,7 @@ def _task(
     parser = tasks.add_parser(name, help=summary, description=summary)
     if moves:
         _add_arm(parser, own=own)
-        parser.add_argument("--dry-run", action="store_true", help="print the moves, from home, and make none")
+        parser.add_argument("--dry-run", action="store_true", help="only print the moves, from home")
     add_geometry(parser)
     add_quiet(parser)
     return parser
@@ -193,7 +193,7 @@ def _add_arm(parser: argparse.ArgumentParser, *, own: bool = False) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Do one task."""
+    """Run one task."""
     TASKS[arguments.task](arguments, geometry_of(arguments))
     return 0
 
@@ -224,7 +224,7 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
             quiet=arguments.quiet,
         )
     if geometry.accuracy is None:
-        known = "nobody has fitted it: where home is 2 degrees off on both links the sensor hangs up to"
+        known = "not fitted to marks: with home 2 degrees off on both links the sensor hangs up to"
     else:
         known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
     say(
@@ -245,7 +245,7 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 
 def _check_brick(port: str, geometry: Geometry) -> None:
-    """Ask the brick who it is and whether it is fit to work; nothing moves."""
+    """Report the brick's name, firmware and battery, and check that it is ready; nothing moves."""
     from probewise.arm import in_lego_units
 
     with open_brick(port) as brick:
@@ -276,7 +276,7 @@ def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _say_position(arm, quiet=arguments.quiet)
                 if arguments.down:
-                    _asker(arguments, arm)("look how the sensor stands; it is raised again")
+                    _asker(arguments, arm)("check the sensor's position; it will be raised again")
         case [joint, text] if joint in JOINTS:
             try:
                 by_rad = math.radians(float(text))
@@ -313,11 +313,10 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     source = arguments.geometry or shipped_geometry()
     out = check_out_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
     if arguments.dry_run:
-        raise ParameterError("--dry-run", True, "none with fit-geometry: its moves are what a person says")
+        raise ParameterError("--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
         raise CommandError(
-            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit marks that are there, "
-            "--marks MARKS.csv"
+            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit existing marks, --marks MARKS.csv"
         )
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
@@ -327,12 +326,12 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     say(fitted.summary(), quiet=arguments.quiet)
     text = with_fitted(source.read_text(encoding="utf-8-sig"), fitted.geometry)
     write_text_atomically(out, text)
-    read_geometry(out)  # what a person has written above the numbers must not have hidden one
+    read_geometry(out)  # check that edits by hand have not hidden a number
     say(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
 
 
 def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
-    """Bring the sensor to one mark after another, and keep each at once."""
+    """Bring the sensor to one mark after another, and save each at once."""
     from probewise.arm import LegoArm
     from probewise.arm.marks import marks_of
     from probewise.arm.touched import Touched, read_touched, write_touched
@@ -458,7 +457,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     if arguments.readings > _MOST_READINGS:
         raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
     places = np.linspace(start, end, arguments.readings)
-    if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before the brick is called
+    if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before connecting to the brick
         require_reach(geometry, places, "reading of the scan")
     names: list[str] = ["battery_mv"]
     instrument, _ = _instrument(arguments, geometry)
@@ -518,8 +517,8 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
             ask = Hands(arm, plan, origin, watch, looks=not own, typed=not own and is_pty(_port(arguments.arm)))
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             say(
-                f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; {BY_HAND_S:g} s of it each time "
-                "that you are asked for something",
+                f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
+                f"each step by hand",
                 quiet=arguments.quiet,
             )
         readings = carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
@@ -538,7 +537,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 
 def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
-    """Take the plan for what the sensor of a simulated arm reads."""
+    """Return the plan with the instrumentation of a simulated arm's sensor."""
     import dataclasses
 
     from probewise.calibration import read_sensor
@@ -547,7 +546,7 @@ def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
 
 
 def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
-    """Read back the readings of an earlier go, which must be those of the plan's first rows."""
+    """Read the readings of an earlier session, which must match the plan's first rows."""
     import numpy as np
 
     from probewise.arm import readings_of
@@ -565,7 +564,7 @@ def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Rea
     off_mm = [abs(getattr(rows, axis) - getattr(first, axis)) for axis in ("x_mm", "y_mm")] if same_length else []
     same = same_length and all((off <= _OFF_PLAN_MM).all() for off in off_mm)
     if not same or [rows.pattern_names[k] for k in rows.pattern] != [first.pattern_names[k] for k in first.pattern]:
-        raise FileError(out, "readings of another plan", "the first rows of this plan, as an earlier go left them")
+        raise FileError(out, "readings of another plan", "the first rows of this plan, from an earlier session")
     return readings_of(before)
 
 
@@ -589,7 +588,7 @@ def _instrument(
     n_taken: int = 0,
     scene: str = SCENE,
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
-    """Open the arm of a task that every arm can do, and the bench below it if that is simulated too."""
+    """Open the arm for a task that every arm can do, with a simulated bench if it has one."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":
         _refuse(arguments, "a real arm", "sensor", "scene", "seed")
@@ -618,7 +617,7 @@ def _instrument(
 def _take_care(
     arguments: argparse.Namespace, instrument: LegoArm | OwnInstrument | SimulatedArm, geometry: Geometry
 ) -> None:
-    """Warn of a geometry that may lead the sensor into the table; lower it step by step where somebody looks on."""
+    """Warn of a geometry with which the sensor may hit the table; lower in steps if a person can watch."""
     import sys
 
     from probewise.arm import LegoArm
@@ -639,7 +638,7 @@ def _refuse(arguments: argparse.Namespace, what: str, *names: str) -> None:
 
 
 def _is_own(arguments: argparse.Namespace) -> bool:
-    """Tell an instrument of one's own."""
+    """Return whether the arm is a user's own instrument."""
     return arguments.arm is not None and parse_arm(arguments.arm).kind == "file"
 
 

@@ -1,4 +1,4 @@
-"""`probewise audit`: before any data, what a plan cannot see, cannot tell apart, and what would cure that."""
+"""`probewise audit`: which effects a plan cannot detect or tell apart, and which readings would help."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "plan",
         type=a_path,
@@ -30,20 +30,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sensor",
         type=a_path,
         metavar="S.json",
-        help="the sensor as calibrated; without, a typical one is expected",
+        help="the calibrated sensor (default: a typical one)",
     )
     add_simulator(parser)
     parser.add_argument(
         "--out",
         type=a_path,
         metavar="DIR",
-        help="directory for audit.json, audit.png, report.html and the plan that cures; without, only the text",
+        help="directory for audit.json, audit.png, report.html and cure_plan.csv; without it, only the text",
     )
     add_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Audit, say it on one screen, and write it where asked."""
+    """Audit, print the summary, and write the results if requested."""
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
     from probewise.diagnosis import audit_plan
@@ -99,4 +99,4 @@ def _write(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
     return stage.notes
 
 
-VERB = Verb("audit", "Say before any data what a plan cannot see and cannot tell apart.", add_arguments, run)
+VERB = Verb("audit", "List, before any data, the effects that a plan cannot detect or tell apart.", add_arguments, run)

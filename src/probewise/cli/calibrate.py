@@ -1,4 +1,4 @@
-"""`probewise calibrate`: a sensor model from a recording, its number of Gaussians chosen by evidence."""
+"""`probewise calibrate`: fit a sensor model to a recording, with the number of Gaussians chosen by evidence."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_LIVE = 100_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument("recording", type=a_path, metavar="REC.csv", help="recording, its JSON beside it")
     add_out_directory(parser)
     parser.add_argument(
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=list(ORDERS),
         metavar="N",
-        help=f"numbers of Gaussians to weigh (default {' '.join(map(str, ORDERS))})",
+        help=f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})",
     )
     parser.add_argument(
         "--live",
@@ -40,9 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=("refined", "quick", "paper"),
         default=CALIBRATION,
-        help="refined (default): widths evenly probable over orders of magnitude, each evidence refined by importance "
-        "sampling; quick: the same prior, but only one Gaussian is searched for, more are reached by sequential Monte "
-        "Carlo; or as in the paper: uniform priors, the evidence of nested sampling alone",
+        help="refined (default): log-uniform priors of widths, each evidence refined by importance sampling; quick: "
+        "the same priors, nested sampling for one Gaussian only, sequential Monte Carlo for more; paper: uniform "
+        "priors, evidence by nested sampling alone",
     )
     parser.add_argument(
         "--nested-stop",
@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _enough_live(n_live: int, orders: Sequence[int]) -> int:
-    """Refuse, before any work, live points too few for the parameters of so many Gaussians."""
+    """Raise, before any work, if the live points are too few for the number of parameters."""
     from probewise.nested import LIVE_PER_PARAM, least_live
 
     if n_live > MOST_LIVE:
@@ -113,4 +113,4 @@ def _enough_live(n_live: int, orders: Sequence[int]) -> int:
     raise ParameterError("--orders", max(orders), f"up to {most} with --live {n_live}; {takes}")
 
 
-VERB = Verb("calibrate", "Fit the sensor model of a recording; weigh numbers of Gaussians.", add_arguments, run)
+VERB = Verb("calibrate", "Fit the sensor model of a recording; choose the number of Gaussians.", add_arguments, run)

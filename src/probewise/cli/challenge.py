@@ -1,4 +1,4 @@
-"""`probewise challenge`: what a diagnosis is worth, on concealed recordings of another simulator."""
+"""`probewise challenge`: measure the diagnosis on simulated recordings with concealed effects."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     add_out_directory(parser)
     parser.add_argument(
         "--cases",
         type=positive_int,
         default=60,
         metavar="N",
-        help="recordings, always the first of the seed's; 60 are one of each kind, 6000 the whole table (default 60)",
+        help="number of recordings, always the first of the seed; 60 are one of each kind, 6000 the whole table "
+        "(default 60)",
     )
     parser.add_argument(
         "--systems",
@@ -34,14 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_int,
         default=1,
         metavar="N",
-        help="take the readings that the diagnosis asks for, until it is settled, N rounds at most (default 1: none)",
+        help="take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: none)",
     )
     add_executor(parser)
     add_common(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run what is left of the challenge and write its table."""
+    """Run the remaining cases of the challenge and write its table."""
     from probewise._progress import progress_shown
     from probewise.challenge import Investigated, run_case, run_challenge, score, score_rounds
     from probewise.challenge.systems import run_system_case, score_systems
@@ -87,4 +88,4 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-VERB = Verb("challenge", "Measure what a diagnosis is worth, on concealed recordings.", add_arguments, run)
+VERB = Verb("challenge", "Measure how good a diagnosis is, on recordings with concealed effects.", add_arguments, run)

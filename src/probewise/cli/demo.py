@@ -1,4 +1,4 @@
-"""`probewise demo`: the main job, the paper end to end on the recordings that ship with the package."""
+"""`probewise demo`: the paper end to end, on the recordings that ship with the package."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ __all__ = ["VERB"]
 
 MODELS: tuple[Model, ...] = ("naive", "ssf")
 MODEL_NAMES: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
-N_LIVE = 100  # of the calibration; --full takes the paper's 300
+N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
 N_LIVE_ROBOT = 100
 MAX_READINGS = 80
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     add_out_directory(parser)
     parser.add_argument(
-        "--full", action="store_true", help="weigh one to four Gaussians with 300 live points, as the paper does"
+        "--full", action="store_true", help="compare one to four Gaussians with 300 live points, as in the paper"
     )
     add_common(parser)
 
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[str, ...]:
-    """Do it all, and give what there is to say of it."""
+    """Run all steps, and return the lines to print."""
     import json
     import time
 
@@ -130,7 +130,7 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
 
 
 def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[float, ...]) -> list[Search]:
-    """Set each model's run beside what lay there."""
+    """Combine each model's run with the true circle."""
     import numpy as np
 
     from probewise.report.demo import Search
@@ -144,14 +144,14 @@ def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[
 
 
 def hypothesis() -> Circle:
-    """Say what the robot is told and the hidden circle drawn from: wholly on the field, radius 50 to 150 mm."""
+    """Return the prior of the circle: entirely on the field, radius 50 to 150 mm."""
     from probewise.scene import Circle
 
     return Circle(radius_mm=(50.0, 150.0), inside=True)
 
 
 def hidden_circle(seed: int) -> tuple[float, ...]:
-    """Draw the circle to be found: x, y, radius in mm."""
+    """Draw the hidden circle: x, y, radius in mm."""
     import numpy as np
 
     drawn = hypothesis().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
@@ -174,7 +174,7 @@ def _calibrate(seed: int, full: bool, pool: Executor) -> Calibration:
 
 
 def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> tuple[Exploration, list[bytes]]:
-    """Find the circle from nothing; the run, and a picture of each step."""
+    """Search for the circle from an empty field; return the run and a picture of each step."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run, surface_of
@@ -212,7 +212,7 @@ def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: 
 
 
 def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
-    """Find the circle from a first reading at a place on it, the same for every model, by the paper's rule."""
+    """Search for the circle by the paper's rule, from a first reading on it that all models share."""
     import numpy as np
 
     from probewise.arm import Pose
@@ -225,7 +225,7 @@ def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], se
     experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy())
     x_mm, y_mm, radius_mm = truth
     away, turn = np.random.default_rng([seed, 5]).random(2)
-    away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn  # anywhere on the circle alike
+    away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn  # uniform over the circle
     first = Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
     surface = surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
@@ -233,7 +233,7 @@ def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], se
 
 
 def _diagnose(seed: int) -> Diagnosis:
-    """Diagnose the second recording as `probewise diagnose` does, to the same numbers."""
+    """Diagnose the second recording, with the same result as `probewise diagnose`."""
     from probewise.cli.diagnose import generators
     from probewise.diagnosis import diagnose
     from probewise.recordings import read_recording, shipped
@@ -242,4 +242,4 @@ def _diagnose(seed: int) -> Diagnosis:
     return diagnose(read_recording(shipped("concealed")), rng=rng)
 
 
-VERB = Verb("demo", "Do all of it: calibrate, find a hidden circle with two models, diagnose.", add_arguments, run)
+VERB = Verb("demo", "Run everything: calibrate, find a hidden circle with two models, diagnose.", add_arguments, run)

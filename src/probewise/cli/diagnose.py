@@ -25,7 +25,7 @@ OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "recordings",
         type=a_path,
@@ -44,7 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thorough",
         action="store_true",
-        help="weigh the leading hypotheses again by nested sampling, which wins where it disagrees (says how long)",
+        help="compute the evidence of the leading hypotheses also by nested sampling, which takes precedence (reports "
+        "its duration)",
     )
     add_out_directory(parser)
     add_common(parser)
@@ -77,12 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
             recordings.append(recording)
             shapes.append(shape)
         if len(shapes) > 1:
-            raise ParameterError("journals", len(shapes), "one at a time: each run has an unknown shape of its own")
+            raise ParameterError("journals", len(shapes), "one at a time: each run has its own unknown shape")
         diagnosis_rng, nested_rng, files_rng = generators(arguments.seed)
         joined = join(recordings)
         null = None
         if sensor is not None and shapes:
-            progress("looking for shapes that fit")
+            progress("searching for shapes that fit")
             null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
         weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=progress)
         diagnosis = diagnose(
@@ -111,14 +112,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def generators(seed: int) -> Sequence[np.random.Generator]:
-    """Give the randomness of a diagnosis, of its nested sampling, and of the samples in its files."""
+    """Return the generators of a diagnosis, of its nested sampling, and of the samples in its files."""
     import numpy as np
 
     return np.random.default_rng(seed).spawn(3)
 
 
 def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:
-    """List what must not be lost: all that was read, and a plan of an earlier run that was filled in with readings."""
+    """List files to keep: all input files, and the next plan of an earlier run if readings were filled in."""
     from probewise.diagnosis import NEXT_PLAN
 
     read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
@@ -130,7 +131,7 @@ def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:
 
 
 def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *, rng: np.random.Generator) -> None:
-    """Write everything but the page: diagnosis.json, the two sensor models, the next plan, the figures."""
+    """Write diagnosis.json, both sensor models, the next plan and the figures, but not the report."""
     import json
 
     from probewise.calibration import write_sensor

@@ -1,4 +1,4 @@
-"""`probewise emulate-nxt`: a LEGO brick with the arm on it, behind a serial device, for those who own none."""
+"""`probewise emulate-nxt`: emulate a LEGO brick with the arm, behind a serial device."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "--scene",
         default=SCENE,
@@ -108,14 +108,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Listener:
-    """Do what a person types: another scene, `turn DEGREES`, `where`; tell when the sensor is in the table."""
+    """Executes typed commands: another scene, `turn DEGREES`, `where`; reports if the sensor is in the table."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
         self._is_in_table = False
 
     def listen(self) -> None:
-        """Take what has been typed, without waiting; from a terminal only in its foreground, as shells want it."""
+        """Read typed input without waiting; from a terminal only in the foreground, as job control requires."""
         stand = self._bench.arm.stand()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0
@@ -139,7 +139,7 @@ class _Listener:
 
 
 def _where(stand: Stand) -> str:
-    """Say where the sensor is, as somebody sees who looks at it."""
+    """Describe the sensor's position."""
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
 
@@ -147,12 +147,12 @@ def _is_foreground() -> bool:
     try:
         return not os.isatty(0) or os.tcgetpgrp(0) == os.getpgrp()
     except OSError:
-        return True  # a terminal that controls nobody
+        return True  # not a controlling terminal
 
 
 @contextlib.contextmanager
 def _trace(path: Path | None) -> Iterator[Trace]:
-    """Yield what writes a line a telegram, with the seconds since the start."""
+    """Yield a function that writes one line per telegram, with the seconds since the start."""
     from probewise.emulator.radio import no_trace
 
     if path is None:
@@ -167,4 +167,4 @@ def _trace(path: Path | None) -> Iterator[Trace]:
         yield note
 
 
-VERB = Verb("emulate-nxt", "Stand in for a LEGO brick with the arm, behind a serial device.", add_arguments, run)
+VERB = Verb("emulate-nxt", "Emulate a LEGO brick with the arm, behind a serial device.", add_arguments, run)

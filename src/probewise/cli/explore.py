@@ -27,17 +27,17 @@ SHAPE_NAMES = ("circle", "ellipse", "rectangle", "triangle", "hexagon")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument("--sensor", type=a_path, required=True, metavar="S.json", help="sensor model")
     add_out_directory(parser)
-    parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="what the robot takes its sensor for")
+    parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="the robot's sensor model")
     parser.add_argument(
         "--method",
         choices=("particles", "paper"),
         default=METHOD,
-        help="how the robot infers and chooses: with samples that it carries from reading to reading (particles, "
-        "default), or as in the paper: nested sampling anew after each reading, 50 samples diversified, the entropy of "
-        "what they predict, a Student-t or naive likelihood",
+        help="method of inference and choice: posterior samples reweighted after each reading (particles, default), or "
+        "the paper's: a new nested sampling run after each reading, 50 diversified samples, entropy of their "
+        "predictions, a Student-t or naive likelihood",
     )
     parser.add_argument(
         "--nested-stop",
@@ -49,8 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--levels",
         type=a_path,
         metavar="REC.csv",
-        help="recording with readings over black and over white, which the naive model of --method paper takes its "
-        "levels and sds from (a simulated arm reads both before it starts)",
+        help="recording with readings over black and over white, from which the naive model of --method paper takes "
+        "its levels and sds (a simulated arm reads both before it starts)",
     )
     parser.add_argument(
         "--shape",
@@ -58,12 +58,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=SHAPE_NAMES,
         default=[SHAPE],
         metavar="SHAPE",
-        help=f"what may lie on the field, one or several of {', '.join(SHAPE_NAMES)} (default {SHAPE})",
+        help=f"possible shapes on the field, one or several of {', '.join(SHAPE_NAMES)} (default {SHAPE})",
     )
     parser.add_argument(
         "--truth",
         metavar="[SHAPE:]V,V,...",
-        help="what the simulated world hides, a circle as X,Y,R in mm (default: drawn from the seed)",
+        help="the true shape in the simulated world, a circle as X,Y,R in mm (default: drawn from the seed)",
     )
     parser.add_argument(
         "--field", metavar="W,H", help="width and height of the field in mm (default: the geometry's, or 1048,520)"
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_int,
         default=MAX_READINGS,
         metavar="N",
-        help=f"stop here at the latest (default {MAX_READINGS})",
+        help=f"largest number of readings (default {MAX_READINGS})",
     )
     parser.add_argument(
         "--live", action="store_true", help="show the robot's view in a browser while it works (DIR/live.html)"
@@ -88,26 +88,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--both-models",
         action="store_true",
-        help="show beside the robot's view what the other sensor model makes of the same readings",
+        help="also show the posterior of the other sensor model from the same readings",
     )
     parser.add_argument(
         "--utility",
         metavar="NAME",
-        help=f"what a reading is worth: information and, {UTILITY} (default), near the end whether it ends the run; "
-        "information alone; the paper's entropy; information per-second of arm time, "
-        "information about:PARAMETER such as about:radius_mm, or on which-shape of several lies there",
+        help=f"acquisition function: {UTILITY} (default), information and, near the end, the probability that the "
+        f"reading ends the run; information alone; the paper's entropy; information per-second of arm time, "
+        f"information about:PARAMETER such as about:radius_mm, or on which-shape of several is present",
     )
     parser.add_argument(
         "--learn-sensor",
         action="store_true",
-        help="infer the SSF's size and place and both levels along with the shape, from what sensor.json says of them",
+        help="infer the SSF's size and place and both levels together with the shape, with sensor.json as prior",
     )
     parser.add_argument(
         "--trust",
         type=float,
         metavar="P",
-        help="probability that the sensor model leaves nothing out; below 1 the robot weighs what it may leave out "
-        "along with the shape (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
+        help="probability that the sensor model leaves nothing out; below 1 the robot also infers which effects it "
+        "leaves out (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
     )
     parser.add_argument(
         "--reference",
@@ -118,17 +118,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "shape); may be given again",
     )
     parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
-    more = parser.add_argument_group("more than a place", "what else the robot may choose, of an arm that can")
+    more = parser.add_argument_group("more than a place", "further choices, for an arm that supports them")
     more.add_argument(
-        "--orientations", type=_numbers, metavar="DEG,...", help="how the sensor may be turned, such as 0,45,90"
+        "--orientations", type=_numbers, metavar="DEG,...", help="orientations to choose from, such as 0,45,90"
     )
     more.add_argument(
-        "--heights", type=_numbers, metavar="MM,...", help="how high above the surface it may read, such as 10,14"
+        "--heights", type=_numbers, metavar="MM,...", help="reading heights to choose from, such as 10,14"
     )
     more.add_argument(
-        "--repeats", type=_counts, metavar="N,...", help="how often it may read on the spot, such as 1,2,4"
+        "--repeats", type=_counts, metavar="N,...", help="numbers of repeated readings to choose from, such as 1,2,4"
     )
-    parser.add_argument("--resume", action="store_true", help="go on from the journal in DIR")
+    parser.add_argument("--resume", action="store_true", help="resume from the journal in DIR")
     add_common(parser)
 
 
@@ -226,7 +226,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Pat
 
 
 def _seen_from(folder: Path, path: Path) -> str:
-    """Name a file as seen from a folder, so that both can move together."""
+    """Return a file's path relative to a folder, so that both can be moved together."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # on another drive
@@ -234,7 +234,7 @@ def _seen_from(folder: Path, path: Path) -> str:
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """Read "A,B,...", each number once, for argparse."""
+    """Parse "A,B,...", each number once, for argparse."""
     try:
         values = tuple(float(cell) for cell in text.split(","))
     except ValueError:
@@ -245,7 +245,7 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _counts(text: str) -> tuple[int, ...]:
-    """Read "N,M,...", whole numbers above zero, each once, for argparse."""
+    """Parse "N,M,...", integers above zero, each once, for argparse."""
     return tuple(dict.fromkeys(positive_int(cell) for cell in text.split(",")))
 
 
@@ -253,7 +253,7 @@ def _before(journal: Path, *, resume: bool) -> Journal | None:
     from probewise.experiment import read_journal
 
     if resume and not journal.exists():
-        raise FileError(journal, "no such file", "a journal to resume; without --resume a new run begins")
+        raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
     if not journal.exists():
         return None
     if not resume:

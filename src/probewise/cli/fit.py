@@ -1,4 +1,4 @@
-"""`probewise fit`: a person's simulator fitted to their table, without a diagnosis."""
+"""`probewise fit`: fit a user's simulator to a table, without a diagnosis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "tables", type=a_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
     )

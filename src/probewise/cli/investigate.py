@@ -1,4 +1,4 @@
-"""`probewise investigate`: record, diagnose, take the readings that settle it."""
+"""`probewise investigate`: record, diagnose, take the advised readings, repeat."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ PLANS = ("paper", "two_way")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "--arm",
         default="simulated",
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--plan",
         required=True,
         metavar="PLAN.csv",
-        help=f"what is recorded first: a plan or recording, its JSON beside it; or {' or '.join(PLANS)}, which ship",
+        help=f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(PLANS)}, which ship",
     )
     parser.add_argument(
         "--origin-mm",
@@ -67,41 +67,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--truth",
         metavar="NAME:V,V",
-        help="what the simulated world conceals, such as backlash:0.5 or nothing; several joined by + (default: one "
-        "effect drawn from the seed, told at the end)",
+        help="effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
+        "one effect drawn from the seed, named at the end)",
     )
     parser.add_argument(
         "--readings",
         type=positive_int,
         default=400,
         metavar="N",
-        help="at most so many readings more than the first plan has (default 400)",
+        help="largest number of readings beyond the first plan (default 400)",
     )
     parser.add_argument(
         "--minutes",
         type=positive_number("minutes"),
         default=math.inf,
         metavar="M",
-        help="at most so many minutes more (default: no limit)",
+        help="largest number of minutes beyond the first plan (default: no limit)",
     )
     parser.add_argument(
         "--rounds",
         type=positive_int,
         default=6,
         metavar="N",
-        help="at most so many rounds, the first included (default 6)",
+        help="largest number of rounds, including the first (default 6)",
     )
     parser.add_argument(
         "--no-hands",
         action="store_true",
-        help="nobody is there to turn or lay a sheet: take only readings over what lies there",
+        help="no person turns or exchanges sheets: take only readings over the sheet in place",
     )
-    parser.add_argument("--resume", action="store_true", help="go on from the rounds in DIR")
+    parser.add_argument("--resume", action="store_true", help="resume from the rounds in DIR")
     add_common(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Go round after round; keep every reading; write the report of all."""
+    """Run the rounds, save every reading, and write the report."""
     import hashlib
 
     import numpy as np
@@ -181,7 +181,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
-    """Read the first plan, as the arm that was chosen will carry it out."""
+    """Read the first plan, adapted to the chosen arm."""
     plan = plan_named(arguments.plan)
     if chosen.kind == "simulated":
         return plan
@@ -192,7 +192,7 @@ def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
 
 @contextlib.contextmanager
 def _recorder(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int) -> Iterator[Take]:
-    """Open an arm and let it carry out plans, with the hands of a person or, emulated, of the bench."""
+    """Open an arm to carry out plans, with a person or an emulated bench handling the sheets."""
     from probewise.arm import Request, carry_out
     from probewise.cli._bench import open_arm
 
@@ -223,7 +223,7 @@ def _recorder(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFold
 
 
 def _world(truth: str | None, rng: np.random.Generator) -> World:
-    """Build the world behind the shipped recordings, with what it is to conceal."""
+    """Build the world of the shipped recordings, with the effects to conceal."""
     from dataclasses import replace
 
     from probewise.investigation import parse_concealed
@@ -236,7 +236,7 @@ def _world(truth: str | None, rng: np.random.Generator) -> World:
 
 VERB = Verb(
     "investigate",
-    "Record, diagnose, take the readings that the diagnosis asks for, until it is settled.",
+    "Record, diagnose, take the readings that the diagnosis advises, until it is settled.",
     add_arguments,
     run,
 )

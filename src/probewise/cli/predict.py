@@ -1,4 +1,4 @@
-"""`probewise predict`: what a sensor model expects of a plan, and how well it expected a recording."""
+"""`probewise predict`: predict the readings of a plan, and score the prediction of a recording."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["VERB"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "sensor",
         type=a_path,
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Predict every row, and say how well the readings were expected where there are any."""
+    """Predict every row, and score the prediction if there are readings."""
     refuse_journal(arguments.plan)
     if arguments.simulator is not None:
         return _by_simulator(arguments)
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _by_simulator(arguments: argparse.Namespace) -> int:
-    """Predict every row of a table by a simulator and what a diagnosis, or a fit, has found of it."""
+    """Predict every row of a table with a simulator, as fitted or repaired."""
     import numpy as np
 
     from probewise._progress import progress_shown
@@ -77,4 +77,4 @@ def _by_simulator(arguments: argparse.Namespace) -> int:
     return 0
 
 
-VERB = Verb("predict", "Predict the readings of a plan: mean, sd, log density, a row each.", add_arguments, run)
+VERB = Verb("predict", "Predict the readings of a plan: mean, sd and log density of each row.", add_arguments, run)

@@ -1,4 +1,4 @@
-"""`probewise sheets`: the sheets that a bench needs, at true scale, to print."""
+"""`probewise sheets`: print the patterns for a bench at true scale."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FIELD, TARGET, MARKS = "field", "target", "marks"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     parser.add_argument(
         "what",
         metavar="WHAT",
@@ -104,4 +104,4 @@ def _outline(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyp
     return outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
 
 
-VERB = Verb("sheets", "Draw the sheets that a bench needs, at true scale, to print.", add_arguments, run)
+VERB = Verb("sheets", "Draw the patterns for a bench at true scale, to print.", add_arguments, run)

@@ -1,4 +1,4 @@
-"""`probewise study`: how many measurements the robot needs, over many circles and ways of looking."""
+"""`probewise study`: how many readings the robot needs, over many circles and configurations."""
 
 from __future__ import annotations
 
@@ -27,10 +27,14 @@ _SIZES = ("small", "plain", "gross")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Fill the verb's parser."""
+    """Define the verb's options."""
     add_out_directory(parser)
     parser.add_argument(
-        "--circles", type=positive_int, default=200, metavar="N", help="circles a row, always the first (default 200)"
+        "--circles",
+        type=positive_int,
+        default=200,
+        metavar="N",
+        help="circles per row, always the first ones (default 200)",
     )
     parser.add_argument(
         "--quoted", type=positive_int, metavar="N", help="circles of the first row (default as --circles)"
@@ -45,19 +49,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, metavar="S", help="with --concealed: circles, noise and robot of another seed"
     )
     parser.add_argument("--size", choices=_SIZES, help="with --concealed: one of the three sizes alone")
-    parser.add_argument(
-        "--clean", type=positive_int, metavar="N", help="with --concealed: circles of the row that conceals nothing"
-    )
+    parser.add_argument("--clean", type=positive_int, metavar="N", help="with --concealed: circles of the clean row")
     parser.add_argument(
         "--beside-paper",
         action="store_true",
         help="for each sensor model, our method and the paper's (explore --method paper) on the same circles; of the "
         "factors below --population and --nested-stop may be given",
     )
-    one = parser.add_argument_group("one row instead of the table's", "what is not given is as in the reference row")
-    one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, wholly in the field) or anywhere")
-    one.add_argument("--model", metavar="NAME", help="what the robot takes its sensor for: ssf or naive")
-    one.add_argument("--utility", metavar="NAME", help="worth of a reading: finishing, information, entropy, ...")
+    one = parser.add_argument_group("one row instead of the table's", "defaults are those of the reference row")
+    one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, entirely in the field) or anywhere")
+    one.add_argument("--model", metavar="NAME", help="the robot's sensor model: ssf or naive")
+    one.add_argument("--utility", metavar="NAME", help="acquisition function: finishing, information, entropy, ...")
     one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
     one.add_argument("--width", type=float, metavar="F", help="believed width of the SSF over the true one")
     one.add_argument("--batch", type=positive_int, metavar="N", help="readings that are chosen together")

@@ -1,8 +1,8 @@
-"""What physics does the model leave out? From recordings to verdict, cause, repaired model and next measurement.
+"""Diagnosis of what physics a model leaves out: from recordings to verdict, repaired model and next measurement.
 
-The paper, section "Efficacy of Sensor Model", shows that a better likelihood makes better inferences; this is
-how a poor likelihood is found out: its residuals are tested, located, explained by named effects, repaired, and
-the gain is shown on held-out readings.
+The paper, section "Efficacy of Sensor Model", shows that a better likelihood makes better inferences; this package
+finds a poor likelihood: it tests and locates residuals, explains them by named effects, repairs the model, and measures
+the gain on held-out readings.
 """
 
 from probewise.diagnosis.advice.aliases import Alias

@@ -1,7 +1,7 @@
-"""The seam between the engine and whatever took the readings.
+"""The interface between the engine and the apparatus that took the readings.
 
-The engine fits, weighs, tests and repairs; it knows no lamp, arm or pattern. What does know them answers here: a
-light sensor on an arm is one apparatus (`light_sensor`), a person's simulator over a plain table may be another.
+The engine fits, compares, tests and repairs models; it knows nothing of lamps, arms or patterns. Those are the
+apparatus' part: a light sensor on an arm (`light_sensor`), or a user's simulator over a table.
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ __all__ = ["Apparatus", "Words"]
 
 @dataclass(frozen=True)
 class Words:
-    """How sentences speak of an apparatus: what it is that is calibrated, and how to get a signal where there is none.
+    """Words for sentences about an apparatus: the name of the calibrated model, and how to obtain a signal.
 
-    `settles_nothing` says of two aliased effects that no reading tells them apart; `run` is what rows that belong
-    together are called; `next_plan` is the file of the readings to take next, `model` that of the repaired model;
-    `no_cure` says that no further rows would show an effect.
+    `settles_nothing`: no reading separates two aliased effects; `run`: name of a group of rows; `next_plan`, `model`:
+    files of the next readings and of the repaired model; `no_cure`: no further rows would make an effect detectable.
     """
 
     null: str
@@ -43,39 +42,39 @@ class Words:
 
 
 class Apparatus(Protocol):
-    """What the engine asks of whatever took the readings."""
+    """The interface of an apparatus."""
 
     @property
     def words(self) -> Words:
-        """How sentences speak of it."""
+        """Words for sentences about it."""
         ...
 
     def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
-        """Build the vocabulary, scaled to a recording: by name, without what could not show there."""
+        """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
         ...
 
     def proposals(self) -> Mapping[str, NamedEffect[Any]]:
-        """Propose formulas for what has no name, by names that begin with `effects.PROPOSAL`."""
+        """Return proposed formulas for effects out of vocabulary; names begin with `effects.PROPOSAL`."""
         ...
 
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Name the effects that a person added: named to be tried, however far they lead from the null."""
+        """Return the names of the user's own effects, which are always tried."""
         ...
 
     def refits_are_over(self) -> bool:
-        """Tell whether no further combination can be refitted, since predictions are dear and enough were made."""
+        """Return whether the budget of costly predictions is spent, so that no further combination is refitted."""
         ...
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Give the prior odds of these effects, of something unknown, and of their absence."""
+        """Return the prior odds of these effects, of an unknown effect, and of none."""
         ...
 
     def null_forms(self, recording: Recording) -> SsfForms:
-        """Give the forms of the null that are calibrated from the recording, where no null is given."""
+        """Return the forms of the null to calibrate from the recording, if no null is given."""
         ...
 
     def covariates(self, found: Fit, recording: Recording) -> tuple[Sequence[Covariate], FloatArray]:
-        """List what a residual may depend on, and the slope of the prediction along the motion, (n_usable,)."""
+        """Return the covariates of a residual, and the slope of the prediction along the motion, (n_usable,)."""
         ...
 
     def covariate_of(
@@ -86,27 +85,27 @@ class Apparatus(Protocol):
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Choose the covariate that says where an effect is, from its change of the readings `without` it."""
+        """Choose the covariate in which an effect is located, from its change of the readings `without` it."""
         ...
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Differentiate by what no form of the null takes up and is no physics: (n_usable, n_columns)."""
+        """Return slopes by structure that no form of the null fits and that is not physics: (n_usable, n_columns)."""
         ...
 
     def held_out_parts(self, recording: Recording) -> Parts:
-        """Divide usable readings into parts that are held out in turn."""
+        """Partition usable readings into parts to hold out in turn."""
         ...
 
     def commands(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> Sequence[Command]:
-        """List what could be measured next, where `level` (n_points,) is what is expected of the plan's readings."""
+        """Return the possible next measurements; `level` (n_points,) are the expected readings of the plan."""
         ...
 
     def one_after_another(self, commands: Sequence[Any], after: Plan) -> Plan:
-        """Set commands behind each other, each as if it came next after a plan: to predict all of them at once."""
+        """Concatenate commands, each timed as if directly after a plan, to predict all of them at once."""
         ...
 
     def in_turn(self, commands: Sequence[Any], after: Plan) -> Plan:
-        """Take commands one after the other, as they are to be carried out after a plan."""
+        """Concatenate commands as they would be carried out after a plan."""
         ...

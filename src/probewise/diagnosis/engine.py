@@ -1,7 +1,7 @@
-"""Find the mismatch, name the physics, model it, show the gain: from recordings to a Diagnosis, step by step.
+"""The pipeline of a diagnosis, from recordings to a `Diagnosis`.
 
-prepared -> searched -> tested -> judged -> repaired -> located -> advised -> said. Each step takes the values of those
-before it and gives one of its own.
+prepared -> searched -> tested -> judged -> repaired -> located -> advised -> said. Each step takes the values of the
+steps before it and returns a new one.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from probewise.recordings.plan import Recording
 
 __all__ = ["Thorough", "diagnose", "diagnose_prepared"]
 
-_PROPOSED_FROM = 0.1  # probability of something unknown, from which formulas are proposed for it
+_PROPOSED_FROM = 0.1  # probability of an unknown effect from which formulas are proposed for it
 
 Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]]
-"""Weighs again what a search has weighed: gives it with better probabilities, and what was weighed twice."""
+"""Function that recomputes the evidence of a search; returns it with better probabilities, and both evidences."""
 
 
 def diagnose(
@@ -59,29 +59,29 @@ def diagnose(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Diagnosis:
-    """Tell what physics the sensor model leaves out of these recordings.
+    """Diagnose what physics the sensor model leaves out of these recordings.
 
     Parameters
     ----------
     recordings
-        One, or the first and those that it asked for. Of more than 2,400 readings as many are diagnosed, in
-        scans spread over all of them; residuals and predictions are given for every row.
+        One recording, or the first with those taken on its advice. Of more than 2,400 readings, about that many are
+        used, in scans spread over all of them; residuals and predictions cover every row.
     sensor
-        An earlier posterior of the sensor, taken as the prior; without it the null is calibrated here.
+        An earlier posterior of the sensor, used as the prior; without it, the null is calibrated here.
     null
-        What is to be diagnosed instead of a calibrated sensor: `SensorAndShape`, where what lies under it
-        is not known, or `OwnModel`, any simulator.
+        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape, or `OwnModel` for any
+        simulator.
     effects
-        The vocabulary to choose from, by name. What is out of vocabulary counts as unknown, also where it has a
-        formula (`UNNAMED`).
+        The vocabulary of effects, by name. Effects out of vocabulary count as unknown, even those with a formula
+        (`UNNAMED`).
     thorough
-        Weighs what leads a second time: `weigh_thoroughly`, by nested sampling.
+        Computes the evidence of the leading hypotheses a second time: `weigh_thoroughly`, by nested sampling.
     hands
-        Whether somebody can lay or turn a sheet for the next readings; without, they are taken over what lies there.
+        Whether a person can exchange or turn sheets for the next readings; if not, they are over the sheet in place.
     rng
-        Source of randomness, for the null laws of the tests and the posterior samples.
+        Random generator, for the null distributions of the tests and the posterior samples.
     progress
-        Told of every step, and of the refits within.
+        Called for every step, and for the refits within.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def diagnose(
         If there is no usable reading, or units differ, or two recordings are the same, or both a sensor and a null are
         given.
     NotConvergedError
-        If the fit of the null did not arrive anywhere.
+        If the fit of the null did not converge.
     """
     require_rng(rng)
     require_progress(progress)
@@ -111,7 +111,7 @@ def diagnose(
 def diagnose_prepared(
     prepared: Prepared, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
 ) -> Diagnosis:
-    """Go the road of `diagnose` for any apparatus; what is returned and raised is as there."""
+    """Run the pipeline of `diagnose` for any apparatus; see there for returns and raises."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
     if searched.posterior.by_mean.get(("unknown",), 0.0) > _PROPOSED_FROM:
         searched = _with_proposals(searched, progress=progress)
@@ -120,13 +120,13 @@ def diagnose_prepared(
         searched = searched.by_prior_alone()
     elif thorough is not None:
         searched, weighings = thorough(searched)
-    progress("testing what the model leaves")
+    progress("testing the residuals")
     test = run_global_test(searched, rng=rng)
-    progress("judging the repair on readings kept back")
+    progress("testing the repair on held-out readings")
     judged, best = best_repair(searched, test, judge(searched, test), rng=rng)
     drawn = draw_models(searched, test, judged, best, rng=rng, progress=progress)
     found = effects_found(searched, judged.hypotheses, best, drawn.best, rng=rng)
-    progress("locating what is missing")
+    progress("locating the residuals")
     where = locate(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
     change = np.zeros(len(prepared.usable))
     if judged.verdict == "unknown" and not best.out_of_vocabulary:
@@ -140,7 +140,7 @@ def diagnose_prepared(
     grounds = _grounds(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
     reason = with_agreement(reason_of(judged, grounds), weighings)
     if prepared.thinned:
-        reason += f" (From {len(prepared.recording)} of {len(prepared.everything)} readings, spread over all.)"
+        reason += f" (From {len(prepared.recording)} of {len(prepared.everything)} readings, evenly spread.)"
     return Diagnosis(
         recording=prepared.everything,
         judged=judged,
@@ -153,7 +153,7 @@ def diagnose_prepared(
 
 
 def _with_proposals(searched: Searched, *, progress: Progress) -> Searched:
-    """Search again, formulas proposed for what has no name; as it was where there are none, or no time for them."""
+    """Search again with proposed formulas; return the search unchanged if there are none, or no budget."""
     prepared = searched.prepared
     proposals = {} if prepared.apparatus.refits_are_over() else prepared.apparatus.proposals()
     if not proposals:
@@ -172,7 +172,7 @@ def _grounds(
     where: Sequence[Place],
     asked: NextMeasurement | None,
 ) -> Grounds:
-    """Gather what the sentence is made of."""
+    """Collect the facts for the reason."""
     prepared, shares = searched.prepared, searched.evidences.unknown_shares
     orders = searched.posterior.order_probabilities
     beside = searched.beside(test.noise)

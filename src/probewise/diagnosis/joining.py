@@ -1,4 +1,4 @@
-"""Several recordings of one apparatus, diagnosed together."""
+"""Join several recordings of one apparatus."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["covariates_joined", "join", "join_plans", "last_known"]
 
 
 def join(recordings: Sequence[Recording]) -> Recording:
-    """Set recordings behind each other: scans stay apart, patterns of one name but two descriptions too.
+    """Concatenate recordings: scans remain distinct, and so do patterns of one name with different descriptions.
 
-    A covariate of the first that another lacks keeps its last known value there, such as a battery's, and one that the
-    first lacks is left out; a note says so. Times stay as they are in each file.
+    A covariate of the first, such as battery voltage, keeps its last known value in recordings that lack it; one that
+    the first lacks is left out; notes say so. Times are unchanged.
 
     Raises
     ------
@@ -56,9 +56,9 @@ def join(recordings: Sequence[Recording]) -> Recording:
 
 
 def join_plans(plans: Sequence[Plan]) -> Plan:
-    """Set plans behind each other, with the covariates of the first; what is commanded (LED, height) from all.
+    """Concatenate plans, with the covariates of the first and commanded columns (LED, height) of all.
 
-    What is commanded is NaN, as at calibration, where a plan does not say; any other covariate as last known.
+    Commanded columns are NaN (as at calibration) where a plan lacks them; other covariates keep their last known value.
     """
     first = plans[0]
     patterns: dict[str, Pattern] = {}
@@ -96,19 +96,19 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
 
 
 def covariates_joined(plans: Sequence[Plan]) -> dict[str, FloatArray]:
-    """Set the covariates of the first plan behind each other, and what is commanded in any; see `join_plans`."""
+    """Concatenate the covariates of the first plan and the commanded columns of any; see `join_plans`."""
     commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
     return {name: _column(plans, name) for name in sorted({*plans[0].covariates, *commanded})}
 
 
 def last_known(values: FloatArray, otherwise: float = math.nan) -> float:
-    """Give the last value of a covariate that is known."""
+    """Return the last known value of a covariate."""
     known = values[np.isfinite(values)]
     return float(known[-1]) if known.size else otherwise
 
 
 def _column(plans: Sequence[Plan], name: str) -> FloatArray:
-    """Give a covariate of every row; where a plan lacks it NaN for what is commanded, else its last known value."""
+    """Return a covariate of every row; where a plan lacks it, NaN if commanded, else its last known value."""
     columns: list[FloatArray] = []
     last = math.nan
     for plan in plans:
@@ -121,7 +121,7 @@ def _column(plans: Sequence[Plan], name: str) -> FloatArray:
 
 
 def _notes_on_covariates(recordings: Sequence[Recording]) -> list[str]:
-    """Say what is made of covariates that not all recordings have."""
+    """Describe the treatment of covariates that some recordings lack."""
     first, out = recordings[0], []
     for k, other in enumerate(recordings[1:], 1):
         for name in sorted({*first.plan.covariates} - {*other.plan.covariates, *COMMANDED}):
@@ -132,7 +132,7 @@ def _notes_on_covariates(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _same(one: Recording, other: Recording) -> bool:
-    """Tell whether two recordings hold the same readings at the same places and times."""
+    """Return whether two recordings hold the same readings at the same places and times."""
     return (
         len(one) == len(other)
         and np.array_equal(one.readings, other.readings, equal_nan=True)
@@ -145,6 +145,6 @@ def _name(recording: Recording, index: int) -> str:
 
 
 def _unused(name: str, taken: Sequence[str]) -> str:
-    """Count up until a name is free."""
+    """Return an unused name, by appending a number."""
     numbered = (f"{name} ({k})" for k in itertools.count(2))
     return next(n for n in itertools.chain([name], numbered) if n not in taken)

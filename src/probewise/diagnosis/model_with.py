@@ -1,4 +1,4 @@
-"""The model with effects that somebody has chosen, whatever else might explain the recording."""
+"""Fit a model with chosen effects, without a search."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ __all__ = ["model_with"]
 
 
 def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
-    """Fit the sensor with these effects and no others, at the SSF order of the most evidence.
+    """Fit the sensor with exactly these effects, at the SSF order with the largest evidence.
 
     Parameters
     ----------
     recording
         What was read.
     names
-        Effects of the vocabulary; none for the calibrated sensor alone.
+        Names of effects of the vocabulary; empty for the calibrated sensor alone.
     rng
         Source of randomness, for the posterior samples.
 
     Returns
     -------
     ModelSamples
-        Without an effect on the mean that these readings do not feel.
+        The samples; effects on the mean that do not act on these readings are left out.
 
     Raises
     ------
     ParameterError
-        If a name is not of the vocabulary, or its effect cannot show in this recording.
+        If a name is not in the vocabulary, or its effect cannot act in this recording.
     """
     require_recording(recording)
     require_rng(rng)
@@ -60,7 +60,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     on_noise = tuple(sorted(set(names) - set(on_mean)))
     noise = on_noise if on_noise in found.noise_models else found.certain
     best = found.best(on_mean, noise) or found.best((), noise)
-    assert best is not None  # the calibrated sensor is always weighed
+    assert best is not None  # the calibrated sensor is always fitted
     if not np.isfinite(best.evidence[noise].log_z):
         raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that show in this recording")
     return sample_model(best.found, best.evidence[noise], recording, weights=best.weights, rng=rng)

@@ -1,4 +1,4 @@
-"""What a combination of effects is called by: their names."""
+"""Type of a combination of effects: their names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is to be diagnosed: the readings, the effects they could show, and the null."""
+"""Input of a diagnosis: readings, possible effects, and the null."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ __all__ = ["Prepared", "prepare"]
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is to be diagnosed.
+    """Input of a diagnosis.
 
     Parameters
     ----------
     recording
-        The readings that are compared.
+        The readings used.
     effects
-        Those that could show in them, by name.
+        Effects that could act in them, by name.
     null
-        What is diagnosed; None: a null that is calibrated from the recording.
+        The null model; None: calibrated from the recording.
     apparatus
-        What took the readings.
+        The apparatus that took the readings.
     everything
-        All readings; `recording` itself where all are compared.
+        All readings; the same as `recording` if all are used.
     """
 
     recording: Recording
@@ -50,7 +50,7 @@ class Prepared:
 
     @property
     def thinned(self) -> bool:
-        """Whether only some readings are compared."""
+        """Whether only some readings are used."""
         return self.everything is not self.recording
 
     @cached_property
@@ -65,7 +65,7 @@ class Prepared:
 
     @property
     def least_readings(self) -> int:
-        """Fewest usable readings that a verdict is given on."""
+        """Fewest usable readings for a verdict."""
         return LEAST_READINGS if self.null is None else self.null.least_readings
 
     @property
@@ -75,11 +75,11 @@ class Prepared:
 
     @property
     def too_little(self) -> bool:
-        """Whether the readings are too few to say anything, or all equal."""
+        """Whether the readings are too few for a verdict, or all equal."""
         return len(self.usable) < self.least_readings or self.constant
 
     def spread(self, values: FloatArray) -> FloatArray:
-        """Give every row its value, NaN where no reading is usable: (n_usable,) -> (n_points,)."""
+        """Expand values of usable readings to all rows, NaN elsewhere: (n_usable,) -> (n_points,)."""
         out = np.full(len(self.recording), np.nan)
         out[self.usable] = values
         return out

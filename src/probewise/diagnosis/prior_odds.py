@@ -1,4 +1,4 @@
-"""What is believed of hypotheses before any reading."""
+"""Prior odds of hypotheses."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ __all__ = ["PriorOdds"]
 
 @dataclass(frozen=True)
 class PriorOdds:
-    """Prior odds of what may be missing from the mean, and of what may be wrong with the noise.
+    """Prior odds of effects on the mean and on the noise.
 
-    Of the mean: `clean_mean`, `unknown`, and the rest shared out over combinations, by size, then evenly;
-    `unknown_beside` is the share of those in which something unknown is at work besides. Half of what is
-    unknown (`out_of_vocabulary`) is shared out over the effects of `UNNAMED`, the rest has no formula.
-    Of the noise: `white`, the rest over noise models, by size, then evenly. `complexity_penalty` (nats) is what
-    speaks against an effect that makes a Gaussian of the SSF superfluous, for each one: that physics looks
-    like an SSF's shape takes more than an even chance to believe; `unknown_complexity_penalty` the same of what has
-    no name, which bends to any shape: before it is believed, the SSF may have its Gaussians.
+    Mean: `clean_mean`, `unknown`, and the rest divided among combinations by size, then equally; `unknown_beside` is
+    the share of those with an additional unknown effect. The share `out_of_vocabulary` of the unknown is divided among
+    the effects of `UNNAMED`; the rest has no formula. Noise: `white`, and the rest divided among noise models by size,
+    then equally. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it makes
+    superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an unknown
+    effect, which can imitate any shape.
     """
 
     n_named: int = 24
@@ -43,14 +42,14 @@ class PriorOdds:
 
     @classmethod
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
-        """Share the odds out over these effects."""
+        """Divide the odds among these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)
         again = sum(first_of(name) is not None for name in effects)
         return cls(len(effects) - len(on_noise) - unnamed - again, unnamed, len(on_noise))
 
     def log_mean(self, names: Names) -> float:
-        """Log prior of a combination of effects on the mean."""
+        """Return the log prior of a combination of effects on the mean."""
         named = [name for name in names if not is_out_of_vocabulary(name)]
         log_p = self._log_of_named(len(named))
         for k in range(len(names) - len(named)):
@@ -62,20 +61,20 @@ class PriorOdds:
         return math.log(self.by_size[n - 1] / math.comb(self.n_named, n) if n else self.clean_mean)
 
     def log_unknown(self, names: Names) -> float:
-        """Log prior of something that nobody foresaw, beside a combination of effects on the mean."""
+        """Return the log prior of an unknown effect in addition to a combination of effects on the mean."""
         if names:
             return self.log_mean(names) + math.log(self.unknown_beside)
         return math.log(self.unknown * (1 - self.out_of_vocabulary if self.n_unnamed else 1.0))
 
     def alone(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
-        """Give what is believed of clean, unknown and single effects on the mean where no reading says anything.
+        """Return the prior probabilities of clean, unknown and single effects, for readings without information.
 
         Parameters
         ----------
         names
-            Of the effects on the mean in the vocabulary.
+            Names of the effects on the mean in the vocabulary.
         noise
-            What is certain of the noise.
+            Names of the certain noise effects.
         """
         each = self.by_size[0] / self.n_named
         believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
@@ -84,7 +83,7 @@ class PriorOdds:
         return {(mean, noise): p / total for mean, p in believed.items()}
 
     def log_noise(self, names: Names) -> float:
-        """Log prior of a noise model; `names` are those of its effects that may be absent."""
+        """Return the log prior of a noise model; `names` are those of its effects that are not certain."""
         if not names:
             return math.log(self.white)
         return math.log(self.noise_by_size[len(names) - 1] / math.comb(self.n_noises, len(names)))

@@ -1,4 +1,4 @@
-"""What could be measured next, whatever carries it out."""
+"""The interface of possible next measurements."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ MOST_READINGS = 102
 
 
 class Command(Protocol):
-    """Some rows that could be taken next: of which kind, in words, the rows, and how long they take."""
+    """Rows that could be measured next: kind, description, plan and duration."""
 
     @property
     def kind(self) -> str:
-        """What is done."""
+        """Kind of measurement."""
         ...
 
     @property
     def description(self) -> str:
-        """The same in words."""
+        """Description in words."""
         ...
 
     @property
@@ -35,11 +35,11 @@ class Command(Protocol):
 
     @property
     def minutes(self) -> float:
-        """How long they take, with the break before them."""
+        """Duration in minutes, including the break before them."""
         ...
 
 
 def rows_of(commands: Sequence[Command]) -> list[IntArray]:
-    """Give the row numbers of each command, where all are set behind each other."""
+    """Return the row numbers of each command after concatenation."""
     ends = np.cumsum([len(command.plan) for command in commands])
     return [np.arange(end - len(command.plan), end) for end, command in zip(ends.tolist(), commands, strict=True)]

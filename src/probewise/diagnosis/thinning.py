@@ -1,4 +1,4 @@
-"""Long recordings: a diagnosis needs a few thousand readings, and its time grows with each more."""
+"""Thinning of long recordings: a diagnosis needs at most a few thousand readings."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _STRETCH = 6  # readings
 
 
 def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArray:
-    """Choose rows, spread over the recording, that hold about `most` usable readings; all where there are no more.
+    """Choose rows spread over the recording with about `most` usable readings; all rows if there are no more.
 
-    Whole scans, so that what one reading leaves to the next is kept; where that leaves fewer than eight
-    scans, stretches of each scan.
+    Whole scans are kept, to preserve correlations between readings; if fewer than eight scans would remain, stretches
+    of each scan.
 
     Returns
     -------
@@ -36,6 +36,6 @@ def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArra
     if n_kept >= _FEWEST_SCANS:
         kept = np.unique(np.linspace(0, n_scans - 1, n_kept).round().astype(np.int64))
         return np.flatnonzero(np.isin(scan, kept))
-    # A stretch of neighbours, then a gap, and so on.
+    # Stretches of successive readings with gaps in between.
     within = np.arange(n_points) % round(_STRETCH / share)
     return np.flatnonzero(within < _STRETCH)

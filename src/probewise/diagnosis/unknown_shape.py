@@ -1,4 +1,4 @@
-"""A sensor over a shape that is not known: the shape's parameters are nuisance parameters of the null."""
+"""A sensor over an unknown shape, whose parameters are nuisance parameters of the null."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
 
 @dataclass(frozen=True, eq=False)
 class SensorAndShape:
-    """A calibrated sensor, and the prior of what lies under it wherever no pattern is described.
+    """A calibrated sensor with the prior of a shape, wherever no pattern is described.
 
-    `starts` (n_starts, n_params) are coordinates near the readings' best explanations; see `of`.
+    `starts` (n_starts, n_params) are coordinates near the best fits; see `of`.
     """
 
     sensor: CalibratedSensor
@@ -42,16 +42,16 @@ class SensorAndShape:
 
     @classmethod
     def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:
-        """Take a calibrated sensor's posterior and a shape's prior, and look for shapes that fit the readings.
+        """Build from a calibrated sensor's posterior and a shape's prior, and search for shapes that fit the readings.
 
-        A set of shapes is settled first: the one that fits best.
+        Of a set of shapes, the best-fitting one is chosen first.
 
         Parameters
         ----------
         sensor
             As calibrated.
         shape
-            What may lie there.
+            The possible shape, or set of shapes.
         recording
             What was read.
         rng
@@ -65,32 +65,32 @@ class SensorAndShape:
 
     @property
     def n_params(self) -> int:
-        """The sensor's and the shape's."""
+        """Number of parameters of sensor and shape."""
         return self.sensor.n_params + len(self.shape.prior.names)
 
     @property
     def n_gaussians(self) -> int:
-        """The sensor's."""
+        """As for the sensor."""
         return self.sensor.n_gaussians
 
     @property
     def degrees_of_freedom(self) -> int:
-        """The sensor's."""
+        """As for the sensor."""
         return self.sensor.degrees_of_freedom
 
     @property
     def form(self) -> str:
-        """The sensor's."""
+        """As for the sensor."""
         return self.sensor.form
 
     @property
     def in_bulk(self) -> bool:
-        """Each sample has its own cost."""
+        """False: every sample costs as much as the first."""
         return False
 
     @property
     def exchangeable(self) -> bool:
-        """Whether the sensor's can."""
+        """Whether the sensor's Gaussians are exchangeable."""
         return self.sensor.exchangeable
 
     @property
@@ -100,11 +100,11 @@ class SensorAndShape:
 
     @property
     def least_readings(self) -> int:
-        """Three for each parameter of the shape, and three more; the sensor is known."""
+        """Three readings per parameter of the shape, and three more; the sensor is known."""
         return 3 * len(self.shape.prior.names) + 3
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """All that the sensor does."""
+        """Return whether the sensor admits the effect."""
         return self.sensor.admits(effect)
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -118,7 +118,7 @@ class SensorAndShape:
         return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, tuple(effects), n_nodes=n_nodes)
 
     def with_described_field(self, diagnosis: Diagnosis) -> Diagnosis:
-        """Describe the shape in the next plan as it is believed to be now, so that the plan can be written and read."""
+        """Describe the shape in the next plan by its current estimate, so that the plan can be written."""
         asked, names = diagnosis.next_measurement, list(diagnosis.repaired.chain.names)
         if asked is None:
             return diagnosis
@@ -133,7 +133,7 @@ class SensorAndShape:
 
 @dataclass(frozen=True, eq=False)
 class _ShapeAmongPatterns:
-    """A scene of known patterns, and of one unknown shape under every other name."""
+    """A scene with known patterns, and one unknown shape under every other name."""
 
     shape: Shape
     plan: Plan
@@ -149,16 +149,16 @@ class _ShapeAmongPatterns:
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Region by pattern name, theta (n_samples, n_params of the shape)."""
+        """Return regions by pattern name, theta (n_samples, n_params of the shape)."""
         known = known_scene(self.plan).regions(theta)
         unknown = self.shape.region(theta)
         return {name: known.get(name, unknown) for name in self.plan.pattern_names}
 
 
 def _likely(null: SensorAndShape, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
-    """Look for shapes that fit, the sensor as it is believed to be: sum of squares of the best, and the best four.
+    """Search for fitting shapes with the prior-mean sensor; return the best sum of squares and the best four shapes.
 
-    Draws of the prior, of which the best are kept and scattered more and more narrowly.
+    Random draws of the prior, refined repeatedly about the best ones.
     """
     usable = recording.usable
     if not usable.any():

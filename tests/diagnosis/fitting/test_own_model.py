@@ -125,7 +125,7 @@ def test_a_simulator_of_the_wrong_shape_is_told_the_right_one():
 
 def test_a_model_that_predicts_no_numbers_did_not_converge():
     broken = OwnModel(lambda parameters, plan: parameters["start"] * np.full(len(plan), np.nan), PRIOR)
-    with pytest.raises(NotConvergedError, match="no finite numbers"):
+    with pytest.raises(NotConvergedError, match="are not finite"):
         diagnose(recording({"start": 60.0, "tau_s": 120.0}), null=broken, rng=np.random.default_rng(0))
 
 

@@ -1,1 +1,1 @@
-"""What to do next: what cannot be told apart, what the arm could do about it, and the scans that tell most."""
+"""Advice on the next measurement: aliased effects, possible scans, and the most informative of them."""

@@ -1,4 +1,4 @@
-"""Which effects leave the same trace in these readings, and which others would part them."""
+"""Aliased effects in these readings, and the readings that would separate them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from probewise.effects import NamedEffect, first_of
 __all__ = ["Alias", "aliased_pairs", "aliases", "settle", "surviving_cosine"]
 
 ALIAS_COSINE = 0.9
-_LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # that a reading must promise: less is rounding, and settles nothing
+_LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rounding error
 
 
 @dataclass(frozen=True)
 class Alias:
-    """Effects whose surviving parts look alike under this plan, and what would tell them apart."""
+    """Two effects with nearly collinear projected templates under this plan, and the plan that would separate them."""
 
     effects: tuple[str, str]
     cosine: float
@@ -36,12 +36,12 @@ class Alias:
 
 
 def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
-    """Largest principal cosine of what survives of two templates, each (n_points, k)."""
+    """Return the largest principal cosine of two projected templates, each (n_points, k)."""
     bases = []
     for columns in (first, second):
         raw = np.linalg.norm(problem.law(columns)) / problem.sd
         projected = problem.project(columns)
-        # What the fit absorbs to within a thousandth is not there to be compared.
+        # Columns that the fit absorbs to within a thousandth are ignored.
         if np.linalg.norm(projected) <= 1e-3 * raw:
             return 0.0
         u, lengths, _ = np.linalg.svd(projected, full_matrices=False)
@@ -50,16 +50,16 @@ def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
 
 
 def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
-    """List pairs of effects whose surviving templates have a cosine of 0.9 or more; `settle` says what would part them.
+    """List pairs of effects whose projected templates have a cosine of 0.9 or more; `settle` adds what separates them.
 
     Parameters
     ----------
     problem
         The null fit.
     templates
-        For each effect its most telling columns (n_points, k).
+        For each effect, its best-fitting template columns (n_points, k).
     otherwise
-        What is said of a pair as long as nothing settles it.
+        Text for a pair that nothing separates.
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
@@ -70,14 +70,14 @@ def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwi
 
 
 def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
-    """Compare what survives of the effects, each by the entry of its bank that fits best here, and say what parts them.
+    """Compare the projected templates of all effects, each by its best-fitting bank entry, and find separating plans.
 
     Parameters
     ----------
     searched
-        What was searched.
+        Result of the search.
     problem, found
-        The null.
+        The null fit, linearised and as a fit.
     """
     prepared, screening = searched.prepared, searched.screening
     telling: dict[str, FloatArray] = {}
@@ -98,10 +98,10 @@ def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[A
 def settle(
     pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
 ) -> list[Alias]:
-    """Say which candidate plan tells aliased effects apart, pair by pair, and by how many readings.
+    """Find for each aliased pair the candidate plan that separates it, and the number of readings needed.
 
-    Each effect is taken at the size at which 400 readings would show it at lambda 8; the plan of the
-    most expected nats a reading is advised, as many readings of it as three nats take.
+    Each effect has the size at which 400 readings give lambda 8; the advised plan has the most expected nats per
+    reading, with as many readings as three nats need.
     """
     names = sorted({name for pair in pairs for name in pair.effects})
     null = found.model.predict(found.z[None, :])[0]

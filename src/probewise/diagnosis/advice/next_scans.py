@@ -1,9 +1,9 @@
-"""The next scans: chosen for what their readings tell of which hypothesis is true.
+"""The next scans, chosen by the mutual information of their readings and the true hypothesis.
 
 The index of the true hypothesis and the readings have a mutual information; between hypotheses whose predictions are
 normal it has a lower bound in closed form, from the Bhattacharyya distance of each two (Kolchinsky & Tracey 2017,
 "Estimating mixture entropy with pairwise distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2). Scans are
-added greedily, each for what it tells a minute, as long as there is something left to tell.
+added greedily by information per minute, as long as there is information to gain.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from probewise.recordings.plan import Plan
 __all__ = ["NextMeasurement", "Rival", "mutual_information", "next_scans"]
 
 _STRIDES = (2, 4)
-_PROMISING = 4  # scans for each two rivals of which more than the mean is predicted
-_ENOUGH = 40.0  # squared distance of predictions, in noise sd, beyond which two rivals are told apart all the same
-_SETTLED = 0.05  # share of what is open that may stay open
-_WORTHWHILE = 0.03  # share of what is open that a further scan has to tell
-_ANYTHING = 1e-6  # the same of the first
-_LEAST_WEIGHT = 0.05  # of a rival, however improbable: a probability may be wrong
+_PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
+_ENOUGH = 40.0  # squared distance of predictions, in noise sds, beyond which more separation adds nothing
+_SETTLED = 0.05  # share of the entropy that may remain
+_WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
+_ANYTHING = 1e-6  # the same for the first scan
+_LEAST_WEIGHT = 0.05  # least weight of a rival, since its probability may be wrong
 
 
 @dataclass(frozen=True, eq=False)
 class NextMeasurement:
-    """A plan to take next, and how much it is expected to tell.
+    """A plan to take next, with its expected information.
 
-    `expected_log_bayes_factor`: of the true hypothesis over the one hardest to tell from it, in nats, averaged over
-    which is true. `between`: what these are, in words.
+    `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
+    true. `between`: the hypotheses, in words.
     """
 
     plan: Plan
@@ -49,7 +49,7 @@ class NextMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A hypothesis about the mean: its name in words, a model at its best point z (n_params,), and its probability.
+    """A hypothesis on the mean: label, model with its best point z (n_params,), and probability.
 
     `root` (n_params, n_params): a square root of the covariance there, root root^T.
     """
@@ -61,14 +61,14 @@ class Rival:
     probability: float
 
     def predictive(self, plan: Plan, sd: float) -> PredictiveNormal:
-        """Predict a plan's readings, in noise sd."""
+        """Predict a plan's readings, in noise sds."""
         mean, slopes = replace(self.model, plan=plan).jacobian(self.z)
         return PredictiveNormal(mean / sd, slopes @ self.root / sd)
 
 
 @dataclass(frozen=True, eq=False)
 class PredictiveNormal:
-    """Normal predictions in noise sd: mean (n_points,), covariance 1 + factor factor^T, factor (n_points, n_params)."""
+    """Normal predictions in noise sds: mean (n_points,), covariance 1 + factor factor^T."""
 
     mean: FloatArray
     factor: FloatArray
@@ -79,23 +79,23 @@ class PredictiveNormal:
 
     @property
     def covariance(self) -> FloatArray:
-        """Of the readings, (n_points, n_points)."""
+        """Covariance of the readings, (n_points, n_points)."""
         return np.asarray(np.eye(len(self.mean)) + self.factor @ self.factor.T)
 
 
 def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus) -> NextMeasurement | None:
-    """Choose the scans that tell the rivals apart, at most 102 readings; None where nothing can be done, or told.
+    """Choose scans of at most 102 readings that separate the rivals; None if no scan is possible or informative.
 
     Parameters
     ----------
     rivals
-        Two or more.
+        Two or more hypotheses.
     sd
         Noise of a reading.
     plan
-        What was measured.
+        The plan already measured.
     apparatus
-        What could measure more.
+        The apparatus that can measure more.
     """
     leader = max(rivals, key=lambda rival: rival.probability)
     level = leader.model.predict(leader.z[None, :])[0]
@@ -117,7 +117,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
                 gains[k] = mutual_information([predictive.take(together) for predictive in predictives], weights) - told
-        gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also where a model fails there
+        gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
             break
@@ -136,12 +136,12 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
 
 
 def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Bound the mutual information of the hypothesis' index and the readings from below, in nats.
+    """Return a lower bound on the mutual information of hypothesis and readings, in nats.
 
     Parameters
     ----------
     predictives
-        What each hypothesis predicts of the same readings.
+        Predictive distribution of the same readings under each hypothesis.
     weights
         Probabilities (n_hypotheses,), which sum to one.
     """
@@ -158,7 +158,7 @@ def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatAr
 def _promising(
     rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
 ) -> list[int]:
-    """Keep, for each two rivals, the few scans in which what they predict differs most a minute."""
+    """Keep, for each pair of rivals, the few scans in which their predictions differ most per minute."""
     if not offered:
         return []
     everywhere, rows = apparatus.one_after_another(offered, plan), rows_of(offered)
@@ -167,14 +167,14 @@ def _promising(
     kept: dict[int, None] = {}
     for a, b in combinations(range(len(rivals)), 2):
         square = (means[a] - means[b]) ** 2
-        # Beyond what settles it more is worth nothing.
+        # Separation beyond this adds nothing.
         worth = np.minimum([square[own].sum() for own in rows], _ENOUGH) / minutes
         kept |= dict.fromkeys(np.argsort(-worth, kind="stable")[:_PROMISING].tolist())
     return list(kept)
 
 
 def _expected_log_bayes_factor(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Average, over which hypothesis is true, the log Bayes factor to be expected over the hardest of its rivals."""
+    """Return the expected log Bayes factor over the closest rival, averaged over the true hypothesis."""
     covariances = [predictive.covariance for predictive in predictives]
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]

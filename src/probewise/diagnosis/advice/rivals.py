@@ -1,4 +1,4 @@
-"""Which hypotheses the next readings are to tell apart."""
+"""The rival hypotheses that the next readings should separate."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ __all__ = ["next_readings"]
 
 _LEAST_PROBABILITY = 0.01
 _MOST_RIVALS = 5
-_TRIED = 3  # effects that are not significant, as a rival, until some reading tells of one
+_TRIED = 3  # insignificant effects to try as a rival, until some reading could detect one
 _UNDETECTED = 3.0  # lambda of such an effect
-_LEFT = 2.0  # times that it may change the readings taken, all told: what takes it up need not be a straight line
-_SIZES = 4  # tried until it does not, each a quarter of the one before
+_LEFT = 2.0  # factor by which its total change of the existing readings may exceed that, since the refit is nonlinear
+_SIZES = 4  # sizes tried, each a quarter of the last
 
 
 def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | None:
-    """Ask for the readings that tell the leading refitted hypotheses about the mean apart."""
+    """Choose the readings that separate the leading refitted hypotheses on the mean."""
     by_mean = searched.posterior.by_mean
-    # What has no name at all predicts no more than the null does.
+    # An unknown effect makes no prediction beyond the null.
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
     found: list[WeighedFit] = []
     for names in ranked:
         candidate = searched.best(names, searched.certain) if names else null
-        # Of what is named the next is a rival however improbable; of nothing, something that could be there.
+        # The rival of a named effect is the next hypothesis, however improbable; that of clean, a possible weak effect.
         second = len(found) == 1 and bool(found[0].names)
         if candidate is not None and (not found or second or probabilities[names] >= _LEAST_PROBABILITY):
             found.append(candidate)
@@ -61,7 +61,7 @@ def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> 
 
 
 def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
-    """Make a rival of an effect that is not significant, of a size that leaves lambda 3 here; None where none does."""
+    """Return a rival with an insignificant effect of the size that gives lambda 3 here, or None."""
     effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
@@ -78,9 +78,9 @@ def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
 
     for _ in range(_SIZES if amplitudes else 1):
         z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
-        z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor as it would then have been fitted
+        z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor refitted to readings with the effect
         if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.sd:
-            root = np.zeros((len(z), len(z)))  # of that size, and no other
+            root = np.zeros((len(z), len(z)))  # its size is fixed
             root[: len(found.z), : len(found.z)] = _root_of(null)
             return Rival(f"{spoken_name(name)} too weak to be detected so far", model, z, root, 0.0)
         setting[amplitudes] /= 4
@@ -88,6 +88,6 @@ def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
 
 
 def _root_of(candidate: WeighedFit) -> FloatArray:
-    """Take the square root of the covariance of a fit's coordinates, noise white."""
+    """Return a square root of the covariance of a fit's coordinates, for white noise."""
     slopes, sd = candidate.found.slopes, candidate.sd
     return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd))

@@ -1,1 +1,1 @@
-"""A plan judged before any data: what it cannot see, what it cannot tell apart, and the cure."""
+"""Audit of a plan before any data: undetectable effects, aliased effects, and readings that would help."""

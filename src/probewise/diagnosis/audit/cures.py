@@ -1,4 +1,4 @@
-"""The fewest extra readings that cure a plan: greedily, scan by scan, over what arm and hand can do."""
+"""The fewest extra readings that make effects identifiable: scans chosen greedily from those possible."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from probewise.recordings.plan import Plan
 
 __all__ = ["cures_of"]
 
-_MOST_SETTINGS = 48  # of an effect's bank: a hundred scans are tried at every step
+_MOST_SETTINGS = 48  # bank entries per effect, since a hundred scans are tried at every step
 _MOST_SCANS = 5
-_WORTHWHILE = 0.15  # of one effect's trouble: the least that an added scan must take away
-_WORTHWHILE_EACH = 0.005  # and for each of its readings: 200 readings may be spent on one effect, no more
+_WORTHWHILE = 0.15  # least reduction of the summed deficit by an added scan
+_WORTHWHILE_EACH = 0.005  # and per reading: at most 200 readings are spent on one effect
 _STRIDES = (1, 4)
 
 
@@ -40,20 +40,20 @@ def cures_of(
     ailing: Sequence[str],
     progress: Progress = silent,
 ) -> list[Scan]:
-    """Choose scans to add, one at a time, each for the trouble of the ailing effects that a reading of it takes away.
+    """Choose scans to add one at a time, each with the largest reduction of the effects' deficit per reading.
 
     Parameters
     ----------
     plan
-        What is to be measured.
+        The plan.
     expected
-        The sensor.
+        The expected sensor.
     effects
         The vocabulary, by name.
     ailing
-        Names of the effects that are not fine under the plan.
+        Names of the effects that are not identifiable under the plan.
     progress
-        Told of every scan that is chosen.
+        Called for every chosen scan.
     """
     every = [*commands(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Scan] = []
@@ -83,7 +83,7 @@ def cures_of(
 
 
 def _trouble(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
-    """Add up how far effects are from being fine: 0 fine, up to 1 aliased, 1 to 2 invisible."""
+    """Return the summed deficit of effects: 0 fine, up to 1 aliased, 1 to 2 invisible."""
     detectability = ProjectedTemplates.of(laid, rows).detectability(ailing)
     total = 0.0
     for name in ailing:

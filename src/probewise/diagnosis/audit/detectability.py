@@ -1,7 +1,7 @@
-"""How a plan sees the effects of a vocabulary: what survives of their traces, and how alike survivors are.
+"""Detectability of effects under a plan: norms and cosines of their projected templates.
 
-Everything is linear algebra about one expected sensor, before any reading: templates of every setting of
-every effect, the sensor's own parameters projected out.
+Linear algebra about one expected sensor, before any reading: templates of every effect at many settings, with the
+sensor's own parameters projected out.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ __all__ = [
 ]
 
 LAMBDA = 8.0  # size of an effect at which a plan is judged
-LEAST_NATS = 3.0  # least that tells two effects apart
-ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which they leave no more
-LEAST_SHARE = 0.05  # of an effect's trace; less is lost in what the sensor's parameters absorb
-_MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank; beyond it the bank is thinned
+LEAST_NATS = 3.0  # least evidence that separates two effects
+ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which the evidence is LEAST_NATS
+LEAST_SHARE = 0.05  # least share of an effect's template that the sensor's parameters must not absorb
+_MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
 
 
 def nats_between(cosine: float) -> float:
-    """Expect the log Bayes factor between two effects of lambda 8 whose surviving traces have this cosine."""
+    """Return the expected log Bayes factor between two effects of lambda 8 with this cosine of projected templates."""
     return 0.5 * LAMBDA**2 * (1 - cosine**2)
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """The sensor that is expected: its prior, the point `z` (n_params,) about which to look, levels, noise sd."""
+    """The expected sensor: its prior, the point `z` (n_params,) of linearisation, levels, noise sd."""
 
     null: Null
     z: FloatArray
@@ -59,9 +59,9 @@ class Expected:
 class PlanTemplates:
     """The templates of one plan, in units of the noise sd.
 
-    `columns` (n_points, n_columns) come in entries, the settings of an effect's bank; `entry` (n_columns,)
-    numbers them, `owner` (n_entries,) says which effect of `names` each belongs to, `settings` what was set.
-    `slopes` (n_points, n_params) are the sensor's own. Effects that cannot show here at all are not in `built`.
+    `columns` (n_points, n_columns) are grouped in entries, the settings of an effect's bank; `entry` (n_columns,)
+    numbers them, `owner` (n_entries,) is the index of the effect in `names`, `settings` its parameters. `slopes`
+    (n_points, n_params) are those of the sensor. Effects that cannot act here are not in `built`.
     """
 
     slopes: FloatArray
@@ -81,9 +81,9 @@ class PlanTemplates:
         *,
         most: int | None = None,
     ) -> Self:
-        """Lay out every effect on the mean, at most `most` settings of each, spread evenly.
+        """Build the templates of every effect on the mean, with at most `most` settings each, evenly spread.
 
-        Without `most` all of them, but for plans of thousands of readings.
+        Without `most`, all settings are used, except for plans of thousands of readings.
         """
         extent = Extent(*expected.levels, plan)
         maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
@@ -95,7 +95,7 @@ class PlanTemplates:
     def of_built(
         cls, expected: Expected, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
     ) -> Self:
-        """Lay out effects that have their scale already."""
+        """Build the templates of effects that are already scaled."""
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
         model = Model(expected.null, (), plan)
         predicted, slopes = model.jacobian(expected.z)
@@ -122,16 +122,16 @@ class PlanTemplates:
         )
 
     def norms(self, columns: FloatArray) -> FloatArray:
-        """Norm of each entry's columns together, (n_entries,)."""
+        """Return the joint norm of each entry's columns, (n_entries,)."""
         return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectedTemplates:
-    """What survives of every entry's columns on some rows, in noise sds: `left` (n_rows, n_columns).
+    """Templates on some rows with the sensor's parameters projected out, in noise sds: `left` (n_rows, n_columns).
 
-    `basis` holds each entry's columns made orthonormal; `raw` and `kept` (n_entries,) are the entries'
-    norms before and after.
+    `basis` holds each entry's columns orthonormalised; `raw` and `kept` (n_entries,) are the norms before and after the
+    projection.
     """
 
     laid: PlanTemplates
@@ -152,10 +152,9 @@ class ProjectedTemplates:
         return cls(laid, left, _orthonormal(left, laid.entry), laid.norms(columns), laid.norms(left), n_points)
 
     def detectability(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
-        """Give the surviving share of each effect that is asked about, and its cosine to every visible other one.
+        """Return the detectable share of each requested effect, and its cosine to every other detectable effect.
 
-        Both are medians over the effect's settings: what is true of a typical one. The cosine is to the
-        setting of the other that imitates best.
+        Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.
         """
         laid = self.laid
         present = {name: self._present(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
@@ -184,12 +183,12 @@ class ProjectedTemplates:
         return out
 
     def _present(self, effect: int) -> IntArray:
-        """Entries of an effect that act on these rows at all."""
+        """Return the entries of an effect that act on these rows."""
         mine = np.flatnonzero(self.laid.owner == effect)
         return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
 
     def smallest(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
-        """Size of each amplitude at which lambda 8 is left of it, the median over settings; None where nothing is."""
+        """Return the value of each amplitude that gives lambda 8, median over settings; None if undetectable."""
         at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
         columns = np.flatnonzero(np.isin(self.laid.entry, at))
         settings = np.concatenate([self.laid.settings[k] for k in at])
@@ -203,14 +202,14 @@ class ProjectedTemplates:
 
 
 def _starts(codes: IntArray) -> IntArray:
-    """Give the first place of each run of equal codes."""
+    """Return the first index of each run of equal codes."""
     return np.flatnonzero(np.diff(codes, prepend=-1))
 
 
 def _orthonormal(columns: FloatArray, entry: IntArray) -> FloatArray:
-    """Make each entry's columns orthonormal.
+    """Orthonormalise each entry's columns.
 
-    What is shorter than a thousandth of the longest is not there: its column is 0.
+    Directions shorter than a thousandth of the longest become zero columns.
     """
     out = np.zeros_like(columns)
     widths = np.bincount(entry)

@@ -1,4 +1,4 @@
-"""audit.json: what `probewise audit` found, strict JSON, format "audit/1"."""
+"""audit.json: the result of `probewise audit` as strict JSON, format "audit/1"."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CURE_PLAN = "cure_plan.csv"
 
 
 def audit_json(audit: PlanAudit) -> dict[str, Any]:
-    """Lay an audit out as audit.json: finite numbers, texts, lists, null where there is no number."""
+    """Convert an audit to the content of audit.json: finite numbers, texts, lists, null for missing numbers."""
     plan = audit.cure_plan
     return {
         "format": "audit/1",

@@ -1,8 +1,8 @@
-"""Audit a plan before any data: which effects it cannot see, which it cannot tell apart, what would cure that.
+"""Audit a plan before any data: undetectable effects, aliased effects, and readings that would help.
 
-About a typical sensor (or a calibrated one) every effect of the vocabulary is laid out as templates, and what
-the sensor's own parameters would absorb is projected out. What survives says how well an effect is seen;
-the cosine between two survivors, how well they are told apart: by lambda^2 (1 - cosine^2) / 2 nats.
+About a typical (or calibrated) sensor, every effect of the vocabulary becomes a set of templates, with the sensor's own
+parameters projected out. The norm of a projected template measures detectability; the cosine of two, how well they are
+separated: by lambda^2 (1 - cosine^2) / 2 nats.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ __all__ = ["Cure", "Detectability", "EffectAudit", "PlanAudit", "Smallest", "aud
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
-_MOST_READINGS = 4000  # of a recording that are looked at; of a longer one every second, every third, ...
-_SETTINGS = 48  # of an effect's bank, beside a diagnosis
-_LEVELS = (0.1, 0.9)  # of the range of a reading, black and white, where no sensor is known
+_MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...
+_SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis
+_LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
 _READING_GUIDE = (
     "(fine: these readings show the effect and tell it from every other. aliased (as X, c): they show it, but X at its",
     " best setting passes for it, by a cosine c of 1 at most; where X is there, it may still be told from this one.",
     " invisible: they cannot show it.)",
 )
-_NOISE = 0.01  # of the span between the levels, likewise
-# Two Gaussians, a core and a fainter skirt, off the centre and not round: nothing is invisible by symmetry alone.
+_NOISE = 0.01  # noise as a share of the span between the levels, likewise
+# Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
 _TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.2, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
 class Smallest:
-    """The size of one parameter at which an effect leaves lambda 8 behind; None where none does."""
+    """The value of one parameter at which an effect has lambda 8; None if it never has."""
 
     parameter: str
     unit: str
@@ -63,22 +63,22 @@ class Smallest:
 
 @dataclass(frozen=True)
 class EffectAudit:
-    """How a plan sees one effect.
+    """Detectability of one effect under a plan.
 
     Attributes
     ----------
     name, detectability
         The effect, and whether it is invisible, aliased or fine.
     share
-        Surviving share of its trace, the median over its settings; 0 where it cannot show at all.
+        Detectable share, median over its settings; 0 if it cannot act here.
     alike
-        Effects that a typical setting of this one looks like, each with the cosine, most alike first.
+        Effects that imitate a typical setting of this one, with cosines, largest first.
     smallest
-        The size at which it is seen, for each amplitude.
+        The value of each amplitude at which it has lambda 8.
     reason
         Why it is invisible, or "".
     rows
-        Rows like these at which it is seen where it changes readings by one noise sd rms; None where not counted.
+        Number of rows like these that detect it if it changes readings by one noise sd rms; None if not computed.
     """
 
     name: str
@@ -98,7 +98,7 @@ class EffectAudit:
 
 @dataclass(frozen=True, eq=False)
 class Cure:
-    """One scan to add: its kind (`Scan`), in words, readings, time, and the effects that are fine from then on."""
+    """One scan to add: its kind (`Scan`), description, plan, minutes, and the effects that become identifiable."""
 
     kind: str
     description: str
@@ -109,25 +109,25 @@ class Cure:
 
 @dataclass(frozen=True, eq=False)
 class PlanAudit(ShowsItself):
-    """What a plan can and cannot tell.
+    """The audit of a plan.
 
     Attributes
     ----------
     plan
         The plan.
     assumed
-        What was taken for the sensor, in words.
+        The assumed sensor, in words.
     effects, after
         Every effect, under the plan and under the plan with all cures.
     cosines
-        How well each effect (row) is imitated by each other (column), (n_effects, n_effects), in the order of
-        `effects`; on the diagonal the surviving share.
+        Cosine of each effect (row) with its best imitation by each other (column), (n_effects, n_effects), in the order
+        of `effects`; on the diagonal, the detectable share.
     cures
-        Scans to add, the most telling first.
+        Scans to add, the most useful first.
     words
-        How to speak of what would take the readings.
+        Words for the apparatus.
     classes
-        Effects that are not told apart, each class once; None where not asked.
+        Classes of aliased effects; None if not requested.
     """
 
     plan: Plan
@@ -143,12 +143,12 @@ class PlanAudit(ShowsItself):
         object.__setattr__(self, "cosines", frozen(self.cosines))
 
     def seen_as(self, detectability: Detectability, *, after: bool = False) -> tuple[EffectAudit, ...]:
-        """Select the effects that are seen this way, in the plan as it is or after its cures.
+        """Return the effects with this detectability, under the plan or the plan with its cures.
 
         Raises
         ------
         ParameterError
-            If there is no such way.
+            If there is no such detectability.
         """
         require_one_of("detectability", detectability, get_args(Detectability))
         return tuple(
@@ -157,7 +157,7 @@ class PlanAudit(ShowsItself):
 
     @property
     def cure_plan(self) -> Plan | None:
-        """All cures as one plan to carry out, one after the other; None where there is none."""
+        """All cures as one plan; None if there are none."""
         if not self.cures:
             return None
         first, *more = (cure.plan for cure in self.cures)
@@ -165,16 +165,16 @@ class PlanAudit(ShowsItself):
 
     @property
     def extra_readings(self) -> int:
-        """Number of readings that the cures take."""
+        """Number of readings of the cures."""
         return sum(len(cure.plan) for cure in self.cures)
 
     @property
     def extra_minutes(self) -> float:
-        """How long the cures take, with the breaks before each scan."""
+        """Duration of the cures in minutes, including the breaks before each scan."""
         return sum(cure.minutes for cure in self.cures)
 
     def summary(self) -> str:
-        """Say it on one screen."""
+        """Return a plain-text summary."""
         lines = [f"{len(self.plan)} readings in {count_of(self.plan.scan_names, self.words.run)}; {self.assumed}"]
         lines += _listed("fine", [e.name for e in self.seen_as("fine")])
         lines += _listed("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
@@ -194,7 +194,7 @@ class PlanAudit(ShowsItself):
 
 
 def count_of(names: Sequence[str], noun: str) -> str:
-    """Count what has names."""
+    """Write the number of names with a noun."""
     return f"{len(names)} {noun}{'' if len(names) == 1 and noun != 'scan' else 's'}"
 
 
@@ -203,7 +203,7 @@ def _with_aliases(effect: EffectAudit) -> str:
 
 
 def _listed(label: str, names: Sequence[str], width: int = 100) -> list[str]:
-    """Wrap names behind a label."""
+    """Wrap names after a label."""
     lines, line = [], f"{label:<10} "
     for k, name in enumerate(names):
         piece = name + (", " if k + 1 < len(names) else "")
@@ -222,12 +222,12 @@ def audit_plan(
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
     progress: Progress = silent,
 ) -> PlanAudit:
-    """Say of each effect whether a plan sees it and tells it from the others, and what readings would cure it.
+    """Determine for each effect whether a plan detects and identifies it, and which readings would help.
 
     Parameters
     ----------
     plan
-        What is to be measured; of a recording its plan.
+        The plan to be measured, or that of a recording.
     sensor
         A calibrated sensor, whose posterior becomes the prior; None: a typical one.
     noise_sd
@@ -236,7 +236,7 @@ def audit_plan(
     effects
         The vocabulary, by name.
     progress
-        Told of the plan, then of each scan that might cure it.
+        Called for the plan, then for each scan considered as a cure.
 
     Raises
     ------
@@ -265,7 +265,7 @@ def audit_plan(
         current = behind(current, [command.plan])
         steps.append(judged(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)
-    n_kept = max(cured.values(), default=0)  # no scan that was to help a next one that never came
+    n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
         Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
         for k, c in enumerate(chosen[:n_kept], start=1)
@@ -274,9 +274,9 @@ def audit_plan(
 
 
 def _cured_at(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
-    """Say of each effect that the steps cure from which one on it is fine; what no step does lasting good is left out.
+    """Return, for each effect cured by the steps, the step from which it remains fine.
 
-    An effect may be fine as long as the steps last that cure anything, and spoilt by one behind them.
+    An effect may be fine at some step and not after a later one.
     """
     fine = [{effect.name for effect in step if effect.detectability == "fine"} for step in steps]
 
@@ -293,14 +293,14 @@ def audit_recorded(
     sensor: SensorPrior | None = None,
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
 ) -> PlanAudit:
-    """Audit the readings of a diagnosis about the sensor that it calibrated; cures are its next measurement's part.
+    """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
 
     Parameters
     ----------
     diagnosis
-        Of a light sensor over known patterns.
+        Diagnosis of a light sensor over known patterns.
     sensor
-        The earlier sensor that it was given, if any.
+        The earlier sensor used as its prior, if any.
     effects
         The vocabulary, by name.
     """
@@ -327,7 +327,7 @@ def audit_recorded(
 
 
 def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:
-    """Say what is expected of the sensor, and in words."""
+    """Return the expected sensor, and its description."""
     if sensor is not None:
         mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
         null = sensor_of(sensor)
@@ -350,7 +350,7 @@ def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) ->
 def judged(
     laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
-    """Judge every effect, and how well each (row) is imitated by each other (column)."""
+    """Return the audit of every effect, and the matrix of cosines (row imitated by column)."""
     seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
     detectability = seen.detectability()
     names = list(effects)
@@ -359,7 +359,7 @@ def judged(
     for own, name in enumerate(names):
         effect = laid.built.get(name)
         if effect is None:
-            out.append(EffectAudit(name, "invisible", 0.0, reason="what it shows in does not vary here"))
+            out.append(EffectAudit(name, "invisible", 0.0, reason="its covariate does not vary here"))
         elif effect.stage is Stage.NOISE:
             enough = seen.n_points >= LEAST_READINGS
             reason = "" if enough else f"{seen.n_points} readings show no scatter; {LEAST_READINGS} do"

@@ -1,1 +1,1 @@
-"""What a fit is worth, and what could be added to it: Laplace's evidence, templates and their Bayes factors."""
+"""Evidence of fits by Laplace's approximation, and Bayes factors of effects to add, by templates."""

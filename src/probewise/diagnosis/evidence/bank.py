@@ -1,7 +1,6 @@
-"""Many templates at once: what can be known of them before a fit, and their Bayes factors about any fit.
+"""A bank of templates, with products computed once and Bayes factors about any fit.
 
-A fit takes a part out of each template; the products that tell how much need the templates themselves only
-once for each law of the noise.
+A fit absorbs a part of each template; the products needed for this are computed once for each noise model.
 """
 
 from __future__ import annotations
@@ -18,23 +17,23 @@ from probewise.diagnosis.noise.law import NoiseLaw
 
 __all__ = ["Bank"]
 
-_ABSENT = 1e-9  # share of a template's sum of squares, below which what a fit leaves of it is rounding
-_REMEMBERED = 5  # laws, those asked for last, as long as they take no more than so many bytes
+_ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error
+_REMEMBERED = 5  # most recent noise models in the cache, up to `_MOST_BYTES`
 _MOST_BYTES = 2**28
 
 
 @dataclass(eq=False)
 class Bank:
-    """Templates side by side.
+    """Templates, concatenated.
 
     Parameters
     ----------
     columns
-        All of them, (n_points, n_columns).
+        Columns of all templates, (n_points, n_columns).
     widths
-        Columns of each template, (n_templates,).
+        Number of columns of each template, (n_templates,).
     labels
-        What each is, n_templates.
+        Label of each template.
     """
 
     columns: FloatArray
@@ -44,12 +43,12 @@ class Bank:
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> Bank:
-        """Set templates, each (n_points, k), side by side."""
+        """Concatenate templates, each (n_points, k)."""
         widths = np.array([t.shape[1] for t in templates], dtype=np.int64)
         return cls(np.concatenate([np.zeros((n_points, 0)), *templates], axis=1), widths, tuple(labels))
 
     def __getitem__(self, at: int) -> FloatArray:
-        """Give one template, (n_points, k)."""
+        """Return one template, (n_points, k)."""
         first = int(self._starts[at])
         return self.columns[:, first : first + int(self.widths[at])]
 
@@ -60,18 +59,18 @@ class Bank:
 
     @cached_property
     def members(self) -> dict[str, IntArray]:
-        """Numbers of the templates of each label."""
+        """Indices of the templates of each label."""
         labels = np.array(self.labels)
         return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
 
     def take(self, members: IntArray) -> Bank:
-        """Keep these templates."""
+        """Return the bank of these templates."""
         at = [self._starts[k] + np.arange(self.widths[k]) for k in members]
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
         return Bank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
-        """Weigh each template against a fit, as `block_log_bayes_factors` does.
+        """Return the log Bayes factor of each template against a fit, as `block_log_bayes_factors` does.
 
         Parameters
         ----------
@@ -87,7 +86,7 @@ class Bank:
         own = problem.residual[:, None] if residuals is None else residuals
         n = problem.n_points
         whitened = self._under(problem.law)
-        taken = problem.basis[:n].T @ whitened.templates  # what the fit takes up, (n_params, n_columns)
+        taken = problem.basis[:n].T @ whitened.templates  # the part that the fit absorbs, (n_params, n_columns)
         along = whitened.templates.T @ own[:n]
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.widths), own.shape[1]))
@@ -103,14 +102,14 @@ class Bank:
         return out
 
     def surviving(self, problem: Linearised) -> FloatArray:
-        """Share of each template that a fit leaves, (n_templates,): 0 where its parameters take all of it up."""
+        """Return the share of each template that a fit does not absorb, (n_templates,)."""
         templates = self._under(problem.law).templates
         taken = problem.basis[: problem.n_points].T @ templates
         whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._starts) for a in (templates, taken))
         return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
 
     def _of_width(self, width: int) -> tuple[IntArray, IntArray]:
-        """Give the numbers of the templates of one width, (n,), and of their columns, (n, width)."""
+        """Return the indices of the templates of one width, (n,), and of their columns, (n, width)."""
         members = np.flatnonzero(self.widths == width)
         return members, self._starts[members, None] + np.arange(width)
 
@@ -137,7 +136,7 @@ class Bank:
 
 @dataclass(frozen=True, eq=False)
 class _Whitened:
-    """All templates under one law, (n_points, n_columns), and by width each one's products, (n, width, width)."""
+    """All templates, whitened, (n_points, n_columns), and by width their Gram matrices, (n, width, width)."""
 
     templates: FloatArray
     products: dict[int, FloatArray]

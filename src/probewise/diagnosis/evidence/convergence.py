@@ -1,4 +1,4 @@
-"""Has a fit arrived? One that has not is no ground for a verdict."""
+"""Convergence of a fit, which a verdict requires."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
 
 
 def require_finite(found: Fit) -> Fit:
-    """Return a fit whose predictions are numbers.
+    """Return a fit after checking that its predictions are finite.
 
     Raises
     ------
@@ -23,12 +23,12 @@ def require_finite(found: Fit) -> Fit:
         If they are not, with the fit as its `partial`.
     """
     if not np.isfinite(found.objective):
-        raise NotConvergedError("the model predicts readings that are no finite numbers; check it and its prior", found)
+        raise NotConvergedError("the model predicts readings that are not finite; check the model and its prior", found)
     return found
 
 
 def require_converged(found: Fit, problem: Linearised) -> None:
-    """Refuse a fit that one more step would still improve by much, unless it rests against the bounds of its prior.
+    """Refuse a fit that one more step would still improve much, unless it is at the bounds of its prior.
 
     Raises
     ------
@@ -41,6 +41,6 @@ def require_converged(found: Fit, problem: Linearised) -> None:
     if left > _FAR and np.abs(found.z).max() < FARTHEST - 0.1:
         raise NotConvergedError(
             f"the fit of the model did not converge: one more step would still gain about {left:.0f} nats; "
-            "a narrower prior or readings that tell more would help",
+            "a narrower prior or more informative readings would help",
             found,
         )

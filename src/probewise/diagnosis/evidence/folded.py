@@ -1,10 +1,9 @@
-"""Each Gaussian of an SSF under one name: the same evidence, and one peak where there were as many as orders of them.
+"""Remove the label switching of an SSF's Gaussians: the same evidence, with one mode instead of N!.
 
-The likelihood of exchangeable Gaussians has every peak N! times. (The prior of three shares and more, given by their
-ratios to the first, is not quite the same for all orders.) Folded onto the order that is nearest to a point, with the
-prior density of all orders summed, the posterior has each peak once. Sampling then has nothing to hop between: of
-three Gaussians, one hardly needed, two hundred live points left the log evidence uncertain by five nats, and folded by
-one.
+The likelihood of exchangeable Gaussians has every mode N! times. (The prior of three or more shares, given by their
+ratios to the first, is not quite the same for all orders.) Folded onto the order nearest to a point, with the prior
+density of all orders summed, the posterior has each mode once. Sampling need not hop between modes: for three
+Gaussians, one hardly needed, with two hundred live points, the error of the log evidence fell from five nats to one.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class FoldedNormal(StandardNormal):
     n_params
         Number of coordinates.
     sensor
-        Whose Gaussians trade names; its coordinates come first.
+        Sensor with exchangeable Gaussians; its coordinates come first.
     near
         The point, (n_params,).
     """
@@ -52,7 +51,7 @@ class FoldedNormal(StandardNormal):
         return np.stack([self.sensor.renamed(np.eye(n_own), order) for order in orders]) - shift, shift
 
     def _images(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Give every order's coordinates, (n_orders, n_samples, n_params), and how far each is from the point."""
+        """Return every order's coordinates, (n_orders, n_samples, n_params), and their distances from the point."""
         turn, shift = self._other_orders
         images = np.repeat(z[None], len(turn) + 1, axis=0)
         n_own = self.sensor.n_params
@@ -60,7 +59,7 @@ class FoldedNormal(StandardNormal):
         return images, np.linalg.norm(images - self.near, axis=2)
 
     def fold(self, z: FloatArray) -> FloatArray:
-        """Name the Gaussians in the order nearest to the point, (n_samples, n_params) both ways."""
+        """Reorder the Gaussians to be nearest to the point, (n_samples, n_params) both ways."""
         images, far = self._images(z)
         return np.asarray(images[np.argmin(far, axis=0), np.arange(len(z))])
 
@@ -69,7 +68,7 @@ class FoldedNormal(StandardNormal):
         return self.fold(super().from_unit_cube(u))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Log density, (n_samples,): of all orders together, and -inf where another order is nearer."""
+        """Return the log density summed over all orders, (n_samples,); -inf if another order is nearer."""
         images, far = self._images(theta)
         density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
         return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
@@ -77,13 +76,13 @@ class FoldedNormal(StandardNormal):
 
 @dataclass(frozen=True, eq=False)
 class Folded:
-    """A problem under the folded prior; predictions do not ask for the order of Gaussians."""
+    """A problem with the folded prior; predictions do not depend on the order of the Gaussians."""
 
     problem: JointProblem
     prior: FoldedNormal
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Ask the problem, (n_samples, n_params) -> (n_samples,)."""
+        """Return the log likelihood, (n_samples, n_params) -> (n_samples,)."""
         return self.problem.log_likelihood(theta)
 
 
@@ -93,13 +92,13 @@ def folded(problem: JointProblem, near: FloatArray) -> JointProblem | Folded:
     Parameters
     ----------
     problem
-        As it is.
+        The problem.
     near
         The point, (n_params,).
 
     Returns
     -------
-    A problem of the same evidence; the problem itself where its sensor is no mixture whose names can be traded.
+    A problem with the same evidence; the problem itself if its sensor has no exchangeable Gaussians.
     """
     sensor = problem.model.sensor
     if not (isinstance(sensor, SensorCoordinates) and sensor.exchangeable and sensor.n_gaussians > 1):

@@ -1,4 +1,4 @@
-"""Does the repaired model predict held-out readings? Rows left out at random would leak, so whole parts are."""
+"""Gain on held-out readings. Whole parts are held out, since rows chosen at random would leak information."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from probewise.recordings.plan import Recording
 __all__ = ["LEAST_ROWS", "MOST_PARTS", "HeldOut", "Parts", "compare_parts", "held_out_blocks", "held_out_gain"]
 
 LEAST_ROWS = 8
-"""Of a part: a shorter one is not held out."""
+"""Least number of rows of a held-out part."""
 
 MOST_PARTS = 10
-"""That are held out in turn."""
+"""Largest number of parts held out in turn."""
 
 Parts = tuple[IntArray, tuple[str, ...]]
-"""Numbers of the parts that usable readings are held out in, (n_usable,), and their names."""
+"""Part number of each usable reading, (n_usable,), and the names of the parts."""
 
 _BLOCKS = 5
 
@@ -38,11 +38,11 @@ class HeldOut:
 
 
 def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOut:
-    """Refit both models without one part at a time and compare how they predict it, reading by reading.
+    """Refit both models without one part at a time and compare their predictions of it, reading by reading.
 
-    Each reading counts by itself, as the law of the noise has it; where the part has parameters of its own, of which
-    the others tell nothing, its readings count one after the other, each predicted with the help of those before it.
-    Parts of fewer than eight readings stay in.
+    Each reading is predicted by itself under the noise model. If the part has parameters of its own, which other parts
+    do not determine, its readings are predicted sequentially, each given those before it. Parts of fewer than eight
+    readings are not held out.
     """
     plan, usable = recording.plan, recording.usable
     parts, names = held_out
@@ -57,24 +57,24 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
 
 
 def held_out_blocks(recording: Recording) -> Parts:
-    """Divide usable readings into blocks of eight that follow each other, every fifth of which is held out together.
+    """Divide usable readings into successive blocks of eight; every fifth block is held out together.
 
-    What is local in time tells nothing of another scan; of readings between those that are known it does, and a block
-    is long enough that its middle is no neighbour of theirs.
+    An effect local in time cannot be predicted for another scan, but it can between known readings; a block is long
+    enough that its middle is not adjacent to them.
     """
     block = np.arange(int(recording.usable.sum())) // LEAST_ROWS
     return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
 def compare_parts(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
-    """Hold one part out at a time and gather the gains of its readings.
+    """Hold out one part at a time and collect the gains of its readings.
 
     Parameters
     ----------
     scan
         Scan of each usable reading, (n_usable,).
     gain
-        For a mask of the held-out readings (n_usable,), the gain of each of them, in nats.
+        Function of a mask of held-out readings (n_usable,); returns the gain of each of them, in nats.
     scan_names
         Names of the scans; without, their numbers.
     """
@@ -93,10 +93,10 @@ def compare_parts(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_
 
 
 def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray) -> FloatArray:
-    """Log predictive density of each held-out reading, by itself, by a refit to the others.
+    """Return the log predictive density of each held-out reading, from a refit to the others.
 
-    `rows` (n_points,) and `out` (n_usable,) are the same readings. What a law says of lost readings is the
-    same for every model of the mean, and left out.
+    `rows` (n_points,) and `out` (n_usable,) are the same readings. The contribution of lost readings, the same for
+    every model of the mean, is left out.
     """
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest, own = law.take(~out), law.take(out)
@@ -104,8 +104,8 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     asked = np.flatnonzero(rows & recording.usable)
     of_its_own = ~np.any(found.slopes[~out], axis=0) & np.any(found.slopes[out], axis=0)
     turned = np.where(of_its_own, 0.0, rest(without.slopes))
-    # What the part alone tells is linearised where all readings together have it: its prior may be wide, and the
-    # others may bound it on one side, as they do a ceiling that they stay below.
+    # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the other
+    # readings may bound them on one side only, as for a ceiling.
     about = np.where(of_its_own, found.z, without.z)
     predicted, slopes = (part[asked] for part in found.model.jacobian(about))
     free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
@@ -127,7 +127,7 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
 def _one_after_another(
     law: NoiseLaw, miss: FloatArray, slopes: FloatArray, mean: FloatArray, covariance: FloatArray, sigma_2: float
 ) -> FloatArray:
-    """Log density of each reading given those before it, (n,): `mean` and `covariance` of the coordinates are updated.
+    """Return the log density of each reading given those before it, (n,); `mean` and `covariance` are updated.
 
     Whitened readings are independent, given the coordinates; a constant of the whitening, the same for every model of
     the mean, is left out.
@@ -143,7 +143,7 @@ def _one_after_another(
         shares = np.array([1 - law.share, law.share])
         density = _log_normal(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
         out[k] = np.logaddexp(*density)
-        variance = float(np.exp(density - out[k]) @ parts)  # as wide as this reading most probably is
+        variance = float(np.exp(density - out[k]) @ parts)  # the most probable noise variance of this reading
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
     return out

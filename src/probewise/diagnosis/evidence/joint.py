@@ -1,4 +1,4 @@
-"""A hypothesis as a problem of inference, as `probewise.nested` asks: a model in its coordinates, and a recording."""
+"""A hypothesis as an inference problem for `probewise.nested`: a model in its coordinates, and a recording."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from probewise.recordings.plan import Recording
 
 __all__ = ["JointProblem", "StandardNormal", "log_likelihood_of_whitened"]
 
-_HELD = 0.999  # of the evidence by the nodes of the noise that are kept; the rest is made up for
+_HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
 
 
 @dataclass(frozen=True, eq=False)
 class StandardNormal:
-    """The prior of a model's coordinates: independent, standard normal, and chains step in them as they are."""
+    """The prior of a model's coordinates: independent standard normals, in which chains step directly."""
 
     n_params: int
 
@@ -34,15 +34,15 @@ class StandardNormal:
 
     @property
     def coordinates(self) -> StandardNormal:
-        """Its own."""
+        """The coordinates themselves."""
         return self
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the unit cube to normal scores, (n_samples, n_params) both ways."""
+        """Map the unit cube to standard-normal coordinates, (n_samples, n_params) both ways."""
         return np.asarray(ndtri(u))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map normal scores to the unit cube."""
+        """Map standard-normal coordinates to the unit cube."""
         return np.asarray(ndtr(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
@@ -60,14 +60,14 @@ class StandardNormal:
 
 @dataclass(frozen=True, eq=False)
 class JointProblem:
-    """A model in its coordinates against a recording, the noise's sd and the nodes of its law summed out.
+    """A model in its coordinates with a recording; noise sd and noise nodes are marginalised.
 
     Parameters
     ----------
     model, recording
-        What predicts and what was read.
+        Model and data.
     noise
-        The evidence of a fit under the noise model: its nodes, of which those that matter are kept.
+        Evidence of a fit under the noise model, whose important nodes are kept.
     """
 
     model: Model
@@ -80,7 +80,7 @@ class JointProblem:
         return StandardNormal(self.model.n_params)
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Predict all readings and weigh the usable ones under each law kept: (n_samples, n_params) -> (n_samples,)."""
+        """Return the log likelihood, averaged over the kept noise nodes: (n_samples, n_params) -> (n_samples,)."""
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         residuals = (self.recording.readings[usable] - predicted).T
@@ -95,7 +95,7 @@ class JointProblem:
 
     @cached_property
     def _kept(self) -> list[int]:
-        """The fewest nodes of the noise that hold what matters."""
+        """Fewest noise nodes that hold the given share of the evidence."""
         order = np.argsort(-self.noise.weights)
         n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
         kept: list[int] = order[:n_kept].tolist()

@@ -1,4 +1,4 @@
-"""Weigh hypotheses: Laplace evidence of a fit, closed-form Bayes factors of what could be added to it."""
+"""Laplace evidence of a fit, and closed-form Bayes factors of templates to add to it."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ __all__ = [
 ]
 
 SCALES = np.geomspace(0.05, 25.0, 8)
-"""Prior scales of an effect's rms, in noise sd: a mixture with a heavy tail."""
+"""Prior scales of an effect's rms, in noise sds: a mixture with a heavy tail."""
 
 LEAST_VISIBLE = 4.0
-"""Least size (lambda) of what counts as an effect: there the alarm at one in a hundred sees more than it misses."""
+"""Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
 
-_INVISIBLE = -50.0  # log Bayes factor of a template of which nothing survives
+_INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
 
 
 _ROUNDING = 1e-12
-_MOST_NUMBERS = 4_000_000  # held at once, of the slopes under several laws
+_MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noise models
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseEvidence:
-    """Log evidence of a fit under one noise model, and where among its nodes the evidence lies.
+    """Log evidence of a fit under one noise model, in total and by node.
 
-    A model that cannot be (none of its nodes fits these readings) has no nodes, and log evidence minus infinity.
+    An impossible model (none of its nodes fits these readings) has no nodes and log evidence minus infinity.
     """
 
     noise: NoiseModel
@@ -60,7 +60,7 @@ class NoiseEvidence:
         return np.exp(self.log_z_nodes - logsumexp(self.log_z_nodes))
 
     def likely_nodes(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Give up to four nodes of one effect that hold most, (n_nodes, n_params), and the log weight of each."""
+        """Return up to four nodes of one effect with the largest weight, (n_nodes, n_params), and their log weights."""
         own = self.nodes.settings[:, self.noise.columns_of(name)]
         settings, node_of = np.unique(own, axis=0, return_inverse=True)
         node_of = node_of.ravel()
@@ -72,23 +72,22 @@ class NoiseEvidence:
 
     @property
     def law(self) -> NoiseLaw:
-        """The most probable node's."""
+        """Noise model at the most probable node."""
         return self.nodes.laws[int(np.argmax(self.log_z_nodes))]
 
     @property
     def at_best(self) -> NoiseEvidence:
-        """The most probable node alone."""
+        """Return the evidence restricted to the most probable node."""
         at = [int(np.argmax(self.log_z_nodes))]
         own = NoiseNodes(self.nodes.settings[at], (self.law,), self.nodes.log_weights[at])
         return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], own)
 
 
 def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
-    """Integrate a fit's likelihood over its parameters and the noise sd (Laplace), and the noise model's nodes.
+    """Integrate a fit's likelihood over its parameters and the noise sd (Laplace) and the nodes of the noise model.
 
-    At each node the fit is carried to its new optimum by the linearised model, so that a correlation
-    is judged without the bias of residuals that were fitted as if white. Where the floor of the sd is above what is
-    left, the integral over the sd is taken to be as wide as elsewhere.
+    At each node the linearised model moves the fit to its new optimum, which avoids the bias of residuals fitted as if
+    white. If the floor of the sd exceeds the residuals, the integral over the sd is given its usual width.
     """
     every = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
@@ -97,7 +96,7 @@ def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
         out[nodes] = _of_normal_laws(found, [every.laws[node] for node in nodes], joined)
-    tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # by whitening, flat tops apart
+    tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
     for node in sorted({*range(len(out))} - {*normal}):
         law = every.laws[node]
         tailed.setdefault((law.linear, law.flat > 0), []).append(node)
@@ -109,16 +108,16 @@ def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
 
 
 def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
-    """Take a square root of the covariance of a fit's coordinates by Laplace, root root^T, (n_params, n_params).
+    """Return a square root of the Laplace covariance of a fit's coordinates, (n_params, n_params).
 
-    Of whitened slopes (n_points, n_params), and the variance of a whitened reading.
+    Arguments: whitened slopes (n_points, n_params), and the variance of a whitened reading.
     """
     curvature = slopes.T @ slopes / variance + np.eye(slopes.shape[1])
     return np.asarray(np.linalg.inv(np.linalg.cholesky(curvature)).T)
 
 
 def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
-    """Weigh a fit under laws without a tail, (n_laws,); `joined` are slopes and residual, (n_points, n_params + 1)."""
+    """Return the log evidence under Gaussian noise models, (n_laws,); `joined`: slopes and residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
     if any(law.walk.size for law in laws):
         turned = np.stack([law(joined) for law in laws])
@@ -147,7 +146,7 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) ->
 
 
 def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
-    """Weigh a fit under laws of one whitening that differ in their tails or flat tops, (n_laws,)."""
+    """Return the log evidence under noise models of one whitening with different tails or rounding, (n_laws,)."""
     turned = laws[0](joined)
     p, n_points = turned.shape[1] - 1, laws[0].n_points
     slopes, residual = turned[:, :p], turned[:, p:]
@@ -169,24 +168,24 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> Float
 
 
 def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Take the steps to the peaks, (n_laws, n_params), of curvatures (n_laws, n_params, n_params)."""
+    """Return the Newton steps to the modes, (n_laws, n_params), for curvatures (n_laws, n_params, n_params)."""
     try:
         return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
-    except np.linalg.LinAlgError:  # readings that are met exactly: beside their weight a prior's is lost in rounding
+    except np.linalg.LinAlgError:  # readings fitted exactly: the prior is lost in rounding
         size = np.trace(curvature, axis1=1, axis2=2)[:, None, None] / curvature.shape[1]
         ridge = _ROUNDING * size * np.eye(curvature.shape[1])
         return np.asarray(np.linalg.solve(curvature + ridge, downhill[:, :, None])[:, :, 0])
 
 
 def _peak(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
-    """Give what Laplace's approximation makes of peaks at z (n_laws, n_params), and the densities' constant."""
+    """Return Laplace's approximation for modes at z (n_laws, n_params), with the constant of the densities."""
     widths = -0.5 * np.linalg.slogdet(curvature)[1]
     return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A fit as a linear Gaussian problem whose parameters are projected out, prior included.
+    """A fit linearised to a Gaussian problem with its parameters, including their prior, projected out.
 
     Rows are the whitened readings in units of the noise sd, then one row for each parameter's prior.
     Under the null every row is standard normal, so r* = P eps needs no refit.
@@ -200,7 +199,7 @@ class Linearised:
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, beside: FloatArray | None = None) -> Linearised:
-        """Linearise about a fit; `beside` are slopes (n_points, k) by coordinates that it has not, taken to be 0."""
+        """Linearise about a fit; `beside` are slopes (n_points, k) by additional coordinates, which are 0."""
         slopes, z = found.slopes, found.z
         if beside is not None:
             slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
@@ -216,14 +215,14 @@ class Linearised:
         augmented = np.concatenate([law.pseudo(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
         if known:
-            # What says less than so many readings should, flat at the top, does not make the noise smaller.
+            # Rounded readings carry less information, which must not make the noise sd smaller.
             rest = math.sqrt(max(free - float(residual @ residual), 0.0))
             basis, residual = np.concatenate([basis, np.zeros((1, p))]), np.append(residual, rest)
         return cls(basis, residual, law, sd, n_points)
 
     @property
     def n_rows(self) -> int:
-        """Readings and priors."""
+        """Number of rows: readings and priors."""
         return len(self.basis)
 
     def project(self, columns: FloatArray) -> FloatArray:
@@ -237,7 +236,7 @@ class Linearised:
         return out
 
     def absorbed(self, found: Fit, change: FloatArray) -> FloatArray:
-        """Move the fit's coordinates so that a change of the readings (n_points,) is taken up, (n_params,)."""
+        """Return the shift of the fit's coordinates that absorbs a change of the readings (n_points,): (n_params,)."""
         slopes = self.law(found.slopes) / self.sd
         left = self.law(found.residuals - change)[:, None]
         normal = self.law.as_normal(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
@@ -254,10 +253,10 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Templates made orthonormal: columns `u` (n_rows, n_columns) in blocks, `gain` the surviving share.
+    """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, with squared lengths `gain`.
 
-    `gain` (n_columns,) is the squared length of what survives of a template of unit rms (times
-    n_points); `starts` (n_blocks,) is the first column of each block; `label` says what each block is.
+    `gain` (n_columns,) is the squared length of the projection of a template of unit rms (times n_points); `starts`
+    (n_blocks,) is the first column of each block; `labels` name the blocks.
     """
 
     u: FloatArray
@@ -275,7 +274,7 @@ class Blocks:
     def of_projected(
         cls, projected: FloatArray, widths: Sequence[int], labels: Sequence[str], problem: Linearised
     ) -> Blocks:
-        """Orthonormalise templates that `project_scaled` gave, side by side (n_rows, n_columns), each by itself."""
+        """Orthonormalise each of the concatenated templates from `project_scaled`, (n_rows, n_columns)."""
         starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])
         for width in set(widths):  # all templates of one width at a time
@@ -286,7 +285,7 @@ class Blocks:
 
 
 def project_scaled(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
-    """Whiten templates (n_points, k), scale each to unit rms, project the fit out: side by side (n_rows, n_columns)."""
+    """Whiten templates (n_points, k), scale to unit rms, project the fit out; concatenated, (n_rows, n_columns)."""
     widths = [t.shape[1] for t in templates]
     whitened = problem.law(np.concatenate(templates, axis=1))
     per_column = np.repeat(widths, widths)
@@ -298,10 +297,10 @@ def project_scaled(problem: Linearised, templates: Sequence[FloatArray]) -> Floa
 def orthonormal(
     columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Orthonormalise neighbours, `width` at a time: (n_rows, n_columns) and squared lengths (n_columns,).
+    """Orthonormalise groups of `width` adjacent columns: (n_rows, n_columns) and squared lengths (n_columns,).
 
-    By the eigenvectors of their products. What is no longer than `least`, or than a `share` of the longest of its
-    block, both squared, is not there: its column is 0.
+    It uses the eigenvectors of the Gram matrices. Directions with squared length up to `least`, or up to a `share` of
+    the longest in the block, become zero columns.
     """
     blocks = columns.reshape(len(columns), -1, width)
     squares, axes = np.linalg.eigh(np.einsum("ibj,ibk->bjk", blocks, blocks, optimize=True))
@@ -312,10 +311,10 @@ def orthonormal(
 
 
 def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int) -> FloatArray:
-    """Weigh each block against the null, its amplitude and the noise sd integrated out.
+    """Return the log Bayes factor of each block against the null, with amplitude and noise sd integrated out.
 
-    An amplitude whose template has unit rms is normal with sd kappa noise sd, kappa mixed over those of
-    `SCALES` at which it can be seen; the noise sd marginalised makes it a Student-t.
+    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
+    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
 
     Parameters
     ----------
@@ -342,17 +341,17 @@ def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int
 
 
 def mix_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatArray:
-    """Average the Bayes factors of templates of one width over the `SCALES` at which each can be seen.
+    """Average the Bayes factors of templates of one width over the `SCALES` at which each is detectable.
 
-    At a smaller one what survives of a template has an rms lambda below `LEAST_VISIBLE`. There the Bayes factor is
-    near one whatever is read: it would keep alive what makes no difference.
+    At smaller scales the projected template has an rms lambda below `LEAST_VISIBLE`: the Bayes factor is near one
+    whatever the readings, and would keep irrelevant effects.
 
     Parameters
     ----------
     explained
         Share of the residual's sum of squares along each axis, (n_templates, width, n_draws).
     gain
-        Squared length of what survives along each axis, (n_templates, width).
+        Squared length of the projection along each axis, (n_templates, width).
     n_points
         Number of readings.
 

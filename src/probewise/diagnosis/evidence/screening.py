@@ -1,4 +1,4 @@
-"""Score what could be added to a fit, by templates in closed form: many at once, no refits."""
+"""Score effects to add to a fit, by templates in closed form, many at once without refits."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from probewise.diagnosis.names import Names
 
 __all__ = ["log_mean", "score_effects", "score_pairs", "score_unknown"]
 
-_BEST_ENTRIES = 2  # of each effect's bank, for pairs
+_BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
 
 
 def log_mean(scores: FloatArray) -> float:
-    """Average Bayes factors, given and returned as logs."""
-    top = float(scores.max())  # thousands of short lists: a library's care for every case takes ten times as long
+    """Return the log of the mean of Bayes factors given as logs."""
+    top = float(scores.max())  # thousands of short lists: scipy's general function is ten times slower
     return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
 
 
 def score_effects(problem: Linearised, bank: Bank) -> dict[str, FloatArray]:
-    """Weigh each entry of each effect's bank, labelled by its name: name -> log Bayes factors (n_entries,)."""
+    """Return the log Bayes factors of the entries of each effect's bank, by name, (n_entries,)."""
     scores = bank.log_bayes_factors(problem)[:, 0]
     return {name: scores[members] for name, members in bank.members.items()}
 
 
 def score_unknown(problem: Linearised, bases: Bank) -> dict[str, float]:
-    """Weigh what has no name against the fit, by the family of the bases: log Bayes factors."""
+    """Return the log Bayes factor of an unknown effect, by family of basis functions."""
     return {family: log_mean(own) for family, own in score_effects(problem, bases).items()}
 
 
 def score_pairs(
     problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
 ) -> dict[Names, float]:
-    """Weigh pairs: as if each effect stood alone, and what their best entries gain or lose together."""
+    """Return the log Bayes factors of pairs: the sum of singles, corrected by the joint score of their best entries."""
     best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
     entries = [(name, int(i)) for name in templates for i in best[name]]
     pairs = list(combinations(sorted(templates), 2))
@@ -48,7 +48,7 @@ def score_pairs(
         return {}
     columns = [templates[name].columns[i] for name, i in entries]
     widths = [c.shape[1] for c in columns]
-    # In the axes of the space that all of them span, with one more for the rest of the residual.
+    # In a basis of their joint span, with one more axis for the rest of the residual.
     axes, turned = np.linalg.qr(project_scaled(problem, columns))
     along = axes.T @ problem.residual
     rest = math.sqrt(max(float(problem.residual @ problem.residual - along @ along), 0.0))

@@ -1,6 +1,6 @@
-"""What could be added to a fit: the vocabulary's effects.
+"""Templates of the effects that could be added to a fit.
 
-A template is a set of columns (n_usable, k), the change of the readings that an amplitude of one makes.
+A template is a set of columns (n_usable, k), the change of the readings per unit amplitude.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from probewise.sensor import Stage
 
 __all__ = ["EffectTemplates", "TemplateMemory", "effect_templates", "subsets"]
 
-_RUNS_AWAY = 1e9  # times the largest prediction: such a model has run away, and says nothing to first order
-_ROUNDING = 1e-9  # of the largest prediction; what changes by less is not changed
-_AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
+_RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
+_ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none
+_AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
 class EffectTemplates:
-    """An effect's bank about a fit, all its variants': for each entry its columns, the setting and the variant."""
+    """An effect's template bank about a fit, for all its variants: columns, setting and variant of each entry."""
 
     columns: tuple[FloatArray, ...]  # each (n_usable, n_columns)
     settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
@@ -36,26 +36,26 @@ class EffectTemplates:
     choice: IntArray  # number of each entry's variant, (n_entries,)
 
     def variant(self, at: int) -> NamedEffect[Any]:
-        """Give the variant of one entry."""
+        """Return the variant of one entry."""
         variant: NamedEffect[Any] = self.variants[self.choice[at]]
         return variant
 
     def weights(self, scores: FloatArray) -> FloatArray:
-        """Posterior probability of each variant, (n_variants,), by the log Bayes factors of the entries."""
+        """Return the posterior probability of each variant, (n_variants,), from the entries' log Bayes factors."""
         shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants))
         return np.asarray(shares / shares.sum())
 
 
 @dataclass(eq=False)
 class TemplateMemory:
-    """The templates of effects about fits, each laid out once."""
+    """Cache of the templates of effects about fits."""
 
     usable: IntArray
     known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
     banks: dict[tuple[Fit, tuple[str, ...]], Bank] = field(default_factory=dict)
 
     def bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> Bank:
-        """Give the coarse templates of several effects about one fit, side by side, labelled by their names."""
+        """Return the bank of coarse templates of several effects about one fit, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
             own = [(effect.name, t) for effect in effects for t in self.of(found, effect.coarse()).columns]
@@ -63,7 +63,7 @@ class TemplateMemory:
         return self.banks[key]
 
     def of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
-        """Give the templates of one effect about one fit."""
+        """Return the templates of one effect about one fit."""
         key = found, effect
         if key not in self.known:
             self.known[key] = effect_templates(found, effect, self.usable)
@@ -73,7 +73,7 @@ class TemplateMemory:
 def effect_templates(
     found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
 ) -> EffectTemplates:
-    """Difference the chain with and without each variant of the effect, of `most` entries spread evenly."""
+    """Subtract predictions without the effect from those with each variant, for `most` evenly spread entries."""
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
     choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
@@ -86,7 +86,7 @@ def effect_templates(
         (everywhere,) = _columns(found, effect, gates.always[None, :, :], usable)
         columns = [everywhere * gates.opened[k][usable, None] for k in choice]
     else:
-        # Variants bound to the same scans and patterns differ in their priors alone: one prediction does for them.
+        # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
         for _, group in itertools.groupby(range(len(choice)), key=lambda at: _bound_to(variants[choice[at]])):
             at = list(group)
@@ -109,7 +109,7 @@ def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: Int
     before[usable] = found.predicted
     inside = np.flatnonzero(in_scans(plan, effect.scans)) if effect.scans else slice(None)
     there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
-    # What acts on what has been seen needs no second look.
+    # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.look(plain.theta_of(sensor, own), there)
     change = np.zeros((n_rows, len(plan)))
     step = max(_AT_ONCE // len(there), 1)

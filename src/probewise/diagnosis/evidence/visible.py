@@ -1,4 +1,4 @@
-"""Whether what a fit holds is large enough to be seen: smaller, it is as good as nothing."""
+"""Probability that the effects of a fit are large enough to be detectable."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ __all__ = ["log_visible"]
 
 
 def log_visible(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
-    """Give the log probability that every effect of a fit is of a size (lambda) that can be seen.
+    """Return the log probability that every effect of a fit has a detectable size (lambda).
 
-    A size is that of the change by the effect, to first order what is left of it when all other parameters
-    have been refitted; its posterior is normal of unit sd about it. Multiplied with the evidence this keeps
-    of a hypothesis the part that is not, to these readings, the one with an effect less.
+    The size is the norm of the effect's change after a (linearised) refit of all other parameters; its posterior is
+    normal with unit sd. Multiplied with the evidence, it removes the part of a hypothesis that is indistinguishable
+    from the hypothesis without the effect.
 
     Parameters
     ----------
     found
         The fit.
     law
-        The law of its noise.
+        Its noise model.
     usable
-        Rows of the plan that were read, (n_usable,).
+        Rows with usable readings, (n_usable,).
     """
     sd = found.sd / np.sqrt(law.information)
     slopes, out = law(found.slopes) / sd, 0.0

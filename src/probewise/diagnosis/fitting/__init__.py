@@ -1,1 +1,1 @@
-"""What is fitted: the null and a user's own model in coordinates of standard normal prior, and the fit itself."""
+"""Models in coordinates with a standard normal prior (the null, a user's own model), and their fit."""

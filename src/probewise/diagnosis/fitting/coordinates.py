@@ -2,7 +2,7 @@
 
 The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their
 widths, the inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, all of
-order one. An effect's coordinates are the normal scores of its own prior.
+order one. An effect's coordinates are the standard-normal transforms of its own prior.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ FARTHEST = 6.0
 
 
 LEAST_READINGS = 24
-"""Fewest usable readings that a verdict on a sensor is given on."""
+"""Fewest usable readings for a verdict on a sensor."""
 
 
 class CalibratedSensor(ABC):
-    """A sensor over known patterns as a `Null`: a normal prior of natural coordinates of SSF and levels.
+    """A sensor over known patterns as a `Null`, with a normal prior of the natural coordinates of SSF and levels.
 
     `center` (n_params,) is the prior's mean, `factor` a square root of its covariance.
     """
@@ -73,21 +73,21 @@ class CalibratedSensor(ABC):
     @property
     @abstractmethod
     def degrees_of_freedom(self) -> int:
-        """How many Gaussians its SSF is as free as."""
+        """Effective degrees of freedom of its SSF, counted in Gaussians."""
 
     @property
     @abstractmethod
     def form(self) -> str:
-        """What its SSF is, in words."""
+        """Description of its SSF."""
 
     @property
     def in_bulk(self) -> bool:
-        """Each sample has its own cost."""
+        """False: every sample costs as much as the first."""
         return False
 
     @property
     def exchangeable(self) -> bool:
-        """Whether its Gaussians can trade names."""
+        """Whether its Gaussians are exchangeable."""
         return False
 
     @abstractmethod
@@ -105,16 +105,16 @@ class CalibratedSensor(ABC):
 
     @property
     def nuisance(self) -> tuple[str, ...]:
-        """Nothing: all its parameters are the sensor's own."""
+        """Empty: all its parameters belong to the sensor."""
         return ()
 
     @property
     def least_readings(self) -> int:
-        """As many as tell its parameters from the noise."""
+        """Fewest readings that determine its parameters."""
         return LEAST_READINGS
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """All of them."""
+        """Return True: every effect can act on a sensor."""
         return True
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -141,7 +141,7 @@ class CalibratedSensor(ABC):
 class SensorCoordinates(CalibratedSensor):
     """A sensor whose SSF is a mixture: 6 n_gaussians + 1 coordinates, one less than the paper's parameters.
 
-    Amplitudes have a common factor. `exchangeable` Gaussians can trade names, which the evidence counts.
+    Only ratios of amplitudes matter. The evidence counts the permutations of `exchangeable` Gaussians.
     """
 
     n_gaussians: int
@@ -156,12 +156,12 @@ class SensorCoordinates(CalibratedSensor):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """As many Gaussians as it has."""
+        """Its number of Gaussians."""
         return self.n_gaussians
 
     @property
     def form(self) -> str:
-        """So many Gaussians."""
+        """Its number of Gaussians, in words."""
         return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 
     def from_natural(self, natural: FloatArray) -> FloatArray:
@@ -173,7 +173,7 @@ class SensorCoordinates(CalibratedSensor):
         return theta_to_natural(theta, self.n_gaussians)
 
     def renamed(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
-        """Give coordinates, (n_samples, n_params), of the same SSF with its Gaussians named in another order."""
+        """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians permuted."""
         n, natural = self.n_gaussians, self._natural(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
@@ -183,7 +183,7 @@ class SensorCoordinates(CalibratedSensor):
 
 @lru_cache(maxsize=32)
 def known_scene(plan: Plan) -> KnownScene:
-    """Build a plan's scene once for all models that look at it."""
+    """Build a plan's scene, cached for all models."""
     return KnownScene(plan.patterns)
 
 
@@ -219,7 +219,7 @@ def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def default_sensor(extent: Extent, n_gaussians: int) -> SensorCoordinates:
-    """Believe in a footprint of about a fourteenth of the longest scan, give or take a factor of two."""
+    """Return the default prior: a footprint of about a fourteenth of the longest scan, within a factor of two."""
     length = extent.length_mm
     one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
     one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
@@ -229,7 +229,7 @@ def default_sensor(extent: Extent, n_gaussians: int) -> SensorCoordinates:
 
 
 def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
-    """Map normal scores, (n_samples, n_params), to the effect's own parameters."""
+    """Map standard-normal coordinates, (n_samples, n_params), to the effect's own parameters."""
     return effect.prior.from_unit_cube(ndtr(z))
 
 

@@ -1,4 +1,4 @@
-"""An earlier posterior of the sensor, taken as the prior."""
+"""An earlier posterior of the sensor, used as the prior."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["SensorPrior", "require_same_unit", "require_sensor_prior", "sensor_f
 
 
 def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
-    """Take an earlier sensor's posterior, by its mean and covariance, as the prior.
+    """Build a prior from an earlier sensor's posterior mean and covariance.
 
-    Only the SSF's and the levels' columns are used; effects of the earlier model are not carried over.
+    Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class SensorPrior(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameter names, one a column."""
+        """Parameter names, one per column."""
         ...
 
     @property
@@ -75,7 +75,7 @@ def require_sensor_prior(sensor: object) -> None:
 
 
 def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
-    """Raise ParameterError where readings are in another unit than the sensor was calibrated in; "" is not known."""
+    """Raise ParameterError if the readings' unit differs from that of the calibration; "" is an unknown unit."""
     unit, own = plan.instrumentation.unit, ""
     if isinstance(sensor, FittedSensor):
         own = sensor.instrumentation.unit
@@ -84,9 +84,9 @@ def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
 
 
 def sensor_of(sensor: SensorPrior) -> CalibratedSensor:
-    """Take an earlier sensor's posterior samples as the prior; see `sensor_from_posterior`.
+    """Build a prior from an earlier sensor's posterior samples; see `sensor_from_posterior`.
 
-    Of what a diagnosis has left open in it, the most probable: a normal prior holds one hypothesis.
+    If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
     """
     if isinstance(sensor, FittedSensor):
         sensor = sensor.leading()

@@ -1,4 +1,4 @@
-"""Fit a model to a recording: bounded Levenberg-Marquardt with every perturbation in one prediction."""
+"""Fit a model to a recording: bounded Levenberg-Marquardt with all perturbations in one vectorised prediction."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ __all__ = [
 ]
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
-_AT_ONCE = 300_000  # predictions: more of them do not stay in a processor's cache
+_AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
 def _points_about(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lay out a point z (n_params,) and one a step along each coordinate: (n_params + 1, n_params), (n_params,)."""
-    # Steps point inwards, so that no parameter leaves the bounds.
+    """Return z (n_params,) and points one step along each coordinate, (n_params + 1, n_params), and the steps."""
+    # Steps point inwards, to stay within the bounds.
     steps = np.where(z > 0, -_STEP, _STEP)
     return np.concatenate([z[None, :], z + np.diag(steps)]), steps
 
 
 def _differentiated(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Turn predictions at such points (n_params + 1, n_points) to those at z and slopes (n_points, n_params)."""
+    """Convert predictions at these points (n_params + 1, n_points) to the one at z and slopes (n_points, n_params)."""
     return batch[0], (batch[1:] - batch[0]).T / steps
 
 
@@ -49,7 +49,7 @@ def _differentiated(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, F
 class Model:
     """A chain with its effects, in coordinates of standard normal prior.
 
-    Effects on the noise play no part here; they are in its law.
+    Noise effects are not part of it; they are in the noise model.
     """
 
     sensor: Null
@@ -100,11 +100,11 @@ class Model:
         return _differentiated(self.predict(points, plan), steps)
 
     def with_effect(self, effect: NamedEffect[Any]) -> Model:
-        """Add an effect behind the others."""
+        """Append an effect."""
         return Model(self.sensor, (*self.effects, effect), self.plan)
 
     def without(self, name: str) -> tuple[Model, BoolArray]:
-        """Leave an effect out; also which coordinates stay, (n_params,)."""
+        """Return the model without an effect, and the mask of the remaining coordinates, (n_params,)."""
         stay = np.ones(self.n_params, dtype=np.bool_)
         stay[self.columns_of(name)] = False
         return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
@@ -118,8 +118,8 @@ class Model:
 class Fit:
     """The best point of a model: coordinates `z`, and at it the usable rows' predictions and slopes.
 
-    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` is the most likely sigma of its law;
-    `settled` says that no step gained more than the tolerance any longer.
+    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` is the most likely sigma of its noise
+    model; `settled`: the last step gained less than the tolerance.
     """
 
     model: Model
@@ -132,7 +132,7 @@ class Fit:
     settled: bool = False
 
     def change_by(self, name: str, usable: IntArray) -> FloatArray:
-        """Tell what one of its effects does to the usable readings, all else as it is, (n_usable,)."""
+        """Return the change of the usable readings by one of its effects, other parameters fixed, (n_usable,)."""
         without, stay = self.model.without(name)
         return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
 
@@ -146,23 +146,23 @@ def fit(
     max_steps: int = 30,
     tolerance: float = 5e-3,
 ) -> Fit:
-    """Find the most probable point, the noise sd integrated out.
+    """Find the maximum of the posterior with the noise sd integrated out.
 
-    Maximises the log likelihood under the law of the noise, less |z|^2 / 2, over the box |z| <= 6.
+    Maximises the log likelihood under the noise model minus |z|^2 / 2, over the box |z| <= 6.
     Each step differentiates in one vectorised prediction and tries five dampings in another.
 
     Parameters
     ----------
     model, recording
-        What predicts and what was read.
+        Model and data.
     start
         Coordinates to start from, shape (n_params,).
     law
-        The law of the noise.
+        The noise model.
     max_steps
-        Bound of the number of steps.
+        Largest number of steps.
     tolerance
-        Stop when a step gains less, in nats.
+        Gain of a step, in nats, below which to stop.
     """
     (found,) = fits(model, recording, [start], law, max_steps=max_steps, tolerance=tolerance)
     return found
@@ -179,7 +179,7 @@ def fits(
 ) -> list[Fit]:
     """Fit as `fit` does from each of several starts.
 
-    Where many predictions cost as much as one they go on side by side, as many as stay in a processor's cache.
+    If predictions broadcast, the fits run in parallel, in batches that fit a processor's cache.
     """
     walks = [_walk(model, recording, start, law, max_steps, tolerance) for start in starts]
     at_once = 1
@@ -203,7 +203,7 @@ def fits(
 def _walk(
     model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
 ) -> Generator[FloatArray, FloatArray, Fit]:
-    """Go down from one start: gives the points that it wants predicted, (n, n_params), and gets (n, n_points)."""
+    """Minimise from one start: yields points to predict, (n, n_params), and is sent predictions, (n, n_points)."""
     usable = recording.usable
     readings = recording.readings[usable]
 
@@ -220,7 +220,7 @@ def _walk(
     eye = np.eye(len(z))
     predicted, slopes = yield from jacobian(z)
     best = float(objective(predicted[None, :], z[None, :])[0])
-    if not (np.isfinite(best) and np.isfinite(slopes).all()):  # nothing to go down from
+    if not (np.isfinite(best) and np.isfinite(slopes).all()):  # no finite starting point
         return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
     settled = False
     for _ in range(max_steps):
@@ -233,7 +233,7 @@ def _walk(
         if not len(tries):
             break
         tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
-        # Where many predictions cost as much as one, slopes are had along with them.
+        # If predictions broadcast, slopes are computed along with them.
         about = [_points_about(at) for at in tries] if model.sensor.in_bulk else []
         batch = yield np.concatenate([points for points, _ in about]) if about else tries
         all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
@@ -256,10 +256,10 @@ def _walk(
 
 
 def _steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Solve for the step at each damping, (n_solved, n_params).
+    """Return the step for each damping, (n_solved, n_params).
 
-    Where readings are met exactly the prior is lost beside them in the last digits, and what is only just damped may
-    be singular: it is left out.
+    If readings are fitted exactly, the prior is lost in rounding and weakly damped systems may be singular; these are
+    left out.
     """
     scale, solved = np.diag(curvature), []
     for damping in _DAMPINGS:
@@ -269,12 +269,12 @@ def _steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
 
 
 def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
-    """Count the readings that no parameter takes: n less the number of parameters that they, not the priors, settle.
+    """Return the residual degrees of freedom: n minus the number of parameters that readings, not priors, determine.
 
     Parameters
     ----------
     slopes
-        Of the whitened readings by the coordinates, (n_points, n_params).
+        Slopes of the whitened readings by the coordinates, (n_points, n_params).
     sd
         Noise of a whitened reading.
     """
@@ -283,7 +283,7 @@ def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
 
 
 def starts_of_one_gaussian(sensor: SensorCoordinates) -> FloatArray:
-    """Lay out starting points for one Gaussian: typical, narrow and wide, shape (3, n_params)."""
+    """Return starting points for one Gaussian: typical, narrow and wide, shape (3, n_params)."""
     return np.stack([_set_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
 
 
@@ -294,7 +294,7 @@ def _set_widths(z: FloatArray, step: float) -> FloatArray:
 
 
 def start_with_more_gaussians(found: Null, z: FloatArray, wanted: SensorCoordinates) -> FloatArray:
-    """Split the heaviest Gaussian of a fit in several ways, shape (n_starts, wanted.n_params)."""
+    """Return starting points with the heaviest Gaussian split in several ways, shape (n_starts, wanted.n_params)."""
     theta = found.theta(z[None, : found.n_params])[0]
     n = found.n_gaussians
     blocks = theta[: 6 * n].reshape(n, 6)
@@ -302,7 +302,7 @@ def start_with_more_gaussians(found: Null, z: FloatArray, wanted: SensorCoordina
     at = int(np.argmax(mass))
     sd_u, sd_v = 1 / np.sqrt(2 * blocks[at, 3:5])
     splits: Sequence[tuple[float, float, float, float]] = (
-        (0.0, 0.0, 0.65, 1.6),  # a core and a skirt
+        (0.0, 0.0, 0.65, 1.6),  # a core and a halo
         (0.8, 0.0, 0.9, 0.9),  # side by side along x'
         (0.0, 0.8, 0.9, 0.9),
     )

@@ -1,8 +1,8 @@
-"""A sensor whose SSF has any form, as a null.
+"""A null model whose sensor has a free-form SSF.
 
-What a mixture of a few Gaussians leaves of a real SSF looks like physics, and the evidence pays for another Gaussian
-only where it gains ten nats and more. A free form (`probewise.sensor.bent`) takes it up: small shares at many
-places, each with a normal prior, so that the evidence charges for what is used.
+The misfit of a few Gaussians to a real SSF looks like physics, and the evidence favours another Gaussian only if it
+gains ten nats or more. A free form (`probewise.sensor.bent`) absorbs this misfit: small weights at many places, each
+with a normal prior, so that the evidence penalises only those used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from probewise.sensor import N_BENDS, N_FREE_FORM, bends_of, free_form
 
 __all__ = ["FreeForm", "free_form_to_natural"]
 
-_SHARE = 0.1  # prior sd of each bend, of the mass
+_SHARE = 0.1  # prior sd of each weight, as a share of the mass
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +39,13 @@ class FreeForm(CalibratedSensor):
 
     @classmethod
     def about(cls, one: SensorCoordinates) -> Self:
-        """Believe in the place and size of one Gaussian, and in small bends."""
+        """Build the prior from place and size of one Gaussian, with small weights of the free form."""
         factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
         factor[: one.n_params, : one.n_params] = one.factor
         return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
 
     def start_from(self, one: FloatArray) -> FloatArray:
-        """Start unbent from coordinates of the one Gaussian, (7,): (1, n_params)."""
+        """Return a start with zero weights from the coordinates of one Gaussian, (7,): (1, n_params)."""
         return np.pad(one, (0, N_BENDS))[None, :]
 
     @property
@@ -55,12 +55,12 @@ class FreeForm(CalibratedSensor):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """As two: from one Gaussian to any form is one step."""
+        """2: the step from one Gaussian to the free form counts as one."""
         return 2
 
     @property
     def form(self) -> str:
-        """Free."""
+        """The words for a free form."""
         return "an SSF of free form"
 
     def from_natural(self, natural: FloatArray) -> FloatArray:
@@ -74,7 +74,7 @@ class FreeForm(CalibratedSensor):
 
 
 def free_form_to_natural(theta: FloatArray) -> FloatArray:
-    """Invert what `FreeForm.theta` makes of natural coordinates, (n_samples, 6 N + 2) -> (n_samples, 7 + N_BENDS)."""
-    # The amplitude of the first plays no part in its natural coordinates.
+    """Invert the map of `FreeForm.theta` to natural coordinates, (n_samples, 6 N + 2) -> (n_samples, 7 + N_BENDS)."""
+    # The amplitude of the first does not enter its natural coordinates.
     one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
     return np.concatenate([theta_to_natural(one, 1), bends_of(theta[:, :-2])], axis=1)

@@ -1,4 +1,4 @@
-"""What is believed to be the whole truth until shown otherwise, and how the diagnosis talks to it."""
+"""The interface of null models, and of their predictions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Predictor(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters, one a column of theta."""
+        """Names of the free parameters, one per column of theta."""
         ...
 
     @property
@@ -35,19 +35,19 @@ class Predictor(Protocol):
         ...
 
     def look(self, theta: FloatArray, plan: Plan) -> Any:
-        """Go the way up to the stage SEEN; of one hypothesis or of all."""
+        """Compute the stages up to SEEN, for one hypothesis or for all."""
         ...
 
     def read(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Go on from what `look` gave, with the effects from SEEN on: (n_samples, n_points)."""
+        """Compute the stages from SEEN on, from the result of `look`: (n_samples, n_points)."""
         ...
 
 
 class Null(Protocol):
     """A model to be diagnosed, in coordinates in which its prior is a standard normal.
 
-    The sensor of the paper (`SensorCoordinates`), one whose SSF has any form (`FreeForm`), a sensor
-    over a shape that is not known (`SensorAndShape`), or any simulator (`OwnModel`).
+    The sensor of the paper (`SensorCoordinates`), one with a free-form SSF (`FreeForm`), a sensor over an unknown shape
+    (`SensorAndShape`), or any simulator (`OwnModel`).
     """
 
     @property
@@ -57,7 +57,7 @@ class Null(Protocol):
 
     @property
     def n_gaussians(self) -> int:
-        """Number of Gaussians of its SSF; by default 0, there is none."""
+        """Number of Gaussians of its SSF; by default 0, for no SSF."""
         return 0
 
     @property
@@ -67,17 +67,17 @@ class Null(Protocol):
 
     @property
     def form(self) -> str:
-        """What its SSF is, in words; by default nothing."""
+        """Description of its SSF; by default empty."""
         return ""
 
     @property
     def exchangeable(self) -> bool:
-        """Whether the Gaussians of its SSF can trade names; by default there are none."""
+        """Whether the Gaussians of its SSF are exchangeable; by default False."""
         return False
 
     @property
     def in_bulk(self) -> bool:
-        """Whether predictions of many samples cost little more than one; by default they do not."""
+        """Whether predictions of many samples cost little more than one; by default False."""
         return False
 
     @property
@@ -87,19 +87,19 @@ class Null(Protocol):
 
     @property
     def nuisance(self) -> tuple[str, ...]:
-        """Names of parameters that belong to this recording alone, such as a shape's; by default none.
+        """Names of parameters that apply to this recording only, such as those of a shape; by default none.
 
-        No sensor model keeps them.
+        They are not part of a written sensor model.
         """
         return ()
 
     @property
     def least_readings(self) -> int:
-        """Fewest usable readings that a verdict is given on."""
+        """Fewest usable readings for a verdict."""
         ...
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Tell whether an effect acts at a stage that this model has."""
+        """Return whether an effect acts at a stage of this model."""
         ...
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -107,10 +107,10 @@ class Null(Protocol):
         ...
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Predictor:
-        """Build the model of a plan's readings, with effects; `n_nodes` over curved edges, as `sensor.Chain` has it."""
+        """Build the model of a plan's readings, with effects; `n_nodes` for curved edges, as in `sensor.Chain`."""
         ...
 
 
 def log_multiplicity(null: Null) -> float:
-    """Log of the number of peaks of the posterior that are one and the same sensor, taken to be of the same height."""
+    """Return the log of the number of equivalent posterior modes (permutations), taken to have equal height."""
     return math.lgamma(null.n_gaussians + 1) if null.exchangeable else 0.0

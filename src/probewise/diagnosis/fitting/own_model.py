@@ -34,11 +34,11 @@ _ON_READINGS = (Stage.OFFSET, Stage.LAG, Stage.SATURATION, Stage.NOISE)
 
 @dataclass(frozen=True)
 class OwnModel(Null):
-    """A simulator and what is believed of its parameters: a null model like any other.
+    """A null model from a simulator and the prior of its parameters.
 
-    Effects from the stage OFFSET on act on its readings, so half of the vocabulary applies as it is. An effect
-    of the user's own acts at `Stage.SCENE` on the parameters: it adds or changes some, and the simulator reads
-    them (with a default where they are missing, which is the model without the effect).
+    Effects from the stage OFFSET on act on its readings, so half of the vocabulary applies. A user's own effect acts at
+    `Stage.SCENE` on the parameters: it adds or changes some, which the simulator reads (with a default for missing
+    ones, which is the model without the effect).
 
     Parameters
     ----------
@@ -63,28 +63,28 @@ class OwnModel(Null):
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Start from the middle of the prior and from points spread evenly over it, (8, n_params)."""
-        from scipy.stats import qmc  # here, since it takes a second to import that a sensor's diagnosis does without
+        """Return starting points: the centre of the prior and quasi-random points, (8, n_params)."""
+        from scipy.stats import qmc  # imported here, since it takes a second that a sensor's diagnosis does not need
 
         spread = qmc.Halton(self.n_params, scramble=False).random(_N_STARTS)[1:]
         return np.concatenate([np.zeros((1, self.n_params)), np.asarray(ndtri(spread), dtype=np.float64)])
 
     @property
     def least_readings(self) -> int:
-        """Three for each parameter."""
+        """Three readings per parameter."""
         return max(LEAST_READINGS, 3 * self.n_params)
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Only what acts on the readings, and effects of the user's own: there is no footprint, no light."""
+        """Return whether an effect acts on the readings or is the user's own: there is no footprint or light."""
         own = effect.stage is Stage.SCENE and effect.name not in VOCABULARY
         return own or effect.stage in _ON_READINGS
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map normal scores, (n_samples, n_params), to parameters."""
+        """Map standard-normal coordinates, (n_samples, n_params), to parameters."""
         return self.prior.from_unit_cube(ndtr(z))
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnChain:
-        """Add effects; `n_nodes` plays no part.
+        """Add effects; `n_nodes` is not used.
 
         Raises
         ------

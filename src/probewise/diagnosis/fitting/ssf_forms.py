@@ -1,4 +1,4 @@
-"""The forms of an SSF that is calibrated from the recording itself: one Gaussian, any form, more Gaussians."""
+"""Forms of an SSF calibrated from the recording itself: one Gaussian, free form, more Gaussians."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Start = tuple[Null, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class SsfForms:
-    """Sensors whose priors fit a recording of this extent, each with coordinates to fit it from."""
+    """Sensors with priors scaled to a recording, each with starting coordinates."""
 
     extent: Extent
 
@@ -29,13 +29,13 @@ class SsfForms:
         return one, starts_of_one_gaussian(one)
 
     def free(self, found: Fit) -> Start:
-        """Any form, unbent from the fit of one Gaussian."""
+        """Return the free form, starting from the fit of one Gaussian."""
         one = found.model.sensor
         assert isinstance(one, SensorCoordinates)
         free = FreeForm.about(one)
         return free, free.start_from(found.z)
 
     def one_more(self, found: Fit, order: int) -> Start:
-        """So many Gaussians, the heaviest of the fit split in several ways."""
+        """Return `order` Gaussians, starting from splits of the heaviest of the fit."""
         wanted = default_sensor(self.extent, order)
         return wanted, start_with_more_gaussians(found.model.sensor, found.z, wanted)

@@ -1,1 +1,1 @@
-"""What is believed: the test that nothing is missing, and the verdict."""
+"""The global test of the null, and the verdict."""

@@ -1,4 +1,4 @@
-"""Is anything missing from the mean? The null that is most believed, and its test, every look counted."""
+"""Global test of the most probable null's mean, corrected for all looks (multiple comparisons)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 __all__ = ["N_DRAWS", "GlobalTest", "run_global_test"]
 
 N_DRAWS = 999
-"""Residuals drawn under the null."""
+"""Number of residual draws under the null."""
 
-_NO_ALARM = 0.05  # by any rule, so that no other form of the SSF need be asked
+_NO_ALARM = 0.05  # p-value above which no alarm is possible, so that other forms of the SSF need no test
 
 
 @dataclass(frozen=True, eq=False)
 class GlobalTest:
-    """The null under the most probable noise model, as a linear problem, residuals drawn under it, and its p-value."""
+    """The null under its most probable noise model, linearised, with residual draws and the p-value."""
 
     null: WeighedFit
     noise: Names
@@ -34,12 +34,12 @@ class GlobalTest:
 
 
 def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTest:
-    """Test that nothing is missing from the mean.
+    """Test whether the mean of the null is complete.
 
     Raises
     ------
     NotConvergedError
-        If the fit of the null has not arrived anywhere, where there are readings enough to say so.
+        If the fit of the null did not converge, with enough readings to tell.
     """
     prepared, null, noise = searched.prepared, searched.null, searched.posterior.noise()
     problem = Linearised.of(null.found, null.evidence[noise].law)
@@ -48,23 +48,22 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
     draws = problem.draws(N_DRAWS, rng=rng)
     p_value = global_p_value(problem, searched.looks(null.found), draws)
     p_value = _at_every_order(searched, null, noise, p_value, rng=rng)
-    # Readings that never change carry no noise to measure a residual by.
+    # Constant readings have no noise to compare a residual with.
     return GlobalTest(null, noise, problem, draws, 1.0 if prepared.constant else p_value)
 
 
 def _at_every_order(
     searched: Searched, null: WeighedFit, noise: Names, p_value: float, *, rng: np.random.Generator
 ) -> float:
-    """Ask whether an alarm stands, be the SSF of the null's order, of a greater one, or finer still.
+    """Return the largest p-value over SSFs of the null's order, of higher orders, and with fine structure.
 
-    The evidence grants a Gaussian only where it gains the ten nats and more that it costs; what an SSF that is no
-    mixture leaves below that is no physics. So an alarm must stand at every order, and beside fine structure about
-    the freest, and the greatest p-value counts.
+    The evidence accepts another Gaussian only if it gains ten nats or more; a smaller misfit of an SSF that is no
+    mixture is not physics. So an alarm must hold at every order, and with fine structure about the freest form.
     """
     prepared, fits = searched.prepared, searched.evidences.fits
     rivals = [fits[n, ()] for n in sorted(n for n, names in fits if not names and n > null.n_gaussians)]
     asked = [(rival, False) for rival in rivals]
-    if prepared.null is None:  # what is known is not forgotten: that it was turned shows by that alone
+    if prepared.null is None:  # a known prior is kept at every order: an orientation error shows only relative to it
         asked.append(((rivals or [null])[-1], True))
     for rival, fine in asked:
         if p_value > _NO_ALARM:

@@ -1,4 +1,4 @@
-"""The verdict: from probabilities, the test, and what these readings cannot tell apart."""
+"""The verdict, from probabilities, the global test, and aliases."""
 
 from __future__ import annotations
 
@@ -18,46 +18,46 @@ __all__ = ["Hypothesis", "Judged", "Verdict", "credible_set", "decide", "hypothe
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
-_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: more than priors make of likelihoods that are the same
+_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: rivals below it are not credible; priors differ by less
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A set of effects and its probability; () is clean, ("unknown",) what has no name."""
+    """A set of effects and its probability; () is clean, ("unknown",) an effect out of vocabulary."""
 
     effects: Names
     probability: float
 
     @property
     def label(self) -> str:
-        """Its name in a credible set."""
+        """Label in a credible set."""
         return "+".join(sorted(map(public_name, self.effects))) or "clean"
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What is believed of a recording.
+    """The verdict on a recording, with probabilities.
 
     Parameters
     ----------
     verdict
         The verdict.
     combination
-        Most probable set of effects, sorted; () when clean, ("unknown",) when unknown.
+        Most probable set of effects, sorted; () if clean, ("unknown",) if unknown.
     p_value
-        That nothing is missing from the mean, under the noise model found.
+        p-value of the global test of the mean, under the noise model found.
     hypotheses
-        All, most probable first; they sum to one.
+        All hypotheses, most probable first; probabilities sum to one.
     aliases
-        Effects that these readings cannot tell apart, in pairs.
+        Pairs of aliased effects.
     order_probabilities
         Probability of each number of Gaussians of a clean sensor's SSF.
     unknown_shares
-        If something has no name, the probability that it depends on each covariate.
+        Probability of each family given that there is an unknown effect.
     too_little
-        Whether there are too few readings to say anything, or all are equal.
+        Whether there are too few readings for a verdict, or all are equal.
     withdrawn
-        Whether what leads is not named, since it predicts held-out readings far worse than the null does.
+        Whether the leading hypothesis is not stated because it predicts held-out readings far worse than the null.
     """
 
     verdict: Verdict
@@ -71,27 +71,27 @@ class Judged:
     withdrawn: bool = False
 
     def withdraw(self) -> Judged:
-        """Take back what was named."""
+        """Return the verdict with its named effects withdrawn."""
         return replace(self, verdict="cannot_tell", combination=(), withdrawn=True)
 
     @property
     def unknown_probability(self) -> float:
-        """Of something that has no name."""
+        """Probability of an unknown effect."""
         return next((h.probability for h in self.hypotheses if h.effects == ("unknown",)), 0.0)
 
     @property
     def clean_probability(self) -> float:
-        """That nothing is missing."""
+        """Probability that the model is complete."""
         return next((h.probability for h in self.hypotheses if not h.effects), 0.0)
 
     @property
     def credible(self) -> tuple[str, ...]:
-        """Labels of the fewest hypotheses that hold 0.95."""
+        """Labels of the 95 % credible set."""
         return credible_set(self.hypotheses)
 
     @property
     def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
-        """What is out of vocabulary, by the covariate in which it shows, with its share of the unknown."""
+        """Families of the unknown effect with their probabilities."""
         if self.unknown_probability < 1e-3:
             return ()
         shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
@@ -99,13 +99,13 @@ class Judged:
 
 
 def judge(searched: Searched, test: GlobalTest) -> Judged:
-    """Reach a verdict on what was searched and tested."""
+    """Return the verdict on a search and its test."""
     prepared, posterior = searched.prepared, searched.posterior
     hypotheses = hypotheses_of(posterior.probabilities, searched.evidences.known_as)
     pairs = tuple(aliased_pairs(searched, test.problem, test.null.found))
 
     def aliased_with(combination: Names) -> frozenset[Names]:
-        """Give the combinations whose effects on the mean the readings cannot tell from these, the noise the same."""
+        """Return the combinations with the same noise whose effects on the mean are aliased with these."""
         noise = prepared.on_noise & {*combination}
         others = searched.aliased_with(tuple(name for name in combination if name not in noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
@@ -141,9 +141,9 @@ def _without_formulas(mean: Names) -> Names:
 def hypotheses_of(
     probabilities: Mapping[tuple[Names, Names], float], known_as: Callable[[Names], Names] = _without_formulas
 ) -> tuple[Hypothesis, ...]:
-    """Join mean and noise into combinations; unknown is one hypothesis under any noise.
+    """Join effects on mean and noise into hypotheses; unknown is one hypothesis under any noise.
 
-    `known_as` gives the name under which a combination on the mean counts.
+    `known_as` maps a combination on the mean to the name under which it counts.
     """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
@@ -163,13 +163,13 @@ def verdict_on(
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
 ) -> tuple[Verdict, Names]:
-    """Decide by probabilities; name physics only where the test that counts every look has raised an alarm too."""
+    """Decide by probabilities; name physics only if the global test has raised an alarm too."""
     verdict, combination = decide(hypotheses, noise_names, aliases, aliased_with)
     return ("cannot_tell", ()) if verdict == "named" and p_value > ALARM else (verdict, combination)
 
 
 def credible_set(hypotheses: tuple[Hypothesis, ...], mass: float = 0.95) -> tuple[str, ...]:
-    """Name the fewest hypotheses that hold `mass`."""
+    """Return the labels of the smallest set of hypotheses with probability `mass`."""
     out, held = [], 0.0
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
         out.append(hypothesis.label)
@@ -185,12 +185,12 @@ def decide(
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
 ) -> tuple[Verdict, Names]:
-    """Turn probabilities into a verdict and the combination it names.
+    """Return the verdict from probabilities, and the combination it names.
 
-    A class of aliases is the combinations that differ only by swapping aliased effects; where it holds
-    half the probability and none of its members does, the answer is `cannot_tell`. The same where
-    clean leads without holding half, and where the readings cannot tell the leader from another that is
-    not out of the question (`aliased_with`): what tells those apart is what was believed before, not what was read.
+    A class of aliases is the set of combinations that differ only by swapping aliased effects; if it has half the
+    probability and none of its members has, the verdict is `cannot_tell`. The same holds if clean leads with less than
+    half, or if the leader is aliased with a credible rival (`aliased_with`): then the prior, not the data, would
+    decide.
     """
     probability = {h.effects: h.probability for h in hypotheses}
     if probability.get(("unknown",), 0.0) >= 0.5:

@@ -1,6 +1,6 @@
-"""What the arm could be told to do next: repeat, reverse, respeed, rotate, relight, raise, or look at something else.
+"""Possible next scans: repeat, reverse, respeed, rotate, relight, raise, or another target.
 
-The first three need nothing but the arm, the next three what the recording's `controls` list, the last a hand.
+The first three need only the arm, the next three the recording's `controls`, the last a person.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ __all__ = ["Excerpt", "commands", "distinct_scans", "excerpts", "reading_s", "re
 
 _LEAST_ROWS = 8
 _MOST_SCANS = 6
-_NEAR = 26  # readings around an edge
+_NEAR = 26  # readings of an excerpt around an edge
 _TURN_DEG = 45.0
-_RAISE = 1.25  # of the height that the recording names
+_RAISE = 1.25  # factor on the recording's height
 _WORDS = {1: "", 2: " (every second reading, twice as fast)"}
 
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """Some rows of a scan, every so many: a suffix for its name, words to go behind its own."""
+    """Rows of a scan with a stride, with a suffix for its name and words for its description."""
 
     suffix: str
     words: str
@@ -38,16 +38,16 @@ class Excerpt:
 
 
 def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Excerpt]:
-    """Take parts of a scan that are worth a scan of their own.
+    """Return the parts of a scan that could be scans of their own.
 
     Parameters
     ----------
     scan
         Its row numbers.
     strides
-        Every reading, every fourth, ...: one excerpt for each that leaves eight; every reading where none does.
+        Strides to try; each gives an excerpt if it leaves eight readings; otherwise stride 1.
     level
-        What is expected of its readings, in the order of `scan`: one excerpt more, where that changes most.
+        Expected readings, in the order of `scan`: adds an excerpt where they change most.
     """
     out = []
     for stride in [s for s in strides if len(scan[::s]) >= _LEAST_ROWS] or [1]:
@@ -65,16 +65,16 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
 
 
 def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
-    """List what could be done with the scans of a plan, each pose of a scan once.
+    """List the scans that could follow a plan, each pose of a scan once.
 
     Parameters
     ----------
     plan
-        What was measured, or is to be.
+        The plan measured, or to be measured.
     strides
-        Take every reading of a scan, every fourth, ...: a list for each.
+        Strides to try for each scan.
     level
-        What is expected of every row, (n_points,): then also the part of each scan where that changes most.
+        Expected readings, (n_points,): adds the part of each scan where they change most.
     """
     controls = plan.instrumentation.controls
     height_mm = plan.instrumentation.height_mm
@@ -115,7 +115,7 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
 
 
 def rows_that_need_no_hand(plan: Plan) -> IntArray:
-    """Find the rows that can be taken again with the sheet as it lies, and the sensor as it is mounted."""
+    """Return the rows that can be repeated with the sheet in place and the sensor as mounted."""
     last = int(np.argmax(plan.time_s))
     same_sheet = plan.pattern == plan.pattern[last]
     turned_rad = np.abs(np.angle(np.exp(1j * (plan.orientation_rad - plan.orientation_rad[last]))))
@@ -124,7 +124,7 @@ def rows_that_need_no_hand(plan: Plan) -> IntArray:
 
 
 def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
-    """Take rows of a plan as one new scan, in their order, from `start_s` on, commanded as they were."""
+    """Return rows of a plan as one new scan, in order, from `start_s` on, with their commanded values."""
     taken = plan.take(rows)
     controls = plan.instrumentation.controls
     return replace(
@@ -137,7 +137,7 @@ def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: 
 
 
 def _faster(part: Excerpt) -> str:
-    """Say how fast every second reading of an excerpt is taken; a reading takes as long as it did."""
+    """Describe the speed of a scan of every second reading of an excerpt, with unchanged time per reading."""
     if part.stride == 1:
         return f"at double speed{part.words}"
     return f"at {2 * part.stride} times the speed (every {2 * part.stride}th reading)"
@@ -152,7 +152,7 @@ def _commanded(plan: Plan, name: str, value: float) -> Plan:
 
 
 def distinct_scans(plan: Plan) -> list[IntArray]:
-    """Row numbers of the first scans of all that move and differ in pattern, orientation or ends."""
+    """Return the row numbers of the first moving scans that differ in pattern, orientation or ends."""
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in plan.rows_by_scan():
         if rows.size < _LEAST_ROWS or not plan.direction[rows].any():
@@ -164,7 +164,7 @@ def distinct_scans(plan: Plan) -> list[IntArray]:
 
 
 def reading_s(plan: Plan) -> float:
-    """Seconds from one reading to the next, the median within scans; 1 s where nothing tells."""
+    """Return the median time between readings within scans, in seconds; 1 s if unknown."""
     gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
     gaps = gaps[gaps > 0]
     return float(np.median(gaps)) if gaps.size else 1.0

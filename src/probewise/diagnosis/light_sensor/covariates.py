@@ -1,4 +1,4 @@
-"""What a residual may depend on: place, time, level, direction, and whatever else the recording holds."""
+"""Covariates of a residual: place, time, level, direction, and the recording's own columns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from probewise.scene import edge_distance, region_of
 __all__ = ["covariate_of", "covariates_of", "slope_along_the_move"]
 
 
-_MOST_SCANS = 24  # beyond which no place is looked for in each scan by itself
+_MOST_SCANS = 24  # number of scans above which residuals are not located in single scans
 
 
 def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
@@ -27,7 +27,7 @@ def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> F
         replace(plan, x_mm=plan.x_mm + s * plan.direction[:, 0], y_mm=plan.y_mm + s * plan.direction[:, 1])
         for s in (step, -step)
     )
-    # The moved plans move the whole row, so the directions, and with them backlash, stay as they are.
+    # All rows are shifted together, so that directions, and hence backlash, do not change.
     return np.asarray((predict(ahead) - predict(behind)) / (2 * step))
 
 
@@ -41,7 +41,7 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
     usable
         Row numbers of the usable readings, shape (n_usable,).
     level, slope
-        Predicted reading and its slope along the move, both (n_usable,).
+        Predicted reading and its slope along the motion, both (n_usable,).
     """
     everything = np.arange(len(usable))
     sign = sign_of_motion(plan)[usable]
@@ -86,24 +86,24 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
 def covariate_of(
     effect: NamedEffect[Any], change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
 ) -> Covariate | None:
-    """Choose the first of an effect's covariates that varies here; None where none does, or nothing changes.
+    """Return the first of an effect's covariates that varies here; None if none varies, or nothing changes.
 
     Parameters
     ----------
     effect
         The effect.
     change
-        What it makes of the readings, (n_points,).
+        Its change of the readings, (n_points,).
     without
-        What would be read without it, (n_points,), which is what a level is.
+        Predicted readings without it, (n_points,), the values of the covariate `level`.
     plan
-        Of the readings: a place is along the scans in which the change is greatest.
+        Plan of the readings; a place is along the scans with the largest change.
     known
         Covariates of the recording.
     """
     pooled = {c.name: c for c in known if c.scan is None}
     sign = sign_of_motion(plan)
-    if "direction" not in pooled and np.ptp(sign) > 0:  # to stand still is no direction, but tells what a move does
+    if "direction" not in pooled and np.ptp(sign) > 0:  # a reading at rest has no direction, but serves for comparison
         pooled["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
     name = next((name for name in effect.covariates if name in pooled), None)
     if name is None or not np.any(change):
@@ -114,7 +114,7 @@ def covariate_of(
 
 
 def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:
-    """Take the places along X or along Y, of readings that were come to that way: where a change is greater."""
+    """Return the places along X or Y, for readings approached along it, whichever has the larger change."""
     along_x, along_y = (np.flatnonzero(plan.direction[:, k] != 0) for k in (0, 1))
     strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
     rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
@@ -122,7 +122,7 @@ def _along_the_strongest(change: FloatArray, plan: Plan) -> Covariate | None:
 
 
 def _edge_distance(plan: Plan) -> FloatArray:
-    """Distance of each row from the nearest edge under it, mm; infinite where there is none or none is described."""
+    """Return the distance of each row from the nearest described edge, mm; infinite if there is none."""
     out = np.full(len(plan), np.inf)
     for name, rows in plan.rows_by_pattern():
         if name in plan.patterns:

@@ -1,9 +1,9 @@
-"""What is finer in an SSF than any form that is fitted to it.
+"""Structure of an SSF that is finer than any form fitted to it.
 
-A ring, a ridge's shadow or a sharp rim is no mixture of Gaussians and no free form either: of a noise-free recording
-one to three noise sds are left, a little more than nothing, and it is no physics. Small shares of narrow Gaussians,
-spread over the footprint, take that up to first order. They are no part of any fit: the test that nothing is missing
-asks whether its alarm outlasts them.
+A ring, a ridge's shadow or a sharp rim is neither a mixture of Gaussians nor of the free form: it leaves residuals of
+one to three noise sds in all, which are not physics. Narrow Gaussians of small weight, spread over the footprint,
+absorb them to first order. They are not part of any fit: the global test checks whether its alarm persists when they
+are projected out.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ __all__ = ["fine_structure"]
 _REACH = 2.4
 _APART = 0.6
 _WIDTH = 0.35
-_SHARE = 0.03  # prior sd of each, of the mass
+_SHARE = 0.03  # prior sd of each weight, as a share of the mass
 
 
 def fine_structure(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
-    """Differentiate readings by fine structure about an SSF, in coordinates of standard normal prior, all 0 there.
+    """Return the slopes of the readings by fine structure about an SSF, in coordinates with a standard normal prior.
 
     Parameters
     ----------
     model
-        A sensor that is calibrated from the recording, no effects in its model.
+        A sensor calibrated from the recording, without effects.
     z
         Its coordinates, (n_params,).
     usable
-        Rows of the plan to look at.
+        Rows of the plan to use.
 
     Returns
     -------
-    Slopes, (n_usable, n_places), in reading units; nothing where the model has no SSF of its own.
+    Slopes, (n_usable, n_places), in reading units; no columns if the model has no free SSF.
     """
     sensor = model.sensor
     if not isinstance(sensor, CalibratedSensor):
@@ -55,12 +55,12 @@ def fine_structure(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
     levels = theta[0, 6 * sensor.n_gaussians :]
     narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
     chain = Chain(FreeMixture(1), FreeLevels(), known_scene(model.plan), (), n_nodes=FAST_NODES)
-    whole = model.predict(z[None, :])[0]  # of which as much gives way
+    whole = model.predict(z[None, :])[0]  # normalised, so that the total weight is unchanged
     return np.asarray(_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
 
 
 def _hexagons() -> FloatArray:
-    """Lay places evenly over a disc, (n, 2)."""
+    """Return places on a hexagonal grid over a disc, (n, 2)."""
     steps = np.arange(-8, 9)
     i, j = (a.ravel() for a in np.meshgrid(steps, steps))
     places = _APART * np.stack([i + j / 2, j * np.sqrt(3) / 2], axis=-1)

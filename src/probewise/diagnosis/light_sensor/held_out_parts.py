@@ -1,4 +1,4 @@
-"""Which readings are held out together: scans, or of many scans those over one pattern in one orientation."""
+"""Partition for held-out tests: scans or, if there are many, scans over one pattern in one orientation."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["held_out_parts"]
 
 
 def held_out_parts(recording: Recording) -> Parts:
-    """Divide usable readings into scans; where more than ten are long enough, into views of several scans.
+    """Divide usable readings into scans or, if more than ten are long enough, into groups of scans.
 
-    One of many scans that lie side by side would leak into the others: all those over one pattern in one orientation
-    are held out together, if there are several such parts.
+    Neighbouring scans would leak information: all scans over one pattern in one orientation are held out together, if
+    there are several such groups.
     """
     plan, usable = recording.plan, recording.usable
     scan = plan.scan[usable]

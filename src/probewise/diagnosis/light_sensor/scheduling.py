@@ -1,4 +1,4 @@
-"""One scan that the arm could take, and several as one plan, one after the other."""
+"""Scans that the arm could take, and their concatenation to a plan."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = [
     "start_after",
 ]
 
-BREAK_S = 30.0  # to turn the sensor, or to change what lies under it
-LAY_S = 60.0  # more than that to lay something that the plan had not
+BREAK_S = 30.0  # seconds to turn the sensor, or to exchange the sheet
+LAY_S = 60.0  # additional seconds to lay a new sheet
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One scan that the arm could take: which of the six R's, "across" or "lay", words for it, its readings."""
+    """One scan that the arm could take: its kind (one of the six R's, "across" or "lay"), description, plan."""
 
     kind: str
     description: str
@@ -36,20 +36,20 @@ class Scan:
 
     @property
     def minutes(self) -> float:
-        """How long it takes, with the break before it."""
+        """Duration in minutes, including the break before it."""
         return minutes_of(self.plan) + self.lay_s / 60.0
 
     @property
     def lay_s(self) -> float:
-        """How much longer the break before it is, to lay something."""
+        """Additional break before it for laying a sheet, in seconds."""
         return LAY_S if self.kind == "lay" else 0.0
 
 
 def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
-    """Set plans behind a plan; a pattern of one name is one pattern.
+    """Append plans to a plan; patterns of one name are one pattern.
 
-    A covariate that the others lack keeps its last known value there, such as a battery's; what is commanded
-    (the LED, the height) is as at calibration where a plan does not say.
+    A covariate that the others lack, such as battery voltage, keeps its last known value; commanded columns (LED,
+    height) that a plan lacks are as at calibration.
     """
     plans = [plan, *more]
     starts = np.cumsum([0, *(len(p.scan_names) for p in plans)])
@@ -71,27 +71,27 @@ def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
 
 
 def start_after(plan: Plan) -> float:
-    """When a scan after a plan can begin, in s."""
+    """Return the earliest start of a scan after a plan, in s."""
     return float(plan.time_s.max(initial=0.0)) + BREAK_S
 
 
 def minutes_of(plan: Plan) -> float:
-    """Estimate how long a plan takes, with the break before it."""
+    """Estimate the duration of a plan in minutes, including the break before it."""
     return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
 
 
 def one_after_another(scans: Sequence[Scan], after: Plan) -> Plan:
-    """Lay scans out as one plan, so that a model looks at all of them in one prediction.
+    """Concatenate scans, each timed as if directly after a plan, for one joint prediction.
 
-    Covariates that they lack, such as a battery's, stay as they were at the end of the plan before them.
+    Covariates that they lack, such as battery voltage, keep their last value of that plan.
     """
     return _as_left(_joined(scans), after)
 
 
 def in_turn(scans: Sequence[Scan], after: Plan) -> Plan:
-    """Take scans one after the other, with a break before each, a longer one where something has to be laid.
+    """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
-    Covariates that they lack are as expected, as in `one_after_another`: a column to be filled in with what is read.
+    Covariates that they lack are filled as in `one_after_another`, to be replaced by measured values.
     """
     out: list[Scan] = []
     for scan in scans:
@@ -100,7 +100,7 @@ def in_turn(scans: Sequence[Scan], after: Plan) -> Plan:
 
 
 def _as_left(plan: Plan, after: Plan) -> Plan:
-    """Fill in covariates that nobody commands with what they were at the end of the plan before."""
+    """Fill covariates that cannot be commanded with their last values of the plan before."""
     read = {name: last_known(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates})
@@ -111,11 +111,11 @@ def _joined(scans: Sequence[Scan]) -> Plan:
 
 
 def put_off(scan: Scan, plan: Plan) -> Scan:
-    """Put a scan off until a plan is over, and what has to be laid for it is laid."""
+    """Move a scan to after a plan, with time to lay its sheet."""
     return _from(scan, start_after(plan))
 
 
 def _from(scan: Scan, start_s: float) -> Scan:
-    """Begin a scan at a time, or later by what it takes to lay something."""
+    """Start a scan at a time, plus the time to lay its sheet."""
     delay_s = start_s + scan.lay_s - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))

@@ -1,4 +1,4 @@
-"""The paper's apparatus: its vocabulary, covariates, held-out parts, next scans, and words."""
+"""The paper's apparatus: vocabulary, covariates, held-out parts, next scans, and words."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ __all__ = ["LightSensor"]
 
 @dataclass(frozen=True)
 class LightSensor:
-    """A light sensor that an arm moves over patterns; `vocabulary` are the effects it may have, by name.
+    """A light sensor that an arm moves over patterns; `vocabulary` holds its possible effects, by name.
 
-    The vocabulary is a plain dict, which can be sent to another process. `hands` says whether somebody can lay or
-    turn a sheet; without, the next scans are taken over the pattern of the last reading.
+    The vocabulary is a plain dict, which can be pickled. `hands`: a person can exchange or turn sheets; otherwise the
+    next scans are over the pattern of the last reading.
     """
 
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: dict(VOCABULARY))
@@ -44,9 +44,9 @@ class LightSensor:
     )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Scale the vocabulary, and what has a formula beside it; leave out what the null takes up or has no place for.
+        """Return the scaled vocabulary and the effects with a formula, without those that the null absorbs or excludes.
 
-        Where no null is given the SSF is free, and takes up whole what is of the SSF.
+        Without a given null the SSF is free, and absorbs effects on the SSF.
         """
         extent, plan = Extent.of(recording), recording.plan
         kinds = {**self.vocabulary, **UNNAMED, **NUISANCES}
@@ -58,23 +58,23 @@ class LightSensor:
         }
 
     def proposals(self) -> dict[str, NamedEffect[Any]]:
-        """Propose none: what has a formula here is among the effects."""
+        """Return none: effects with a formula are among `effects` here."""
         return {}
 
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Name the effects that are not this library's."""
+        """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
 
     def refits_are_over(self) -> bool:
-        """Never: predictions cost nothing but time here."""
+        """Return False: predictions are cheap here."""
         return False
 
     def null_forms(self, recording: Recording) -> SsfForms:
-        """Give the forms of its SSF."""
+        """Return the forms of its SSF."""
         return SsfForms(Extent.of(recording))
 
     def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        """List the covariates that vary, and the slope of the readings along each one's direction of motion."""
+        """Return the covariates that vary, and the slope of the readings along the direction of motion."""
         usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
         slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return covariates_of(recording.plan, usable, found.predicted, slope), slope
@@ -86,11 +86,11 @@ class LightSensor:
     in_turn = staticmethod(in_turn)
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Differentiate by what is finer in an SSF than any form that is fitted to it."""
+        """Return the slopes by fine structure of the SSF."""
         return fine_structure(found.model, found.z, usable)
 
     def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
-        """List what the arm can do, and what a hand can: swap the target, or turn it."""
+        """List the scans that the arm can take, and those with the target exchanged or turned by hand."""
         if self.hands:
             return [*commands(plan, strides=strides, level=level), *target_swaps(plan)]
         rows = rows_that_need_no_hand(plan)

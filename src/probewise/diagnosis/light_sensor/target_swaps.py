@@ -1,7 +1,7 @@
-"""What else could be laid under the sensor, or scanned along the other axis: what the arm alone cannot bring about.
+"""Scans that need a person: over another or turned target, or along the other axis.
 
-A slope of the table against one of the paper's whiteness, a sensor that looks beside itself against an edge that lies
-elsewhere: no scan over the same sheet parts them, however it is taken. The sheet turned round does, or stripes.
+Some aliases cannot be separated by any scan over the same sheet: a sloping table and a gradient of the paper's
+whiteness, or a displaced footprint and a displaced edge. A turned sheet, or stripes, separates them.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from probewise.recordings.plan import Plan
 
 __all__ = ["target_swaps"]
 
-_FLAT_ROWS = 20  # readings of a plain surface
-_FOOTPRINT = 1 / 14  # of a scan's length, as wide as is believed before any reading
-_ASIDE = 0.3  # of a scan's length, how far from its middle an edge is moved
-_LEAST_CROSSED = 0.3  # of its length, that a scan goes across an edge rather than along it
-_STRIPES = (5, 10)  # how many go into a scan
+_FLAT_ROWS = 20  # readings over a uniform surface
+_FOOTPRINT = 1 / 14  # prior width of the footprint, as a share of a scan's length
+_ASIDE = 0.3  # displacement of an edge, as a share of a scan's length
+_LEAST_CROSSED = 0.3  # least share of a scan's length that must go across an edge
+_STRIPES = (5, 10)  # numbers of stripes per scan
 _STRIDE = 4
 
 
 def target_swaps(plan: Plan) -> list[Scan]:
-    """List scans over plain surfaces, along the other axis, and over an edge of the plan laid otherwise.
+    """List scans over uniform surfaces, along the other axis, and over a moved or turned edge of the plan.
 
-    All begin as the plan's first scan that moves does, or as its first over a `HalfPlane`, the sensor as it was there.
+    They start like the plan's first moving scan, or its first over a `HalfPlane`, with the same orientation.
     """
     scans = distinct_scans(plan)
     if not scans:
@@ -51,7 +51,7 @@ def target_swaps(plan: Plan) -> list[Scan]:
 
 
 def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
-    """Turn the sheet of an edge, half round or by a quarter; move it; lay stripes."""
+    """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
     beyond = _beyond(plan, scan, edge)
     length = float(np.ptp(beyond))
@@ -95,7 +95,7 @@ def _scan(plan: Plan, rows: IntArray, name: str) -> Plan:
 
 
 def _over(scan: Plan, name: str, pattern: Pattern) -> Plan:
-    """Lay a pattern under all of a scan; a name that is taken stands for something else."""
+    """Set the pattern of a scan, under a name not yet in use."""
     while name in scan.pattern_names and scan.patterns.get(name) != pattern:
         name += "_new"
     names = tuple(dict.fromkeys((*scan.pattern_names, name)))
@@ -104,13 +104,13 @@ def _over(scan: Plan, name: str, pattern: Pattern) -> Plan:
 
 
 def _turned(scan: Plan) -> Plan:
-    """Turn a scan's places by a quarter about their middle, anticlockwise."""
+    """Rotate a scan's places by 90 degrees about their middle, anticlockwise."""
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
     return replace(scan, x_mm=x_mm - (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
 
 
 def _both_turned(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
-    """Turn a scan and the edge under it, which stays as far from the scan's middle."""
+    """Rotate a scan with the edge under it, at the same distance from the scan's middle."""
     normal_rad = edge.normal_rad + math.pi / 2
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
     moved_mm = sum(
@@ -121,5 +121,5 @@ def _both_turned(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
 
 
 def _beyond(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
-    """How far places are inside an edge, in mm."""
+    """Return the signed distance of places inside an edge, in mm."""
     return plan.x_mm[rows] * math.cos(edge.normal_rad) + plan.y_mm[rows] * math.sin(edge.normal_rad) - edge.offset_mm

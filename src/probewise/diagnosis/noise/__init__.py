@@ -1,1 +1,1 @@
-"""The law of the noise: normal or with a tail, remembering or rounded, and the models that lay such laws out."""
+"""Distributions of the noise (normal, heavy-tailed, correlated, rounded), and noise models built from effects."""

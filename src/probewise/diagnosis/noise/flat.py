@@ -1,8 +1,8 @@
-"""What rounding makes of normal noise: the sum of a normal and a uniform part, flat at the top.
+"""Rounded normal noise: the sum of a normal and a uniform part, with a flat-topped density.
 
-A reading that was rounded to a lattice says of what was there that it lay within half a step, and the likelihood of
-that is this density of the residual, for any lattice. Inside its flat top a residual says nothing. The step is known,
-so that no density is above one over it, however small the noise beside it.
+A rounded reading means that the unrounded one was within half a step, and its likelihood is this density of the
+residual. Within the flat top a residual carries no information. The density never exceeds one over the (known) step,
+however small the noise.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 
 @dataclass(frozen=True, eq=False)
 class Flat:
-    """Add to normal noise of a known sd `sigma` a uniform part of `half` sigma either way; one, or k of both (k,).
+    """Normal noise of known sd `sigma` plus a uniform part of half width `half` sigma; scalars, or k of both (k,).
 
-    All methods take residuals, (n_points, k) or (n_points, 1), and are those of `Tail`; their `sigma` is this one.
+    The methods are those of `Tail`, with residuals (n_points, k) or (n_points, 1); their `sigma` is this one.
     """
 
     half: float | FloatArray
@@ -41,23 +41,23 @@ class Flat:
     def scale(
         self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
     ) -> FloatArray:
-        """Give the known sigma, (k,)."""
+        """Return the known sigma, (k,)."""
         k = max(whitened.shape[1], np.size(self.sigma))
         return np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (k,)).copy()
 
     def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Minus log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
+        """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
         density = self._log_density(whitened / sigma) + _LOG_ROOT_2_PI
         at_zero = self._log_density(np.zeros((1, 1)))[0] + _LOG_ROOT_2_PI
         of_kept = density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * np.log(sigma) - of_kept)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Turn residuals into those of normal noise that say as much about the mean, as `Tail.as_normal` does."""
+        """Convert residuals to equally informative normal pseudo-observations, as `Tail.as_normal` does."""
         return np.asarray(sigma * self._score(whitened / sigma) / self.information)
 
     def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Give the curvature by which an integral over log sigma is worth 1, (k,): nothing is left to integrate."""
+        """Return the curvature for which the integral over log sigma is 1, (k,), since sigma is known."""
         return np.full(sigma.shape, 2 * math.pi)
 
     def _log_density(self, x: FloatArray) -> FloatArray:
@@ -66,7 +66,7 @@ class Flat:
         return np.asarray(upper + np.log1p(-np.exp(lower - upper)) - np.log(2 * half))
 
     def _score(self, x: FloatArray) -> FloatArray:
-        """Minus the slope of the log density: what the normal part has at either end of the flat top, over it."""
+        """Return minus the derivative of the log density."""
         half = np.asarray(self.half)
         log_mass = self._log_density(x) + np.log(2 * half) + _LOG_ROOT_2_PI
         return np.asarray(np.exp(-0.5 * (x - half) ** 2 - log_mass) - np.exp(-0.5 * (x + half) ** 2 - log_mass))

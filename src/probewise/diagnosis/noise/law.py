@@ -1,7 +1,7 @@
-"""Is it only the noise? The law of a recording's noise, and tests of what is left.
+"""The distribution of a recording's noise, and test statistics of residuals.
 
-A wrong law makes false alarms by the dozen, and a missed effect of the mean looks like correlated or
-heavy-tailed noise; so every hypothesis about the mean is weighed under white and under each other law.
+A wrong noise model causes false alarms, and a missed effect on the mean looks like correlated or heavy-tailed noise; so
+the evidence of every hypothesis on the mean is computed under every noise model.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from probewise.recordings.plan import Recording
 __all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white", "white_of"]
 
 _EM_STEPS = 12
-_LEAST = 1e-150  # of a scale: readings that are all as predicted are no error
+_LEAST = 1e-150  # least scale, for readings that are exactly as predicted
 
 
 def steps_within_scans(recording: Recording) -> IntArray:
-    """Count the rows back to the previous usable reading of the same scan, 0 where there is none.
+    """Return the number of rows back to the previous usable reading of the same scan, 0 if there is none.
 
-    Shape (n_usable,): a missing reading makes its neighbours two steps apart.
+    Shape (n_usable,): neighbours of a missing reading are two steps apart.
     """
     rows = np.flatnonzero(recording.usable)
     steps = np.diff(rows, prepend=rows[:1])
@@ -38,11 +38,10 @@ def steps_within_scans(recording: Recording) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class NoiseLaw:
-    """The law of all readings' noise, up to its overall sd.
+    """The joint distribution of all readings' noise, up to its overall sd.
 
-    Whitening, a linear map, makes residuals independent and of one scale sigma; what is left of each is
-    normal, but with probability `share` `times` as wide: a heavy tail; or rounded, flat at the top. Readings that are
-    lost say nothing.
+    Whitening, a linear map, makes residuals independent with one scale sigma; each is then normal, optionally with a
+    heavy tail (`times` as wide with probability `share`) or rounded (flat-topped). Lost readings carry no information.
 
     Parameters
     ----------
@@ -51,18 +50,18 @@ class NoiseLaw:
     carry
         Correlation with the previous reading, 0 for the first of a scan, (n_points,).
     lost
-        Readings that hold nothing of what lies under the sensor, (n_points,).
+        Mask of lost readings, which do not depend on the target, (n_points,).
     share, times
-        The tail; none by default.
+        Parameters of the heavy tail; none by default.
     log_extra
-        What the law says beyond the density of the readings that are not lost: of those that are.
+        Log probability of the lost readings.
     flat, sigma
-        What rounding adds, where there is no tail: a uniform part, so many sigma either way; sigma is then known.
+        Rounding, if there is no tail: a uniform part of half width `flat` sigma, with known sigma.
     least
-        Least sd that a reading has, given those before it; where sigma is known it plays no part.
+        Least sd of a reading, given those before it; not used if sigma is known.
     walk
-        What a random walk of the offset gains in variance from the row before to each, over runs too, relative to the
-        overall variance, (n_points,); empty where there is none. Readings that walk carry nothing else.
+        Increments in variance of a random walk of the offset from row to row, also between runs, relative to the
+        overall variance, (n_points,); empty without one. Then there is no other correlation.
     """
 
     sd: FloatArray
@@ -82,16 +81,16 @@ class NoiseLaw:
 
     @property
     def n_points(self) -> int:
-        """Readings that are not lost."""
+        """Number of readings that are not lost."""
         return len(self.sd) - int(self.lost.sum())
 
     @property
     def linear(self) -> tuple[bytes, ...]:
-        """What the whitening depends on: laws of one whitening differ in their tails alone."""
+        """Key of the whitening: distributions with the same key differ only in their tails."""
         return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes(), self.walk.tobytes()
 
     def alike(self, other: NoiseLaw) -> bool:
-        """Tell whether another law is as good as the same."""
+        """Return whether another distribution is practically the same."""
         return (
             (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
             and np.array_equal(self.lost, other.lost)
@@ -103,16 +102,16 @@ class NoiseLaw:
 
     @property
     def information(self) -> float:
-        """Fisher information of one whitened reading about its place, in units of 1 / sigma^2."""
+        """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
         return float(self.tail.information)
 
     def take(self, rows: BoolArray) -> NoiseLaw:
-        """Keep the law of some readings, whole scans of them."""
+        """Return the distribution of some readings, which must be whole scans."""
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
         return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows], walk=walk)
 
     def __call__(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns, shape (n_points,) or (n_points, n_columns); 0 for readings that are lost."""
+        """Whiten columns, shape (n_points,) or (n_points, n_columns); rows of lost readings become 0."""
         flat = columns.ndim == 1
         y = columns[:, None] if flat else columns
         if self.walk.size:
@@ -130,7 +129,7 @@ class NoiseLaw:
         return y[:, 0] if flat else y
 
     def _without_walk(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns (n_points, n_columns): differences of neighbours correlate with the next alone."""
+        """Whiten columns (n_points, n_columns) with a random walk: differences correlate only with their neighbours."""
         out = np.zeros(columns.shape)
         kept = ~self.lost
         steps = np.diff(columns[kept], axis=0, prepend=0.0)
@@ -139,7 +138,7 @@ class NoiseLaw:
 
     @cached_property
     def _walk_root(self) -> FloatArray:
-        """Cholesky root of the covariance of neighbours' differences, its two bands, (2, n_kept)."""
+        """Banded Cholesky factor of the covariance of successive differences, (2, n_kept)."""
         kept = ~self.lost
         variance = self.sd[kept] ** 2
         gained = np.diff(np.cumsum(self.walk)[kept], prepend=0.0)
@@ -158,17 +157,17 @@ class NoiseLaw:
 
     @cached_property
     def tail(self) -> Tail | Flat:
-        """The form of one whitened reading's density."""
+        """The density of one whitened reading."""
         return forms([self])
 
     @cached_property
     def floor(self) -> float:
-        """Least sigma, such that no reading's sd, given those before it, is below `least`."""
+        """Least sigma for which every reading's sd, given those before it, is at least `least`."""
         return self.least / self._narrowest if self.least else 0.0
 
     @cached_property
     def _narrowest(self) -> float:
-        """Least sd of a reading given those before it, in units of sigma; 1 where all are lost."""
+        """Smallest sd of a reading given those before it, in units of sigma; 1 if all are lost."""
         if not self.n_points:
             return 1.0
         if self.walk.size:
@@ -176,43 +175,43 @@ class NoiseLaw:
         return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost]))
 
     def at_least(self, sigma: float) -> NoiseLaw:
-        """Bound sigma from below."""
+        """Return the distribution with a lower bound on sigma."""
         return replace(self, least=sigma * self._narrowest)
 
     @property
     def widening(self) -> float:
-        """Sd of a whitened reading in units of sigma, a tail aside: what rounding adds."""
+        """Sd of a whitened reading in units of sigma, including rounding but not a tail."""
         return math.sqrt(1 + self.flat**2 / 3)
 
     def plain(self) -> NoiseLaw:
-        """Leave normal noise of the same whitening; the normal part beside rounding is of any sd."""
+        """Return normal noise with the same whitening and free sd, without tail or rounding."""
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
 
     def scale(self, whitened: FloatArray) -> FloatArray:
-        """Most likely sigma of whitened residuals, the floor at least, (n_points, k) -> (k,)."""
+        """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
         return self.tail.scale(whitened, self.n_points, floor=self.floor)
 
     def misfit(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Minus log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
+        """Return minus the log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
 
         Without n/2 log 2 pi.
         """
         return self.tail.misfit(whitened, sigma, self.n_points)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Turn whitened residuals (n_points, k) into those of normal noise that say as much about the mean."""
+        """Convert whitened residuals (n_points, k) to equally informative normal pseudo-observations."""
         return self.tail.as_normal(whitened, sigma)
 
     def pseudo(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Give residuals as `as_normal` does, but none farther than it is.
+        """Return pseudo-observations like `as_normal`, but never larger than the residuals.
 
-        Beyond a flat top the density falls faster than on the average, and what would be told by that no change needs.
+        Beyond a flat top the density falls faster than average, which would exaggerate the residual.
         """
         normal = self.as_normal(whitened, sigma)
         return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
 
     def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw residuals as `pseudo` makes them, in units of their sd, (n_points, n_draws)."""
+        """Draw pseudo-observations as from `pseudo`, in units of their sd, (n_points, n_draws)."""
         eps = rng.standard_normal((len(self.sd), n_draws))
         if not self.tail.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
@@ -224,7 +223,7 @@ class NoiseLaw:
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """Mix two normal densities of one mean: with probability `share` `times` as wide; one tail, or k of them (k,).
+    """A scale mixture of two normals, `times` as wide with probability `share`; scalars, or k of both (k,).
 
     All methods take whitened residuals, (n_points, k) or (n_points, 1).
     """
@@ -234,7 +233,7 @@ class Tail:
 
     @cached_property
     def is_normal(self) -> bool:
-        """Whether there is none."""
+        """Whether there is no tail."""
         return bool(np.all(np.asarray(self.share) == 0))
 
     @cached_property
@@ -245,13 +244,13 @@ class Tail:
     def scale(
         self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
     ) -> FloatArray:
-        """Most likely sigma, (k,), by expectation and maximisation; rows beyond `n_points` are 0 and do not count."""
+        """Return the most likely sigma, (k,), by EM; rows beyond `n_points` are 0 and do not count."""
         if self.is_normal:
             return np.asarray(
                 np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), max(floor, _LEAST))
             )
         squares = whitened**2
-        if start is None:  # from the middle half of what is not lost, which the tail leaves alone
+        if start is None:  # start from the interquartile range of the readings not lost, which is robust to the tail
             middle = len(whitened) - n_points // 2 - 1
             sigma = np.maximum(np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745, floor) + _LEAST
         else:
@@ -262,7 +261,7 @@ class Tail:
         return np.asarray(sigma)
 
     def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Minus log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
+        """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
         if self.is_normal:
             return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
         squares = (whitened / sigma) ** 2
@@ -272,38 +271,38 @@ class Tail:
         return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share)) - of_kept)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Turn residuals into those of normal noise that say as much about the mean.
+        """Convert residuals to equally informative normal pseudo-observations.
 
-        The score of the density over its information: of sd sigma / sqrt(information), and what lies far
-        out in the tail counts little (Huber 1981, section 6.7: pseudo-observations).
+        The score of the density over its Fisher information, with sd sigma / sqrt(information); outlying residuals have
+        little weight (Huber 1981, section 6.7).
         """
         if self.is_normal:
             return whitened
         return np.asarray(whitened * self._weights((whitened / sigma) ** 2) / self.information)
 
     def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Give minus the second derivative of the log likelihood by log sigma, (k,)."""
+        """Return minus the second derivative of the log likelihood by log sigma, (k,)."""
         squares = (whitened / sigma) ** 2
         wide = self.wide(squares)
         less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
         return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
 
     def wide(self, squares: FloatArray) -> FloatArray:
-        """Probability that a residual is a wide one, by its square in units of sigma^2."""
+        """Return the probability that a residual is from the wide component, from its square over sigma^2."""
         return np.asarray(expit(self._log_odds(squares)))
 
     def _log_odds(self, squares: FloatArray) -> FloatArray:
-        """Log odds that a residual is a wide one, by its square in units of sigma^2."""
+        """Return the log odds that a residual is from the wide component, from its square over sigma^2."""
         share, times = np.asarray(self.share), np.asarray(self.times)
         return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
 
     def _weights(self, squares: FloatArray) -> FloatArray:
-        """Expect the precision of each residual, 1 for those of the narrow part."""
+        """Return the expected precision of each residual relative to the narrow component."""
         return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide(squares))
 
 
 def forms(laws: Sequence[NoiseLaw]) -> Tail | Flat:
-    """Take the densities of laws that all have a tail, or all a flat top, together: one of k."""
+    """Stack the densities of several distributions, all with a tail or all rounded."""
     one = len(laws) == 1
     if laws[0].flat:
         if one:
@@ -318,7 +317,7 @@ def forms(laws: Sequence[NoiseLaw]) -> Tail | Flat:
 def _information(share: float, times: float) -> float:
     if share == 0:
         return 1.0
-    # The integrand reaches as far as the wide part does.
+    # The integrand extends as far as the wide component.
     z = np.linspace(-6 * times, 6 * times, 4001)
     narrow = (1 - share) * np.exp(-0.5 * z * z)
     wide = share / times * np.exp(-0.5 * (z / times) ** 2)
@@ -327,17 +326,17 @@ def _information(share: float, times: float) -> float:
 
 
 def white(n_points: int, *, least: float = 0.0) -> NoiseLaw:
-    """Leave readings as they are."""
+    """Return white noise."""
     return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_), least=least)
 
 
 def white_of(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
-    """Give the usable readings of a recording independent noise, of the relative sds that it declares."""
+    """Return independent noise of a recording's usable readings, with its declared relative sds."""
     return replace(white(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
 
 
 def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:
-    """Measure what white normal noise has none of, shape (3, n_draws).
+    """Return statistics that vanish for white normal noise, shape (3, n_draws).
 
     Parameters
     ----------
@@ -350,7 +349,7 @@ def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) 
 
     Returns
     -------
-    Correlation of neighbours, excess kurtosis, and correlation of the squares with the level.
+    Lag-1 autocorrelation, excess kurtosis, and correlation of the squares with the level.
     """
     r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
     neighbours = np.flatnonzero(steps == 1)

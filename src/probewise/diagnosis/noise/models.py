@@ -1,4 +1,4 @@
-"""Effects on the noise, laid out as laws that a fit can be weighed under."""
+"""Noise models: effects on the noise, discretised to nodes under which the evidence of a fit is computed."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from probewise.sensor.stages import NoiseLevel
 
 __all__ = ["NoiseModel", "NoiseNodes", "hides_the_noise", "least_sd", "log_lost_value", "rough_sd"]
 
-_FAR = 4.0  # noise sd from its prediction beyond which a reading is lost rather than noisy
-_MANY = 12  # nodes of one effect that beside another's would be too many
-_APART = 0.3  # of the logarithm of half a step in sds of the noise beside it, from node to node to begin with
-_WIDEST, _NARROWEST = -6, 9  # nodes: sds of 3 steps, or what is left, to a thirtieth of a step
-_UNLIKELY = 15.0  # nats behind the best: such nodes of the noise beside rounding are left out
-_HIDDEN = 0.6  # of a step: there normal densities sum to 1 + 2 exp(-2 pi^2 0.36) = 1.0016 over a lattice, below to more
+_FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
+_MANY = 12  # nodes of one effect above which they are thinned before combination with another's
+_APART = 0.3  # initial spacing of nodes in the log of half a step over the noise sd
+_WIDEST, _NARROWEST = -6, 9  # range of nodes: noise sds from 3 steps, or the residual rms, to a thirtieth of a step
+_UNLIKELY = 15.0  # nats behind the best from which nodes of noise with rounding are dropped
+_HIDDEN = 0.6  # sd over step from which rounding is negligible (lattice sum 1 + 2 exp(-2 pi^2 0.36) = 1.0016)
 
-_FINE = 0.01  # noise sd: how exactly a lost reading holds its value where nothing is rounded
+_FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseNodes:
-    """The laws of a noise model about a fit, one a node, with settings (n_nodes, n_params) and log prior weights."""
+    """The nodes of a noise model about a fit: distributions, settings (n_nodes, n_params) and log prior weights."""
 
     settings: FloatArray
     laws: tuple[NoiseLaw, ...]
@@ -45,15 +45,15 @@ class NoiseModel:
     Parameters
     ----------
     effects
-        The effects; none for white noise.
+        The effects; empty for white noise.
     recording
         What was read.
     likely
-        For some effects by name, the nodes (n_nodes, n_params) that matter, and the log of what each stands for.
+        For some effects by name, the important nodes (n_nodes, n_params) and their log weights.
     rounding
-        Step of a lattice that all readings are on, where nothing else is wrong with the noise, or 0.
+        Rounding step of all readings, if there is no other noise effect, or 0.
     least_sd
-        Least believable sd of a reading, given those before it.
+        Least plausible sd of a reading, given those before it.
     """
 
     effects: tuple[NoiseEffect, ...]
@@ -68,7 +68,7 @@ class NoiseModel:
         return tuple(effect.name for effect in self.effects)
 
     def columns_of(self, name: str) -> slice:
-        """Columns of the settings that are one effect's."""
+        """Return the columns of one effect's settings."""
         at = 0
         for effect in self.effects:
             n_params = len(effect.prior.names)
@@ -78,7 +78,7 @@ class NoiseModel:
         raise KeyError(name)
 
     def every_third(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Thin out the nodes of each effect that has more than twelve to a third, for `likely`."""
+        """Thin the nodes of each effect with more than twelve to every third, for `likely`."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]
@@ -87,9 +87,9 @@ class NoiseModel:
         return out
 
     def laws(self, predicted: FloatArray) -> NoiseNodes:
-        """Lay out every combination of the effects' nodes about predictions of the usable rows, (n_usable,)."""
+        """Return the nodes of all combinations of the effects, given predictions of the usable rows, (n_usable,)."""
         residuals = (self._readings - predicted) / self._relative_sd
-        # Rounded readings can all be as predicted; what rounding alone leaves is not far.
+        # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._lattice / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
@@ -105,7 +105,7 @@ class NoiseModel:
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law(level, k, far) for k in range(len(settings)))
         if self.rounding:
-            # Sigma is integrated out by nodes, over its logarithm, as it is elsewhere in closed form.
+            # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
             halves, beside = _beside_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
@@ -113,13 +113,13 @@ class NoiseModel:
         return NoiseNodes(settings, laws, log_weights)
 
     def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
-        """Give the nodes of one effect and the log prior weight of each."""
+        """Return the nodes of one effect and their log prior weights."""
         if effect.name in self.likely:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)
 
     def _level(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
-        """Apply the effects with all settings at once, to the usable rows."""
+        """Apply the effects with all settings at once to the usable rows."""
         plan, usable = self.recording.plan, self.recording.usable
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
@@ -147,7 +147,7 @@ class NoiseModel:
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._cell, 1.0)
-            # Each reading that is lost is in the cell of that value.
+            # Each lost reading has that value to within a cell.
             log_extra = n_lost * math.log(lost_share / self._cell)
             log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
@@ -165,7 +165,7 @@ class NoiseModel:
 
     @cached_property
     def _rows_on(self) -> FloatArray:
-        """Rows from the usable one before, over runs too; the first from the table's start."""
+        """Rows since the previous usable one, across runs too; for the first, since the start of the table."""
         return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
 
     @cached_property
@@ -174,19 +174,19 @@ class NoiseModel:
 
     @cached_property
     def _cell(self) -> float:
-        """Width of what a lost reading is known to, in reading units."""
+        """Resolution of a lost reading's value, in reading units."""
         return self._lattice or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
     def _lattice(self) -> float:
-        """Step of a lattice that all readings are on, 0 where there is none."""
+        """Rounding step of all readings, 0 if there is none."""
         return lattice_step(self._readings)
 
 
 def log_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
-    """Give the log prior probability of the value that readings are lost to.
+    """Return the log prior probability of the value of lost readings.
 
-    Half is for the ends of the range, where they are declared, and half for any of so many cells.
+    Half is for the ends of the declared range, and half for any of the cells.
     """
     if not ends:
         return -math.log(cells)
@@ -195,10 +195,10 @@ def log_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
 
 
 def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Lay out the sd of the noise beside rounding, as the half steps that are one sd: nodes and log weights, (n,).
+    """Return nodes and log weights, (n,), for the noise sd with rounding, as half steps per sd.
 
-    Wide apart, and closer about the best, down to the sd that readings without rounding would tell log sigma to; as
-    wide as what is left, where something is missing from the mean.
+    They are coarse, and refined about the best down to the accuracy of log sigma without rounding; they extend to the
+    residual rms, in case the mean is incomplete.
     """
 
     def log_likelihood(halves: FloatArray) -> FloatArray:
@@ -221,27 +221,26 @@ def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> 
 
 
 def hides_the_noise(step: float, recording: Recording) -> bool:
-    """Tell whether readings are rounded to steps so coarse that a normal law is no density of them.
+    """Return whether rounding is too coarse for a normal density of the readings.
 
-    Not where no three readings follow each other, which alone would tell.
+    False if no three readings are successive, which are needed to tell.
     """
     return 0 < rough_sd(recording) < _HIDDEN * step
 
 
 def least_sd(recording: Recording) -> float:
-    """Least sd that a normal law of the readings can have, however they are rounded.
+    """Return the least sd of a normal density of the readings, given their rounding.
 
-    Where they are on a coarse lattice a narrower one would gain by each level that a model puts on the lattice too:
-    a nat in ten readings at 0.4 of a step.
+    On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice, by a nat in ten readings at
+    0.4 of a step.
     """
     return max(sd_floor(recording), _HIDDEN * lattice_step(recording.readings[recording.usable]))
 
 
 def rough_sd(recording: Recording) -> float:
-    """Estimate the noise sd without a model, from second differences within scans, of which few are at an edge.
+    """Estimate the noise sd without a model, from second differences within scans, few of which are at an edge.
 
-    That of readings on a lattice as they are, rounding and all: those that are the same are spread over a step, without
-    which the median would be one of few values.
+    The estimate includes rounding; equal readings are spread over a step, so that the median is not one of few values.
     """
     readings, steps = recording.readings[recording.usable], steps_within_scans(recording)
     inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1

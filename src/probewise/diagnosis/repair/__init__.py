@@ -1,1 +1,1 @@
-"""The repaired model: posterior samples of one hypothesis, or of all that the readings leave open."""
+"""The repaired model: posterior samples of one hypothesis, or averaged over hypotheses."""

@@ -1,4 +1,4 @@
-"""Carry samples from one density to another near it: by their weights, or by tempered sequential Monte Carlo.
+"""Transform samples of one density to a nearby one: by importance resampling, or tempered sequential Monte Carlo.
 
 The densities between are q^(1 - beta) p^beta (Neal 2001). After each step of beta the samples are resampled by their
 weights and moved: each half by differences of the other half (ter Braak 2006), which leaves the density invariant.
@@ -19,10 +19,10 @@ from probewise.progress import Progress, silent
 
 __all__ = ["Density", "anneal", "by_weight"]
 
-_ENOUGH = 0.5  # share of what is wanted that shall be as good as independent
-_LEAST_OF_IT = 0.5  # of that
-_EFFECTIVE = 0.5  # share of the samples that still count after a step of beta
-_AT_LAST = 3  # times as many moves when the density itself is reached
+_ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
+_LEAST_OF_IT = 0.5  # least acceptable share of the target
+_EFFECTIVE = 0.5  # least effective share of the samples after a step of beta
+_AT_LAST = 3  # factor on the number of moves at beta = 1
 _LEAST_STEP = 1e-3
 
 Density: TypeAlias = Callable[[FloatArray], FloatArray]
@@ -37,23 +37,23 @@ def by_weight(
     n_wanted: int,
     rng: np.random.Generator,
 ) -> FloatArray | None:
-    """Draw from a density by the weights of samples of another one, where enough of them count.
+    """Draw from a density by importance resampling, if the effective sample size suffices.
 
     Parameters
     ----------
     first
-        Samples of the other density in no order, (n_first, n_params): no more of them are weighed than it takes.
+        Samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated.
     log_q, log_p
-        Log densities of the samples and of what is wanted, unnormalised, (n, n_params) -> (n,); `log_p` is minus
-        infinity where it cannot be.
+        Unnormalised log densities of the proposal and the target, (n, n_params) -> (n,); `log_p` is minus infinity
+        outside its support.
     n_wanted
-        Samples to draw, of which half shall be as good as independent, a quarter at least.
+        Number of samples to draw; the effective sample size should be half of it, and at least a quarter.
     rng
         Source of randomness.
 
     Returns
     -------
-    Samples in no order, (n_wanted, n_params); None where too few of `first` count.
+    Samples in random order, (n_wanted, n_params); None if the effective sample size is too small.
     """
     least = _LEAST_OF_IT * _ENOUGH * n_wanted
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
@@ -71,7 +71,7 @@ def by_weight(
 
 
 def _independent(log_weight: FloatArray, samples: FloatArray) -> float:
-    """Count weighted samples by Kish's number, copies of one as one."""
+    """Return Kish's effective sample size, with duplicates counted once."""
     _, which = np.unique(samples[:, 0], return_inverse=True)
     if not np.isfinite(log_weight).any():
         return 0.0
@@ -89,7 +89,7 @@ def anneal(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> FloatArray:
-    """Draw from a density, setting out from samples of another one.
+    """Draw from a density by sequential Monte Carlo, starting from samples of another one.
 
     Parameters
     ----------
@@ -98,30 +98,30 @@ def anneal(
     log_q, log_p, n_wanted, rng
         As in `by_weight`.
     n_moves
-        Moves of each sample after a step of beta, and from one harvest to the next.
+        Moves of each sample after a step of beta, and between collections of samples.
     progress
-        Told beta on the way to the density, and there the samples that are harvested.
+        Called with beta, and then with the number of collected samples.
 
     Returns
     -------
-    Samples, (n_wanted, n_params): those carried on, taken as often as it takes, some moves apart.
+    Samples, (n_wanted, n_params), collected from the walkers some moves apart.
 
     Raises
     ------
     NotConvergedError
-        If none of the first samples can be.
+        If no initial sample is in the support of the target.
     """
     n_walkers = len(first)
     z, heights = first, (log_q(first), log_p(first))
     if not np.isfinite(heights[1]).any():
-        raise NotConvergedError("no sample of what stands in for the posterior is within the bounds of the prior")
+        raise NotConvergedError("no sample of the approximate posterior is within the bounds of the prior")
     beta, scale = 0.0, 1.0
     while beta < 1.0:
         gain = heights[1] - heights[0]
         after = _next_beta(gain, beta)
         kept = resampled(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
-        progress("carrying samples to the posterior", note=f"beta {beta:.2f} of 1")
+        progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
         for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
             z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
     harvest = [z]
@@ -134,7 +134,7 @@ def anneal(
 
 
 def _next_beta(gain: FloatArray, beta: float) -> float:
-    """Find the largest beta, by halving, at which enough samples still count."""
+    """Find the largest beta, by bisection, with enough effective samples."""
     enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
@@ -155,7 +155,7 @@ def _moved(
     *,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
-    """Move one half by differences of the other, then the other by the first's; adapt the step's length."""
+    """Move one half of the walkers by differences of the other half, then vice versa; adapt the step size."""
     z, q, p = z.copy(), heights[0].copy(), heights[1].copy()
     order, n = rng.permutation(len(z)), len(z) // 2
     accepted = 0

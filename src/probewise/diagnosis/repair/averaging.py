@@ -1,7 +1,7 @@
-"""Average models by their probability: samples of several SSF orders, or of several hypotheses, in one model.
+"""Bayesian model averaging: samples of several SSF orders, or of several hypotheses, in one model.
 
-What these readings leave open a prediction must leave open too: where readings are unlike those that a repair comes
-from, the likeliest explanation alone would be sure and, at times, wrong.
+Predictions must include the uncertainty between hypotheses: for readings unlike the recorded ones, the most probable
+explanation alone would be overconfident.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ __all__ = ["over_hypotheses", "over_orders", "side_by_side"]
 def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
     """Mix samples of one hypothesis at several SSF orders by their probability.
 
-    All are written at the largest order: a Gaussian in two equal halves is the same Gaussian.
+    All are converted to the largest order, by splitting Gaussians into two equal halves.
 
     Parameters
     ----------
     parts
-        Samples of each order, as many of each.
+        Samples of each order, in equal numbers.
     weights
         Probability of each order, (n_parts,).
     rng
@@ -49,9 +49,9 @@ def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.r
 
 
 def side_by_side(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
-    """Tell whether hypotheses of these effects fit into one model.
+    """Return whether hypotheses of these effects can be combined in one model.
 
-    What both hold must be bound to the same scans, and what one lacks must have a setting at which it does nothing.
+    Shared effects must be bound to the same scans; an effect that one lacks must have a null setting.
     """
     known = {effect.name: effect for effect in first}
     shared = {effect.name for effect in second if effect.name in known}
@@ -62,12 +62,12 @@ def side_by_side(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect
 def over_hypotheses(
     parts: Sequence[ModelSamples], shares: FloatArray, null: Null, plan: Plan, *, rng: np.random.Generator
 ) -> ModelSamples:
-    """Mix samples of several hypotheses by their probability: where one lacks an effect, the effect does nothing.
+    """Mix samples of several hypotheses by their probability; effects that one lacks have their null setting.
 
     Parameters
     ----------
     parts
-        Samples of each hypothesis, as many of each; their effects fit `side_by_side`, their noise is of one kind.
+        Samples of each hypothesis, in equal numbers; they are compatible (`side_by_side`) and share a noise model.
     shares
         Probability of each, (n_parts,).
     null
@@ -112,7 +112,7 @@ def over_hypotheses(
 
 
 def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
-    """Write each sample's mixture with more Gaussians, by halving the heaviest."""
+    """Convert each sample's mixture to more Gaussians, by halving the heaviest."""
     blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
     rows = np.arange(len(theta))
     for _ in range(wanted - n_gaussians):

@@ -1,4 +1,4 @@
-"""Which refitted hypothesis repairs the model, and what it gains."""
+"""The refitted hypothesis that repairs the model, and its gain."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 __all__ = ["Best", "best_repair", "ruins"]
 
-_RUIN = -1.0  # nats per held-out reading, below which what was named repairs nothing
+_RUIN = -1.0  # nats per held-out reading below which named effects are withdrawn
 
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """The fit of the repaired model under its noise model, as a linear problem, and what it gains.
+    """The fit of the repaired model with its noise model, its linearisation, and its gain.
 
-    `out_of_vocabulary` is the combination that it was chosen for where the verdict is `unknown`, () if it has no
-    formula.
+    `out_of_vocabulary` is its combination with a formula if the verdict is `unknown`, otherwise ().
     """
 
     fit: WeighedFit
@@ -44,25 +43,25 @@ class Best:
         out_of_vocabulary: Names = (),
         rng: np.random.Generator,
     ) -> Best:
-        """Measure what a fit gains over the null."""
+        """Measure the gain of a fit over the null."""
         after = Linearised.of(fit.found, fit.evidence[noise].law)
         gain = improvement_of(searched, test, fit, noise, after, rng=rng)
         return cls(fit, noise, after, gain, out_of_vocabulary)
 
 
 def ruins(gain: Improvement) -> bool:
-    """Tell whether a repair predicts held-out readings far worse than the null does."""
+    """Return whether a repair predicts held-out readings far worse than the null."""
     return gain.heldout_log_density_per_reading < _RUIN
 
 
 def best_repair(
     searched: Searched, test: GlobalTest, judged: Judged, *, rng: np.random.Generator
 ) -> tuple[Judged, Best]:
-    """Choose the fit that goes with a verdict, the null where nothing was found.
+    """Choose the fit that belongs to a verdict; the null if nothing was found.
 
     Returns
     -------
-    The verdict, withdrawn where what was named fails on held-out readings; and the fit.
+    The verdict, withdrawn if the named effects fail on held-out readings; and the fit.
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
@@ -75,6 +74,6 @@ def best_repair(
         noise = searched.posterior.noise(stated)
     on_mean = tuple(name for name in judged.combination if name not in on_noise)
     best = Best.of(searched, test, searched.best(on_mean, noise) or null, noise, rng=rng)
-    if judged.verdict == "named" and ruins(best.improvement):  # what explains these readings alone is no repair
+    if judged.verdict == "named" and ruins(best.improvement):  # a fit that fails on held-out readings is no repair
         return judged.withdraw(), Best.of(searched, test, null, noise, rng=rng)
     return judged, best

@@ -1,8 +1,8 @@
-"""Repair a model where nothing in the vocabulary explains the residual: by bases orthogonal to what is known.
+"""Correct a model for residuals that no effect explains, by basis functions orthogonal to its own parameters.
 
-The correction is a Gaussian process of finite rank: the amplitudes of the bases have normal priors, and each
-basis is projected past everything that the sensor model could take up. It belongs to the recording's rows
-and covariates; it names no physics, so the sensor written to sensor.json does not carry it.
+The correction is a Gaussian process of finite rank: amplitudes have normal priors, and everything that the sensor model
+could absorb is projected out of each basis. It applies to the recording's rows and covariates only, and names no
+physics, so sensor.json does not contain it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MOST_BASES = 6
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What the bases add: `change` of the readings (n_points,), and its gain on held-out parts."""
+    """A correction: `change` of the readings (n_points,), and its gain on held-out parts."""
 
     change: FloatArray
     columns: FloatArray
@@ -39,25 +39,25 @@ class Correction:
 
     @property
     def gains_nothing(self) -> bool:
-        """Whether held-out readings, where there are any, are predicted no better."""
+        """Whether it fails to improve the prediction of held-out readings, if there are any."""
         return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
 
 
 def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Correction:
-    """Correct a fit by the most telling basis.
+    """Correct a fit by the basis with the largest evidence.
 
     Parameters
     ----------
     found, problem
         The null, and its linearisation under the noise model found.
     bases
-        What may be missing.
+        The candidate bases.
     scan
-        Scan of each usable row, for keeping scans back, shape (n_points,).
+        Scan of each usable row, for holding scans out, shape (n_points,).
     """
     scores = bases.log_bayes_factors(problem)[:, 0]
-    # Among bases of about equal evidence the one of fewest columns: what needs an amplitude for each scan
-    # says nothing of the next scan.
+    # Among bases of about equal evidence, the one with the fewest columns: a basis with one amplitude per scan cannot
+    # predict the next scan.
     rivals = np.flatnonzero(scores > scores.max() - _ABOUT_EQUAL)
     columns = bases[min(map(int, rivals), key=lambda i: (int(bases.widths[i]), -float(scores[i])))]
     norms = np.sqrt(np.mean(columns**2, axis=0))
@@ -75,15 +75,15 @@ def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Cor
 def corrected(
     searched: Searched, test: GlobalTest, best: Best, *, rng: np.random.Generator
 ) -> tuple[Improvement, FloatArray]:
-    """Repair what the named effects leave by bases without a name, where that predicts held-out parts.
+    """Correct the residuals of the named effects by basis functions, if this improves held-out predictions.
 
-    One basis at a time, the most telling, until nothing more is missing or the next gains nothing. Where the first
-    gains nothing on other scans, blocks within scans are held out instead: of what is local in time.
+    Bases are added one at a time until the test passes or the next one gains nothing. If the first gains nothing on
+    other scans, blocks within scans are held out instead, for residuals that are local in time.
 
     Returns
     -------
     improvement, change
-        That of `best` with what the correction adds, and the correction of the usable readings, (n_usable,).
+        The improvement of `best` including the correction, and the correction of the usable readings, (n_usable,).
     """
     prepared, bases, problem = searched.prepared, searched.screening.unknown_bases, best.problem
     found, gain = best.fit.found, best.improvement
@@ -132,12 +132,12 @@ def corrected(
 def _without(
     found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit parameters and amplitudes to the rows kept; return residual and variance of the mean of the rows asked."""
+    """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean for `asked` rows."""
     sd, p = problem.sd, found.slopes.shape[1]
     design = np.concatenate([found.slopes, columns], axis=1)
     center = np.concatenate([-found.z, np.zeros(columns.shape[1])])
-    # Amplitudes start from a wide prior, then take their own common size as its scale (empirical Bayes):
-    # a scan that was never seen is as uncertain as the seen ones differ.
+    # Amplitudes first have a wide prior, then one with their own common size as scale (empirical Bayes): the
+    # uncertainty for a new scan equals the scatter of the known ones.
     size = sd * SCALES[5]
     for _ in range(3):
         precision = np.concatenate([np.ones(p), np.full(columns.shape[1], size**-2)])

@@ -1,4 +1,4 @@
-"""Posterior samples of what a search has refitted: of one hypothesis, or of all that the readings leave open."""
+"""Posterior samples of refitted hypotheses: of one, or averaged over those that remain possible."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from probewise.progress import Progress, silent
 
 __all__ = ["Drawn", "Ensemble", "draw_models"]
 
-_LEAST_OF_AN_ORDER = 0.2  # probability of an SSF order, below which the model does without it
-_LEAST_OF_A_RIVAL = 0.02  # probability of a hypothesis, below which the model does without it
+_LEAST_OF_AN_ORDER = 0.2  # probability below which an SSF order is left out of the average
+_LEAST_OF_A_RIVAL = 0.02  # probability below which a hypothesis is left out of the average
 _MOST = 6  # hypotheses in one model
-_LEAST_DOUBT = 0.1  # that what has no name is what it looks most like
-_DOUBT_BESIDE = 0.5  # of what has a name, where something that has none is beside it
+_LEAST_DOUBT = 0.1  # least weight of the null when an unknown effect is repaired by its most similar form
+_DOUBT_BESIDE = 0.5  # weight of the null for a named effect with an unknown effect beside it
 
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Samples under one noise model, of each hypothesis once.
+    """Cached posterior samples of hypotheses under one noise model.
 
-    What goes into one model has an SSF of one form: mixtures of any number of Gaussians, or the free form.
+    Models can be combined only if their SSFs are all mixtures of Gaussians, or all free forms.
     """
 
     searched: Searched
@@ -42,7 +42,7 @@ class Ensemble:
     _known: dict[tuple[Names, bool], ModelSamples] = field(default_factory=dict)
 
     def of(self, candidate: WeighedFit) -> ModelSamples:
-        """Draw from the posterior of a candidate's hypothesis, over all SSF orders of its form that matter."""
+        """Draw from the posterior of a candidate's hypothesis, averaged over its probable SSF orders."""
         key = candidate.names, candidate.found.model.sensor.exchangeable
         if key not in self._known:
             alike = self._of_form(candidate, candidate.names)
@@ -54,20 +54,20 @@ class Ensemble:
         return self._known[key]
 
     def likely(self, best: WeighedFit) -> dict[Names, float]:
-        """Weigh what one model can hold beside the best candidate: under its noise, by the form of its SSF."""
+        """Return the probabilities of the hypotheses that can be averaged with the best candidate."""
         out: dict[Names, float] = {}
         prepared = self.searched.prepared
         own = prepared.apparatus.own_effects(prepared.effects)
         for names in dict.fromkeys(names for _, names in self.searched.evidences.fits):
             log_z = [c.evidence[self.noise].log_z for c in self._of_form(best, names)]
-            # No file holds a person's own effect; their own model has it where it is best itself.
+            # A file cannot hold a user's own effect; it is kept only if it is in the best hypothesis.
             if log_z and not own & ({*names} - {*best.names}):
                 out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_mean(names)
         total = np.logaddexp.reduce(list(out.values()))
         return {names: math.exp(value - total) for names, value in out.items()}
 
     def averaged(self, best: WeighedFit, probabilities: Mapping[Names, float]) -> ModelSamples:
-        """Mix the samples of the best candidate with those of its rivals, by probability, as far as one model can."""
+        """Average the samples of the best candidate and its compatible rivals by probability."""
         kept = [(self.of(best), best, probabilities[best.names])]
         for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
             if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST:
@@ -82,7 +82,7 @@ class Ensemble:
         return over_hypotheses(parts, shares, null, self.searched.prepared.recording.plan, rng=self.rng)
 
     def _of_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
-        """List the refitted candidates of a combination whose SSF is of the form that the best one's is."""
+        """List the refitted candidates of a combination whose SSF has the best one's form."""
         form = best.found.model.sensor.exchangeable
         return [
             c
@@ -99,7 +99,7 @@ class Ensemble:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Posterior samples of the null, of the best hypothesis, and of the model that is handed on."""
+    """Posterior samples of the null, of the best hypothesis, and of the averaged model."""
 
     null: ModelSamples
     best: ModelSamples
@@ -115,10 +115,9 @@ def draw_models(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Drawn:
-    """Draw from the posterior of the repaired model, with what a verdict leaves open in its share.
+    """Draw from the posterior of the repaired model, averaged over hypotheses that the verdict leaves open.
 
-    The best hypothesis alone would be sure and, at times, wrong: what is unknown may not be what it looks like, and
-    what leads but little has rivals.
+    The best hypothesis alone would be overconfident if the effect is unknown, or if it leads by little.
     """
     ensemble, fit, null = Ensemble(searched, best.noise, rng, progress), best.fit, test.null
     model = samples = ensemble.of(fit)
@@ -135,7 +134,7 @@ def draw_models(
 
 
 def _left_open(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: Names) -> ModelSamples:
-    """Average over hypotheses where none is stated: what has a name may be it all the same, the rest is the null."""
+    """Average over hypotheses if none is stated: named ones by probability, and the null for the rest."""
     by_mean = searched.posterior.by_mean
     named = {names for _, names in searched.evidences.fits if not out_of_vocabulary(names)}
     fit = searched.best(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null

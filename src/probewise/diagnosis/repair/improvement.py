@@ -1,4 +1,4 @@
-"""What a repair gains over the null."""
+"""The gain of a repair over the null."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ N_DRAWS = 499
 
 @dataclass(frozen=True)
 class Improvement:
-    """What the repaired model gains over the null."""
+    """The gain of the repaired model over the null."""
 
     log_evidence: float
     heldout_log_density_per_reading: float
@@ -35,16 +35,16 @@ class Improvement:
 def improvement_of(
     searched: Searched, test: GlobalTest, best: WeighedFit, noise: Names, after: Linearised, *, rng: np.random.Generator
 ) -> Improvement:
-    """Measure what the best fit gains over the null: in evidence, on held-out parts, in what is left.
+    """Measure the gain of the best fit over the null: in evidence, on held-out parts, in residuals.
 
     Parameters
     ----------
     searched, test
-        What was weighed; the null.
+        Result of the search; test of the null.
     best, noise, after
-        The best fit, its noise model, and the two as a linear problem.
+        The best fit, its noise model, and its linearisation.
     rng
-        Source of randomness, for the null law of the test of what is left.
+        Random generator, for the null distribution of the test of the residuals.
     """
     null = test.null
     rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]

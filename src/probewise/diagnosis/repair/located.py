@@ -1,4 +1,4 @@
-"""Where the effects of a repair are, and where else the residual stands out."""
+"""Places of the effects of a repair, and of other significant residuals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def locate(
     *,
     rng: np.random.Generator,
 ) -> tuple[Place, ...]:
-    """Say where the effects of the repair are, the largest first; then where else the residual stands out.
+    """Locate the effects of the repair, the largest first; then other significant residuals.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def locate(
     sizes
         Lambda of each effect.
     rng
-        Source of randomness, for the null law of a second look at what only readings far out show.
+        Random generator, for the null distribution of a second test of residuals that only outlying readings show.
     """
     prepared, problem, law = searched.prepared, test.problem, test.problem.law
     covariates, residuals = searched.screening.covariates, test.null.found.residuals
@@ -52,7 +52,7 @@ def locate(
     scan_names = prepared.recording.plan.scan_names
     scanned = places(problem, covariates, scan_names, residuals, test.draws)
     if judged.verdict == "unknown" and not (named or scanned) and law.share:
-        # What only readings far out show is noise to a tail.
+        # Under heavy-tailed noise, residuals in outlying readings only are not significant.
         white = Linearised.of(test.null.found, law.plain())
         scanned = places(white, covariates, scan_names, residuals, white.draws(N_DRAWS, rng=rng))
     first: dict[str, Place] = {}

@@ -1,7 +1,7 @@
-"""A model's predictions about a point, to second order: what stands in for it where thousands of samples move.
+"""A second-order surrogate of a model's predictions about a point, for moving thousands of samples.
 
-The steps by which it is laid out are those of the posterior's approximation, so that it is an interpolation over the
-region that matters, not an extrapolation from a point. Changes of the readings that make no difference are left out.
+Its steps are those of the approximate posterior, so that it interpolates over the relevant region instead of
+extrapolating from a point. Negligible changes of the readings are left out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from probewise._arrays import FloatArray, IntArray
 
 __all__ = ["Quadratic"]
 
-_NEGLIGIBLE = 0.02  # noise sd, over all readings together: less of a change at one step is none
+_NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class Quadratic:
 
     @classmethod
     def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> Quadratic:
-        """Lay out: it is exact at every single step, back and forth, and at the sum of any two.
+        """Build the surrogate, exact at every single step in both directions and at the sum of any two.
 
         Parameters
         ----------
         predict
-            The model at so many steps, (n_samples, n_params) -> (n_samples, n_points).
+            The model as a function of steps, (n_samples, n_params) -> (n_samples, n_points).
         n_params
             Number of parameters, one step each.
         sd
@@ -59,6 +59,6 @@ class Quadratic:
         return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
 
     def amounts(self, e: FloatArray) -> FloatArray:
-        """Give the amount of each change, (n_samples, n_changes)."""
+        """Return the amount of each change, (n_samples, n_changes)."""
         first, second = self.pairs
         return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)

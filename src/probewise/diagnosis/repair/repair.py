@@ -1,4 +1,4 @@
-"""The repaired model beside the calibrated one: posterior samples, predictions, and what is gained."""
+"""The calibrated and the repaired model: posterior samples, predictions, and the gain."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Predicted", "Repair", "repair_of"]
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What a model predicts of every row, (n_points,), and what is left; NaN where there is no usable reading."""
+    """Predictions of every row and residuals, (n_points,); residuals are NaN without a usable reading."""
 
     readings: FloatArray
     residuals: FloatArray
@@ -43,11 +43,11 @@ class Repair:
     null, model
         The two models.
     improvement
-        What the second gains.
+        Gain of the second.
     before, after
-        What each predicts, of all rows.
+        Predictions of each, for all rows.
     by_rows
-        Whether what has no name is repaired by rows: `improvement` counts that, `model` does not carry it.
+        Whether an unknown effect is corrected by rows; `improvement` includes that, `model` does not.
     """
 
     null: ModelSamples
@@ -59,12 +59,12 @@ class Repair:
 
     @property
     def changes_predictions(self) -> bool:
-        """Whether the repaired model predicts otherwise than the calibrated one."""
+        """Whether the predictions of the repaired and the calibrated model differ."""
         return not np.array_equal(self.before.residuals, self.after.residuals, equal_nan=True)
 
     @property
     def left_open(self) -> dict[tuple[str, ...], float]:
-        """Share of the model's samples by which of the effects they hold that not all hold, largest first."""
+        """Shares of the model's samples by the effects that they contain and not all do, largest first."""
         absent = self.model.absent
         if not absent:
             return {}
@@ -72,7 +72,7 @@ class Repair:
         return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
 
     def carried_beside(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
-        """List what the model carries and is not stated: name, share of the samples, sentence."""
+        """List effects that the model contains but the verdict does not state: name, share of the samples, sentence."""
         out = []
         for effect in cast(Sequence[NamedEffect[Any]], self.model.chain.effects):
             values = self.model.columns(effect.name)
@@ -85,14 +85,14 @@ class Repair:
 
 
 def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: Drawn, change: FloatArray) -> Repair:
-    """Predict every row by both models, those that were not compared too.
+    """Predict every row with both models, including rows not used in the diagnosis.
 
     Parameters
     ----------
     prepared, test, best, drawn
         What was found.
     change
-        The correction of the usable readings by rows, (n_usable,); readings that were not compared have none.
+        The correction of the usable readings by rows, (n_usable,); unused readings have none.
     """
     null, fit = test.null.found, best.fit.found
     everything = prepared.everything

@@ -1,4 +1,4 @@
-"""The model that a diagnosis ends with: a chain with its effects, as posterior samples."""
+"""Posterior samples of a chain with its effects, the final model of a diagnosis."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ __all__ = ["ModelSamples", "sample_model"]
 
 N_SAMPLES = 500
 N_WALKERS = 250
-_MOVES = 6  # of samples of the posterior after a step
-# What stands in for it costs next to nothing.
+_MOVES = 6  # moves of posterior samples after a step
+# The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
 
@@ -44,9 +44,9 @@ class ModelSamples:
     """Equally weighted posterior samples of a chain with effects.
 
     `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
-    `effects` names all effects, those on the noise too, in the order of their columns; `nuisance` the
-    parameters that belong to this recording alone; `exchangeable` Gaussians are told by their mass; `absent` marks the
-    samples, (n_samples,), that do without an effect.
+    `effects` names all effects, including noise effects, in the order of their columns; `nuisance` the parameters of
+    this recording only; `exchangeable` Gaussians are ordered by mass; `absent` marks the samples, (n_samples,), without
+    an effect.
     """
 
     chain: Predictor
@@ -68,7 +68,7 @@ class ModelSamples:
         return self.theta[:, at]
 
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
-        """Make the sensor of it that predicts, drives the robot, and is written to sensor.json."""
+        """Convert to a FittedSensor, for predictions, the robot, and sensor.json."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
         from_chain = by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_step_mm(recording))
@@ -109,16 +109,15 @@ def sample_model(
     annealed: bool = True,
     progress: Progress = silent,
 ) -> ModelSamples:
-    """Draw from the posterior about a fit, under the noise model it was weighed with.
+    """Draw from the posterior about a fit, under its noise model.
 
-    From its Laplace approximation, and on from there by way of the model to second order: where the SSF has several
-    Gaussians the posterior is bent, and what the approximation alone draws predicts new angles worse by
-    tens of nats.
+    Samples of the Laplace approximation are annealed through a second-order surrogate: with several Gaussians the
+    posterior is curved, and samples of the Laplace approximation predict new angles worse by tens of nats.
 
     Parameters
     ----------
     found, noise
-        The fit and its evidence under a noise model; the model's nodes are drawn by their weight.
+        The fit and its evidence under a noise model, whose nodes are drawn by weight.
     recording
         What was fitted.
     weights
@@ -126,13 +125,13 @@ def sample_model(
     rng
         Source of randomness.
     annealed
-        Whether the samples are carried on to the posterior, or left as Laplace's approximation draws them.
+        Whether samples are annealed to the posterior, or left as draws of the Laplace approximation.
     progress
-        Told how far they are carried.
+        Called with the progress of annealing.
     """
     law, n_samples = noise.law, N_SAMPLES
     z = np.clip(_posterior_draws(found, noise, recording, annealed, progress, rng=rng), -FARTHEST, FARTHEST)
-    # What is not annealed is drawn for the effects' sake alone: the noise is then that of the fit.
+    # Samples that are not annealed serve for the effects only: their noise is that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
     sigma = law.scale(law(residuals.T))
@@ -157,7 +156,7 @@ def sample_model(
         sd = lattice_step_sd(recording.readings[recording.usable], float(theta[0, i]))
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
-    if law.flat:  # as each node of its law has it: beside rounding where that is an effect, else with it
+    if law.flat:  # sd at each noise node, without rounding if that is an effect, else including it
         each = [own.sigma * (1.0 if of_lattice else own.widening) for own in noise.nodes.laws]
         noise_sd = np.array(each)[nodes]
     else:
@@ -176,14 +175,14 @@ def _posterior_draws(
     *,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Draw coordinates, (N_SAMPLES, n_params): by Laplace, then carried to the posterior."""
+    """Draw coordinates, (N_SAMPLES, n_params), from the Laplace approximation, then anneal to the posterior."""
     law, model = noise.law, found.model
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
     sigma = law.scale(whitened)
     sd = max(float(sigma[0]) / math.sqrt(law.information), 1e-150)
     curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
-    # A step in a coordinate moves those behind it too, none before it. With the effects' first and the sensor's last,
-    # most steps leave the SSF's geometry alone, which a prediction of many at once makes use of.
+    # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps leave
+    # the SSF's geometry unchanged, which speeds up vectorised predictions.
     order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
     at, steps = np.ix_(order, order), np.empty_like(curvature)
     steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
@@ -216,12 +215,12 @@ def _posterior_draws(
 
 
 def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:
-    """Take out of a residual's sd what rounding to a step adds; what is left is known no better than the whole is."""
+    """Subtract the rounding variance from a residual's sd, down to the accuracy of the total."""
     return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
 def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw one effect's parameters about the nodes drawn, as far as half way to the next: (n_samples, n_params)."""
+    """Draw one effect's parameters uniformly about the drawn nodes, half way to the next: (n_samples, n_params)."""
     settings = noise.nodes.settings[:, noise.noise.columns_of(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
     if own is not None:

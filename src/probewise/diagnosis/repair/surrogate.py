@@ -1,4 +1,4 @@
-"""What stands in for a posterior about a point: predictions to second order under the law of the noise."""
+"""A surrogate of a posterior about a point: second-order predictions under the noise model."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ __all__ = ["Surrogate"]
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """The log density of coordinates z = center + e @ steps, by e, (n_samples, n_params).
+    """Log density of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
 
-    The noise is normal: of a law with a tail residuals are those of normal noise that say as much. `residual`
+    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-observations. `residual`
     (n_changes + 1,) and `changes` (n_changes + 1, n_changes) are whitened, in the axes of the space that they span,
     where a sum of squares has few terms.
     """
@@ -41,7 +41,7 @@ class Surrogate:
         readings: FloatArray,
         law: NoiseLaw,
     ) -> Self:
-        """Set predictions against readings, (n_points,)."""
+        """Build from predictions and readings, (n_points,)."""
         residual = law(readings - quadratic.center)[:, None]
         residual = law.as_normal(residual, np.maximum(law.scale(residual), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
@@ -49,7 +49,7 @@ class Surrogate:
         return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])
 
     def log_density(self, e: FloatArray) -> FloatArray:
-        """Prior and likelihood but for a constant, (n_samples,); minus infinity outside the prior's bounds."""
+        """Return the unnormalised log posterior, (n_samples,); minus infinity outside the prior's bounds."""
         z = self.center + e @ self.steps
         whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts(e).T
         height = log_likelihood_of_whitened(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)

@@ -1,1 +1,1 @@
-"""What residuals say by themselves: whether something is missing, where, and what no name stands for."""
+"""Residual analysis: global test, location in covariates, and basis functions for unknown effects."""

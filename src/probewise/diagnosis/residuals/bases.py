@@ -1,9 +1,8 @@
-"""What a mismatch that nobody has named may look like: bases over every covariate, by which it is found all the same.
+"""Basis functions over every covariate for effects out of vocabulary.
 
-A mismatch that depends on a covariate smoothly adds to the readings, multiplies the signal, or moves the sensor:
-smooth functions of the covariate alone, times the signal, and times the slope of the readings along the move.
-Others jump (change points), last for a while (windows), belong to a scan or an angle, or to what the sensor
-saw before.
+A mismatch that depends smoothly on a covariate adds to the readings, multiplies the signal, or displaces the sensor:
+smooth functions of the covariate, alone, times the signal, and times the slope of the readings along the motion. Others
+are steps (change points), windows, one value per scan or angle, or memory of earlier readings.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from probewise.diagnosis.residuals.covariate import Covariate
 
 __all__ = ["unknown_templates", "unlike_named"]
 
-_LIKE = 0.9  # cosine from which what has no name is what has one
+_LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _MOST_GROUPS = 24
 _FEW_SCANS = 6
 _MEMORIES = (3.0, 10.0, 30.0)  # readings
@@ -28,30 +27,30 @@ _MEMORIES = (3.0, 10.0, 30.0)  # readings
 
 @dataclass(frozen=True, eq=False)
 class _Ways:
-    """How a mismatch may act, each (n_points,): it adds, multiplies the signal, or moves the sensor along its axis."""
+    """Factors of the kinds of mismatch, (n_points,) each: additive, gain, displacement along the axis of motion."""
 
     adds: FloatArray
     gain: FloatArray
     shift: FloatArray
-    turned: FloatArray  # sign of the move
+    turned: FloatArray  # sign of the motion
     n_scans: int
 
 
 def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, starts: IntArray) -> Bank:
-    """Lay out the bases.
+    """Build the basis functions.
 
     Parameters
     ----------
     covariates
-        Those of the recording.
+        Covariates of the recording.
     signal, slope
-        Predicted reading above its least, and its slope along the move, (n_usable,).
+        Predicted reading above its minimum, and its slope along the motion, (n_usable,).
     starts
         First row of each scan among the usable ones.
 
     Returns
     -------
-    The bases, labelled by their family: families count alike, however many bases they hold.
+    The bases, labelled by family; families have equal prior weight, however many bases they hold.
     """
     sign = np.zeros(len(signal))
     for covariate in covariates:
@@ -67,10 +66,9 @@ def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope
 
 
 def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
-    """Leave out single bases of which what survives looks like that of a named effect, cosine 0.9 and more.
+    """Leave out bases whose projection has a cosine of 0.9 or more with that of a named effect.
 
-    A window that reaches to the end of the recording is a light that was switched on: what has a name
-    must not be found without it.
+    A window that extends to the end of the recording, for instance, is the effect of a light switched on.
     """
     single = np.flatnonzero(bases.widths == 1)
     if single.size == 0 or named.widths.size == 0:
@@ -84,7 +82,7 @@ def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
 
 
 def _family(covariate: Covariate, template: FloatArray) -> str:
-    """Set what is smooth apart from the many that are local, lest those outnumber it."""
+    """Return the family of a template; smooth bases are separate from the many local ones, to keep their weight."""
     where = covariate.name if covariate.scan is None else f"{covariate.name} within scans"
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
 
@@ -126,7 +124,7 @@ def _of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
         yield _smooth(covariate, ways.adds, 3)
         yield _spread(covariate.values[:, None], covariate, len(ways.adds))
         yield _spread(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
-    else:  # a column of the recording's own
+    else:  # a logged column of the recording
         for way in (ways.adds, ways.gain):
             yield _smooth(covariate, way, 3)
             yield _smooth(covariate, way, 8)
@@ -144,7 +142,7 @@ def _of_groups(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
 
 
 def _memories(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
-    """Remember what the sensor saw before in the scan: means that forget, over several times, and the most so far."""
+    """Yield memories of earlier readings in the scan: exponential averages with several constants, and the maximum."""
     held = np.empty((len(signal), len(_MEMORIES) + 1))
     keep = np.exp(-1 / np.array(_MEMORIES))
     first = np.zeros(len(signal), dtype=np.bool_)
@@ -161,7 +159,7 @@ def _memories(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
 
 
 def _ends(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
-    """Die away from where a scan begins, or grow to where it ends: in all scans alike, and in each by itself."""
+    """Yield decays from the start, and growths to the end, of a scan: common to all scans, and for each."""
     first = np.repeat(starts, np.diff(starts, append=n_points))
     last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
     rows = np.arange(n_points)
@@ -174,21 +172,21 @@ def _ends(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
 
 
 def _smooth(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
-    """Cosines of the covariate, finest where the way acts most: along the running share of its square."""
+    """Return cosines along the covariate, with resolution in proportion to the square of `way`."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     distinct, codes = np.unique(values, return_inverse=True)
     share = np.cumsum(np.bincount(codes, weight + 1e-3 * weight.mean()))
     if share[-1] == 0:
         return np.zeros((len(way), n_terms))
     along = (share / share[-1] - 0.5 * np.diff(share, prepend=0.0) / share[-1])[codes]
-    if covariate.name == "level":  # most readings are at its ends; what bends is between them
+    if covariate.name == "level":  # most readings are at its ends, but curvature shows in between
         along = 0.5 * along + 0.5 * (values - distinct[0]) / np.ptp(distinct)
     waves = np.cos(np.pi * along[:, None] * np.arange(0 if np.ptp(way) else 1, n_terms + 1))
     return _spread(waves * way[covariate.rows, None], covariate, len(way))
 
 
 def _steps(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator[FloatArray]:
-    """Change points, at even shares of what the way does."""
+    """Yield steps at change points with equal shares of the sum of `way` squared."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     order = np.argsort(values, kind="stable")
     share = np.cumsum(weight[order])

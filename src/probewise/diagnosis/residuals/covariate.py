@@ -1,4 +1,4 @@
-"""What a residual may depend on."""
+"""A covariate of residuals."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ __all__ = ["Covariate"]
 class Covariate:
     """One covariate of the usable rows.
 
-    `values` (n_usable,) in its unit; `rows` those usable rows it is defined for; `groups` says that
-    only whole groups of equal values make sense (an orientation, a scan). `scan` is the scan's name
-    where it is meant within one scan.
+    `values` (n_usable,) in its unit; `rows` the usable rows for which it is defined; `groups`: it is categorical (an
+    orientation, a scan); `scan`: the name of the scan to which it is restricted, or None.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""Is anything missing, and where? One global p-value, then windows over every covariate.
+"""Global p-value of a fit, and significant windows of residuals in every covariate.
 
-The null law of every statistic comes from the same pivotal bootstrap, r* = P eps: residuals of a linearised
-fit to pure noise, no refits. Every look is counted, because each draw takes every look too.
+The null distribution of every statistic comes from one pivotal bootstrap, r* = P eps: residuals of a linearised fit to
+pure noise, without refits. It accounts for multiple comparisons, because each draw is compared in the same ways.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from probewise.recordings.plan import Plan
 __all__ = ["ALARM", "Place", "global_p_value", "places", "places_of_effect", "windows"]
 
 ALARM = 0.01
-"""p-value below which something is missing."""
+"""p-value below which the model is incomplete."""
 
 _LEAST_ROWS = 3
-_RUNS = ("scan", "run")  # covariates whose values are the numbers of parts of the recording
-_SIGNIFICANT = 0.05  # share of its greatest strength
-_PLAIN = 0.25  # a share of the first draws from which more of them would change nothing
+_RUNS = ("scan", "run")  # covariates that number parts of the recording
+_SIGNIFICANT = 0.05  # of the maximum of an effect: below it, it is negligible
+_PLAIN = 0.25  # p-value of the first draws above which more draws are not needed
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A window of a covariate where the residual stands out, with its witness curve.
+    """A window of a covariate in which residuals are significant, with their mean curve.
 
-    `start`, `end` in the covariate's unit, None for a scan; the curve is the residual's mean in bins of
-    the covariate, with the noise sd of that mean. `values` (n_usable,) are the covariate's at each usable reading, NaN
-    where it has none, as the window was found in them; `without_effect` says that they are what would be read without
-    the effect that is there, of which the calibrated model does not know.
+    `start`, `end` in the covariate's unit, None for a scan; the curve is the mean residual in bins of the covariate,
+    with the noise sd of that mean. `values` (n_usable,) are the covariate at each usable reading, NaN if undefined, as
+    used for the window; `without_effect`: they are predicted readings without the effect, which the calibrated model
+    lacks.
     """
 
     covariate: str
@@ -68,22 +68,21 @@ class Place:
 
 
 def global_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:
-    """Test that nothing is missing from the mean: the sum of all Bayes factors against its null law.
+    """Test whether the mean is complete: the sum of all Bayes factors against its null distribution.
 
     Parameters
     ----------
     problem
         The fit under the noise model found.
     banks
-        Every template looked at, labelled by what it belongs to; labels count alike.
+        All templates compared, with labels; each label has equal weight.
     draws
-        Residuals under the null, shape (n_rows, n_draws). Where the first few show that nothing stands
-        out, the others are left alone.
+        Residuals under the null, shape (n_rows, n_draws). If the first few show no significance, the others are not
+        used.
 
     Returns
     -------
-    Probability, under the null, of at least what was seen. Beyond the draws' reach the
-    bound P(Bayes factor > b) < 1/b takes over.
+    The p-value. Below the resolution of the draws, it is the bound P(Bayes factor > b) < 1/b.
     """
     families = [(number, label) for number, bank in enumerate(banks) for label in bank.labels]
     names = list(dict.fromkeys(families))
@@ -134,7 +133,7 @@ def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple
     looked: set[tuple[int, int]] = set()
     while width >= _LEAST_ROWS and len(columns) <= 160:
         for first in sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width}):
-            # Equal values stay together: a window that parted them would select by something else.
+            # Equal values stay together: a window that split them would select by something else.
             low = int(edges[np.searchsorted(edges, first)])
             high = int(edges[np.searchsorted(edges, first + width)])
             if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
@@ -156,22 +155,22 @@ def places(
     *,
     largest_p: float = 0.05,
 ) -> list[Place]:
-    """Find the window of each covariate that stands out most, strongest first.
+    """Find the most significant window of each covariate, strongest first.
 
     Parameters
     ----------
     problem
         The fit under the noise model found.
     covariates
-        Where to look.
+        Covariates to search.
     scan_names
         Names of the scans, for the covariate `scan`.
     residuals
-        Reading minus prediction, (n_points,), for the witness curves.
+        Reading minus prediction, (n_points,), for the mean curves.
     draws
         Residuals under the null, (n_rows, n_draws).
     largest_p
-        Windows less surprising than this are not reported.
+        Windows with a larger p-value are not reported.
     """
     out: list[Place] = []
     norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_points)
@@ -215,24 +214,24 @@ def places_of_effect(
     size: float,
     sd: float,
 ) -> list[Place]:
-    """Say where a named effect is: where in a covariate it has half its strength.
+    """Locate a named effect: the interval of a covariate in which it exceeds half its maximum.
 
     Parameters
     ----------
     effect
-        The effect; one that is bound to scans is in those of them where it is significant.
+        The effect; one that is bound to scans is located in those in which it is significant.
     change
-        What it makes of the readings, (n_points,).
+        Its change of the readings, (n_points,).
     covariate
-        In which it shows.
+        Covariate in which to locate it.
     scans
-        The covariate `scan`, where there are several.
+        The covariate `scan`, if there are several.
     plan
         Of the readings.
     residuals
-        Of the null, (n_points,), for the witness curve.
+        Residuals of the null, (n_points,), for the mean curve.
     p_value, size
-        That nothing is missing, and lambda.
+        p-value of the global test, and lambda.
     sd
         Of the noise.
     """
@@ -247,7 +246,7 @@ def places_of_effect(
             for scan in _significant_scans(effect.scans, change, plan)
         ]
     strength = np.abs(change[covariate.rows])
-    # What sets in at a level is there from where it is first significant.
+    # An effect with a threshold in level begins where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]
     curve = _curve(covariate, residuals, sd)
@@ -256,7 +255,7 @@ def places_of_effect(
 
 
 def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
-    """Keep the scans in which something is significant, the strongest first: a plain sheet looks the same turned."""
+    """Return the scans in which a change is significant, strongest first; over a uniform sheet, there may be none."""
     rows = {scan: plan.scan == plan.scan_names.index(scan) for scan in scans}
     strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
     significant = [scan for scan in scans if strength[scan] >= _SIGNIFICANT * max(strength.values())]
@@ -264,7 +263,7 @@ def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> 
 
 
 def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
-    """Give the covariate at each reading, and the witness curve."""
+    """Return the covariate at each reading, and the curve of mean residuals."""
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:
         parts = [np.flatnonzero(values == value) for value in np.unique(values)]

@@ -1,7 +1,7 @@
-"""Do the readings that are far out lie together? Then they are no outliers.
+"""Test whether outlying readings cluster in a covariate, in which case they are not random outliers.
 
-A heavy tail takes whatever is wrong with a few readings, and says nothing of which. Where they all lie at one level, at
-one end of a scan or near an edge, something is missing there that shows in them alone.
+A heavy tail explains any few deviating readings. If they all lie at one level, at one end of a scan or near an edge, an
+effect is missing that changes only them.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from probewise.diagnosis.residuals.locate import windows
 __all__ = ["FAR_OUT", "outlying", "score_together"]
 
 FAR_OUT = ", far out"
-"""Ends the name of a family of what is unknown: by whatever readings far out lie together."""
+"""Suffix of the names of families of unknown effects in which outlying readings cluster."""
 
-_A = 0.5  # of the share of readings that are far out, a beta distribution of both parameters (Jeffreys)
+_A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffreys)
 
 
 def outlying(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
-    """Probability of each reading to be in the tail of a law, (n_points,)."""
+    """Return the probability that each reading is in the tail of the noise distribution, (n_points,)."""
     whitened = law(residuals)
     return Tail(law.share, law.times).wide((whitened / law.scale(whitened[:, None])[0]) ** 2)
 
 
 def score_together(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
-    """Weigh that more, or fewer, are far out in some window of a covariate against one share for all.
+    """Return log Bayes factors for a different share of outlying readings in a window of a covariate.
 
     Parameters
     ----------
     far_out
-        Probability of each reading to be far out, (n_points,).
+        Probability of each reading to be outlying, (n_points,).
     covariates
-        What the share may depend on.
+        Covariates to test.
 
     Returns
     -------

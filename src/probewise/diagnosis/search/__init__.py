@@ -1,1 +1,1 @@
-"""Which hypotheses are true: prior odds, refits, what has been weighed, and the second weighing by nested sampling."""
+"""Search for the best hypotheses: refits, evidences, and a second evidence by nested sampling."""

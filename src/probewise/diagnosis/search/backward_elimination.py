@@ -14,8 +14,8 @@ __all__ = ["eliminate_backward"]
 def eliminate_backward(state: SearchState) -> None:
     """Refit the leading combinations less one effect, and select forward from there.
 
-    What screening put first may be superfluous, or have stood for another effect while there was but one. And the
-    scans that an effect is bound to, or the place it is at, were chosen while it stood for both.
+    An effect selected first may be superfluous, or may have stood in for another one; its scans or place were then
+    chosen for both.
     """
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.odds(c))
     named = [c for c in several if not out_of_vocabulary(c.names)]
@@ -32,7 +32,7 @@ def eliminate_backward(state: SearchState) -> None:
 
 
 def _select_again(state: SearchState, held: WeighedFit, names: Names) -> None:
-    """Refit a candidate with what makes it these names, and with what leads beside it."""
+    """Extend a candidate to these names, and by the effects that lead beside it."""
     proposals = proposals_for(state, held, {})
     chosen = [names, *promising(state, proposals, width=SWAPPED, behind=STEERING)[:SWAPPED]]
     for added in [proposals[key].added for key in chosen if key in proposals]:

@@ -1,4 +1,4 @@
-"""What bounds a search, each with the measurement that chose it; where none is named, none is known.
+"""Limits of a search, each with the measurement that chose it, if there is one.
 
 Most bounds limit the cost: what they leave out was not shown to be wrong. Together they are measured by the concealed
 recordings (docs/explanation/diagnosis-measured.md); hardly one was varied by itself.

@@ -1,4 +1,4 @@
-"""What may be wrong with a recording's noise: the noise models that compete, and how probable each is."""
+"""The competing noise models of a recording, with their prior probabilities."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from probewise.recordings.plan import Recording
 
 __all__ = ["Noises"]
 
-_TWO_MEMORIES = {CorrelatedNoise.name, RandomWalk.name}  # one law of the noise carries one of them
+_TWO_MEMORIES = {CorrelatedNoise.name, RandomWalk.name}  # a noise distribution can contain only one of them
 
 
 @dataclass(eq=False)
 class Noises:
-    """The noise models of one recording: each fault alone, and two or three where one or two stand out.
+    """The noise models of one recording: each noise effect alone, and pairs and triples if fewer are significant.
 
-    `certain` are effects on the noise that the readings show without doubt, in every model of `models`; `least_sd` is
-    the least believable sd of a reading.
+    `certain` are noise effects that the readings show beyond doubt, part of every model; `least_sd` is the least
+    plausible sd of a reading.
     """
 
     recording: Recording
@@ -43,7 +43,7 @@ class Noises:
     def __post_init__(self) -> None:
         self.least_sd = least_sd(self.recording)
         self._step = lattice_step(self.recording.readings[self.recording.usable])
-        # That all readings are multiples of a coarse step is no chance; an effect it is where nobody declared it.
+        # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
         self.certain = (Quantisation.name,) if Quantisation.name in self.effects and seen else ()
         self._hidden = hides_the_noise(self._step, self.recording)
@@ -52,7 +52,7 @@ class Noises:
         self.models = {names: self._model(names) for names in single}
 
     def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None) -> NoiseModel:
-        # What is certain is not asked again about each fit, whose own residual may be larger.
+        # Certain effects are not re-estimated about each fit, whose own residual may be larger.
         known = {name: (np.array([[self._step]]), np.zeros(1)) for name in self.certain}
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
@@ -63,24 +63,24 @@ class Noises:
         return self.prior.log_noise(self._uncertain(names))
 
     def over_all(self, log_z: Mapping[Names, float]) -> float:
-        """Give the log evidence under whatever noise, from that under each model; of none it is minus infinity."""
+        """Return the log evidence averaged over noise models; minus infinity for none."""
         values = [value + self.log_prior(names) for names, value in log_z.items()]
         return float(logsumexp(values)) if values else -math.inf
 
     def weigh(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        """Weigh a fit under every model."""
+        """Compute the evidence of a fit under every noise model."""
         return {names: weigh(found, model) for names, model in self.models.items()}
 
     def best(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
-        """Give the evidence of the most probable model."""
+        """Return the evidence under the most probable noise model."""
         return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
 
     def pair_up(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
-        """Where one fault stands out about a fit, add the pairs that rival it, and where a pair does, what rivals that.
+        """If a noise effect is significant about a fit, add the pairs with it; if a pair is, the triples.
 
         Returns
         -------
-        Whether it was looked for.
+        Whether pairs were tried.
         """
         known, singles = dict(evidence), list(evidence)
         for size in range(1, MOST_FAULTS):

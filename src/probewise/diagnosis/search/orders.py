@@ -17,9 +17,9 @@ __all__ = ["at_other_orders"]
 
 
 def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
-    """Refit the most probable combinations wherever that is worth it.
+    """Refit the most probable combinations at other plausible SSF orders.
 
-    What has no name may lead at an order at which no name was tried yet: that must not keep the names from it.
+    An unknown effect may lead at an order at which no named effect was tried; named ones must then be tried there.
     """
     known = sum(p for names, p in by_mean.items() if names != ("unknown",))
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
@@ -33,14 +33,14 @@ def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
 
 
 def _rival_orders(state: SearchState, source: WeighedFit) -> list[int]:
-    """List the SSF orders at which what is refitted at one is worth another refit."""
+    """List the SSF orders at which a combination fitted at one order is worth refitting."""
     own = state.candidates[source.n_gaussians, ()].log_z
     behind = own - REFITTED_WITHIN
     return [
         n
         for n, sensor in state.sensors.items()
         if (n, source.names) not in state.candidates
-        # A freer SSF that does not pay by itself does not pay beside an effect.
+        # A freer SSF that the evidence rejects by itself is also rejected with an effect.
         and (sensor.degrees_of_freedom < source.degrees_of_freedom or state.candidates[n, ()].log_z > behind)
         and (sensor.degrees_of_freedom <= source.degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
     ]

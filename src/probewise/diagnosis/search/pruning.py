@@ -1,4 +1,4 @@
-"""Prune what is out of vocabulary where the readings do not tell it from a name."""
+"""Prune combinations out of vocabulary that are aliased with named ones."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ Key = tuple[int, Names]
 
 
 def prune(candidates: Mapping[Key, WeighedFit], noises: Noises) -> tuple[dict[Key, WeighedFit], set[Names]]:
-    """Leave out or put back what has no name beside names of no more effects.
+    """Drop or penalise combinations out of vocabulary that compete with named ones of no more effects.
 
-    Where the readings are not expected to tell the two, it is left out. Where they have told it by less, a push of
-    three parameters from a tilt of two, it is believed no more than the name is: what it has found beyond that may be
-    noise.
+    If the readings are not expected to separate the two, the unnamed one is dropped. If its observed lead is smaller
+    than that, its evidence is reduced to that of the named one: the lead may be noise.
 
     Returns
     -------

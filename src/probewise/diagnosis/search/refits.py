@@ -1,4 +1,4 @@
-"""Refit jointly and non-linearly, weigh by Laplace's approximation: a model, or a candidate with one more effect."""
+"""Joint nonlinear refits with Laplace evidence: of a model, or a candidate with one more effect."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from probewise.effects import NamedEffect
 
 __all__ = ["Refits", "is_significant"]
 
-_SAME_START = 0.1  # of a coordinate, whose prior has an sd of one: a start no farther from another leads where it does
+_SAME_START = 0.1  # in prior sds: starts that are closer together are duplicates
 
 
 @dataclass(frozen=True, eq=False)
 class Refits:
-    """How a recording is fitted: with what is believed of its `sensor`, under which noises, about which templates."""
+    """How a recording is fitted: prior of the sensor, noise models, templates."""
 
     sensor: Null | None
     noises: Noises
     templates: TemplateMemory
 
     def law_of(self, candidate: WeighedFit) -> NoiseLaw:
-        """Give the most probable law of the noise about a fit."""
+        """Return the most probable noise distribution about a fit."""
         return self.noises.best(candidate.evidence).law
 
     def weighed(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> WeighedFit:
-        """Fit under a law of the noise, weigh under every noise model, refit where another one is more probable."""
+        """Fit under one noise distribution, compute the evidence under all, and refit if another is more probable."""
         found = self._fit(model, starts, law, max_steps)
         for _ in range(2):
             evidence = self.noises.weigh(found)
@@ -59,7 +59,7 @@ class Refits:
     def extended(
         self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0
     ) -> tuple[WeighedFit, dict[Names, float]]:
-        """Refit with one more effect, in the likely ones of its variants.
+        """Refit with one more effect, for its likely variants.
 
         Returns
         -------
@@ -79,16 +79,17 @@ class Refits:
         problem = Linearised.of(parent.found, self.law_of(parent))
         scores = scores_about(problem)
         weights = templates.weights(scores)
-        # What a tail has made of a few readings that an effect moves is noise, and stays so from a start under its law.
+        # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
+        # too.
         plain = self._plainly(parent, problem)
         seen = [(problem, scores), *((about, scores_about(about)) for about in plain)]
         likeliest = (int(np.argmax(templates.weights(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_worth_trying(templates, weights), *likeliest]))
         refitted = [self._of_variant(parent, effect, templates, k, seen) for k in tried]
-        # What refits have shown of variants counts for more than what screening promised.
+        # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
-        if np.isfinite(log_z[best]):  # else no variant could be fitted, and none is likelier than before
+        if np.isfinite(log_z[best]):  # otherwise no variant could be fitted, and weights are unchanged
             weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
             weights[tried] = np.exp(log_z - log_z[best])
             weights /= weights.sum()
@@ -97,7 +98,7 @@ class Refits:
         return refitted[best].as_share(log_share, {**parent.weights, effect.name: weights}), by_noise
 
     def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
-        """Go a few steps from each start, then all the way from the best."""
+        """Take a few steps from each start, then converge from the best."""
         recording = self.noises.recording
         if len(starts) > 1:
             best = min(fits(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
@@ -114,7 +115,7 @@ class Refits:
         variant: int,
         seen: Sequence[tuple[Linearised, FloatArray]],
     ) -> WeighedFit:
-        """Refit with one variant of one more effect, from the entries of its bank that score best under each law."""
+        """Refit with one variant of one more effect, from its best bank entries under each noise distribution."""
         own = np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
         ranked = [(about, scores, own[np.argsort(-scores[own])]) for about, scores in seen]
@@ -124,25 +125,26 @@ class Refits:
             columns = templates.columns[at]
             amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
             setting = effect.start(templates.settings[at], amount)
-            # What has no amplitude is there as a whole; to first order as much of it as the readings ask for.
+            # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
+            # one.
             for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
                 z = parent.found.z + about.absorbed(parent.found, columns @ taken)
                 start = np.concatenate([z, model.scores_of(setting[None, :])[0]])
                 if all(np.abs(start - other).max() > _SAME_START for other in starts):
                     starts.append(start)
         if self.sensor is not None and len(self.sensor.starts) > 1:
-            # A null with several basins: with the effect the best may be another one than without.
+            # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
         return self.weighed(model, np.stack(starts), seen[0][0].law)
 
     def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
-        """Lay a fit out under the plainest law of the noise, where that is another one."""
+        """Linearise a fit under the simplest noise distribution too, if it is a different one."""
         plain = parent.evidence[self.noises.certain].law
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
 
 
 def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
-    """Tell whether an added effect is significant: the fit improves by more than a parameter's fair share."""
+    """Return whether an added effect is significant: the fit improves by more than expected per parameter."""
     law = candidate.law
 
     def misfit(found: Fit) -> float:
@@ -153,9 +155,9 @@ def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
 
 
 def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:
-    """Choose which of an effect's variants are refitted: the leader, and the next where they are bound to scans.
+    """Choose the variants of an effect to refit: the leading one, and the next if they are bound to scans.
 
-    Two scans of opposite ways look the same to first order; which was turned by 30 degrees shows in a refit.
+    Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees.
     """
     first, *others = np.argsort(-weights)[:2].tolist()
     bound = templates.variants[first].scans or templates.variants[first].patterns

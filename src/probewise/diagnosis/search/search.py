@@ -1,8 +1,7 @@
-"""Score, weigh, combine: find the set of effects that explains the recording.
+"""Search for the set of effects that explains the recording.
 
-Every subset of effects on the mean, under every noise model and several SSF orders, and whatever has no
-name beside each of them. Templates screen, a beam of the best is refitted jointly and non-linearly,
-Laplace weighs.
+Hypotheses are subsets of effects on the mean, under every noise model and several SSF orders, with or without an
+unknown effect. Templates screen them; a beam of the best is refitted jointly and nonlinearly, with Laplace evidences.
 """
 
 from __future__ import annotations
@@ -53,21 +52,21 @@ def search(
     depth: int = 3,
     progress: Progress = silent,
 ) -> Searched:
-    """Weigh every combination of effects.
+    """Compute the evidence of combinations of effects.
 
     Parameters
     ----------
     prepared
-        What is to be diagnosed.
+        Input of the diagnosis.
     prior
-        Prior odds; the apparatus's by default.
+        Prior odds; by default those of the apparatus.
     max_order
-        Largest number of Gaussians tried without a null; one more where that is not far behind. By default three, of
-        few readings one.
+        Largest number of Gaussians tried without a given null, plus one if it is not far behind. Default: three, or one
+        for few readings.
     beam, depth
-        How many combinations of each size above one are refitted, and the largest size.
+        Number of combinations refitted at each size above one, and the largest size.
     progress
-        Told of every refit.
+        Called at every refit.
     """
     recording, effects = prepared.recording, prepared.effects
     if max_order is None:
@@ -93,7 +92,7 @@ def search(
     if prepared.null is not None:
         _refit_null(state)
     eliminate_backward(state)
-    # Beside a form of the SSF that the readings refute, it is the form that is missing.
+    # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
     unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
     for k in range(MOST_REFITTED_LATE):
         progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
@@ -123,7 +122,7 @@ def search(
 
 
 def _refit_null(state: SearchState) -> None:
-    """Fit the null once more from where the best fits of one effect lie, whose gain may be but a deeper valley."""
+    """Refit the null from the best fits of one effect, whose gain may be due to a better mode of the null."""
     null = state.null
     single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
     for candidate in sorted(single, key=lambda c: -c.log_z)[:NULL_TRIED_AGAIN]:
@@ -136,7 +135,7 @@ def _log_z(candidate: WeighedFit) -> float:
 
 
 def _unknown(state: SearchState, prepared: Prepared) -> Unknown:
-    """Build what has no name about the best null."""
+    """Build the basis functions of unknown effects about the best null."""
     null, recording = state.null, prepared.recording
     covariates, slope = prepared.apparatus.covariates(null.found, recording)
     level = null.found.predicted

@@ -1,4 +1,4 @@
-"""What a search comes to: the evidence of every hypothesis, and what to believe of it."""
+"""The result of a search: evidence and posterior probability of every hypothesis."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ __all__ = ["Evidences", "Posterior", "Screening", "Searched", "posterior_of"]
 
 @dataclass(frozen=True, eq=False)
 class Evidences:
-    """Log evidence of what was weighed.
+    """Log evidences of hypotheses.
 
-    Hypotheses are pairs (mean, noise) of names; the mean ("unknown",) is what has no name, alone or beside others.
+    Hypotheses are pairs (mean, noise) of names; the mean ("unknown",) is an unknown effect, alone or beside others.
 
     Parameters
     ----------
@@ -39,9 +39,9 @@ class Evidences:
     screened
         The rest, by templates: (mean, noise) -> log evidence.
     unknown
-        Something unknown beside fits: (SSF order, mean, noise) -> log evidence.
+        Unknown effects beside fits: (SSF order, mean, noise) -> log evidence.
     unknown_shares
-        How much of that each family of bases has.
+        Share of each family of bases in it.
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
@@ -50,14 +50,14 @@ class Evidences:
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
     def names_more(self, order: int, names: Names, noise: Names) -> bool:
-        """Tell whether a combination explains more than something unknown does beside it."""
+        """Return whether a combination explains more than an unknown effect beside it."""
         if not names or (order, ()) not in self.fits:
             return False
         named = self.fits[order, names].evidence[noise].log_z
         return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
 
     def known_as(self, mean: Names) -> Names:
-        """Name a combination as a person is told it: what has no name is unknown, unless what has one explains more."""
+        """Return a combination's reported name: unknown if out of vocabulary, unless its named part explains more."""
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
             return mean
@@ -84,11 +84,11 @@ class Evidences:
         return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
     def _log_z(self, names: Names) -> float:
-        """Give the most evidence of a refitted combination; minus infinity where it was not refitted."""
+        """Return the largest log evidence of a refitted combination; minus infinity if it was not refitted."""
         return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
     def moved(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
-        """Move the evidence of fits, and of what is unknown beside them, under every noise model alike."""
+        """Shift the log evidence of fits, and of unknown effects beside them, equally under every noise model."""
         fits = {key: fit.moved(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
         unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in self.unknown.items()}
         return replace(self, fits=fits, unknown=unknown)
@@ -103,14 +103,14 @@ class Posterior:
 
     @property
     def by_mean(self) -> dict[Names, float]:
-        """Probability of each hypothesis about the mean, under any noise."""
+        """Probability of each hypothesis on the mean, marginalised over noise models."""
         out: dict[Names, float] = {}
         for (mean, _), p in self.probabilities.items():
             out[mean] = out.get(mean, 0.0) + p
         return out
 
     def noise(self, stated: Names | None = None) -> Names:
-        """Find the most probable noise model, of all or of those that hold what is stated of the vocabulary."""
+        """Return the most probable noise model, of all or of those that contain the `stated` effects."""
         marginal: dict[Names, float] = {}
         for (_, noise), p in self.probabilities.items():
             if stated is None or in_vocabulary(noise) == stated:
@@ -119,18 +119,18 @@ class Posterior:
 
 
 def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
-    """Turn evidences into probabilities, summed over SSF orders.
+    """Convert evidences to probabilities, summed over SSF orders.
 
     Parameters
     ----------
     evidences
-        Of what was weighed.
+        Log evidences.
     prior
         Prior odds.
     certain
-        Effects on the noise that the readings show without doubt.
+        Noise effects that the readings show beyond doubt.
     n_forms
-        Number of SSF orders that were fitted, each as probable as the others.
+        Number of fitted SSF orders, with equal prior probability.
     """
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), fit in evidences.fits.items():
@@ -138,7 +138,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
             log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
     log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
-        # What is named stays named when something smaller is left.
+        # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.names_more(n, names, noise) else ("unknown",)), noise
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
     for (names, noise), value in evidences.screened.items():
@@ -158,10 +158,9 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """What the tests look with: templates of effects, all about one fit, and bases of the unknown.
+    """Templates for the tests: effects, about one fit, and basis functions of unknown effects.
 
-    About one fit, since those of one recording predict much the same, and which templates a test looks with is its own
-    choice.
+    One fit suffices, since all fits to a recording predict much the same, and a test is valid with any templates.
     """
 
     templates: TemplateMemory
@@ -172,22 +171,22 @@ class Screening:
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """Everything weighed, and what it comes to.
+    """Result of a search.
 
     Parameters
     ----------
     prepared
-        What was searched.
+        Input of the search.
     prior
         Prior odds.
     noise_models, certain
-        The models of the noise, by names; and the effects on it that the readings show without doubt.
+        Noise models by names; and the certain noise effects.
     nulls
         The null by SSF order.
     screening
-        What the tests look with.
+        Templates for the tests.
     evidences, posterior
-        Of all hypotheses.
+        Evidences and probabilities of all hypotheses.
     """
 
     prepared: Prepared
@@ -200,12 +199,12 @@ class Searched:
     posterior: Posterior
 
     def with_evidences(self, evidences: Evidences) -> Searched:
-        """Take other evidences, and what they come to."""
+        """Return the search with other evidences and the resulting probabilities."""
         posterior = posterior_of(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
         return replace(self, evidences=evidences, posterior=posterior)
 
     def by_prior_alone(self) -> Searched:
-        """Believe what was believed before, where the readings say nothing, whatever the evidence makes of them."""
+        """Return the search with prior probabilities, for readings without information."""
         effects = self.prepared.effects
         on_mean = [name for name in effects if name not in self.prepared.on_noise and not out_of_vocabulary((name,))]
         probabilities = self.prior.alone(on_mean, self.certain)
@@ -217,7 +216,7 @@ class Searched:
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 
     def aliased_with(self, names: Names) -> frozenset[Names]:
-        """Give the other combinations that these readings cannot tell from this one, at any SSF order; () has none."""
+        """Return the combinations aliased with this one, at any SSF order; () has none."""
         fits = self.evidences.fits
         return frozenset(
             key
@@ -227,7 +226,7 @@ class Searched:
         )
 
     def beside(self, noise: Names) -> WeighedFit | None:
-        """Give the fit beside which something unknown most probably is; None where nothing unknown was weighed."""
+        """Return the fit beside which an unknown effect is most probable; None if none was considered."""
         scores = {
             (n, names): value + self.prior.log_unknown(names)
             for (n, names, own), value in self.evidences.unknown.items()
@@ -236,7 +235,7 @@ class Searched:
         return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
 
     def named_beside_unknown(self) -> dict[str, float]:
-        """Give, if something is unknown, the probability that each named effect stands beside it."""
+        """Return the probability of each named effect, given that there is an unknown effect."""
         scores = {
             (names, noise): value
             + self.prior.log_unknown(names)
@@ -253,14 +252,14 @@ class Searched:
         return out
 
     def looks(self, found: Fit) -> list[Bank]:
-        """List every template that a test looks at about a fit: of the effects that it lacks, and the unknown."""
+        """Return all templates for testing a fit: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]
         return [self.screening.templates.bank(self.screening.about, missing), self.screening.unknown_bases]
 
     @property
     def order(self) -> int:
-        """SSF order of the most probable explanation, named or not: that at which the null is tested."""
+        """SSF order of the most probable explanation, named or not, at which the null is tested."""
         by_order: dict[int, float] = {}
         terms = [(n, fit.log_z + self.prior.log_mean(names)) for (n, names), fit in self.evidences.fits.items()]
         for (n, names, _), value in self.evidences.unknown.items():
@@ -275,7 +274,7 @@ class Searched:
         return self.evidences.fits[self.order, ()]
 
     def leading_out_of_vocabulary(self) -> Names:
-        """Name the leading refitted combination with something out of vocabulary, if it leads what is unknown."""
+        """Return the leading combination out of vocabulary, if it leads among the unknown hypotheses; else ()."""
         by_mean = self.posterior.by_mean
         own = {names: p for names, p in by_mean.items() if out_of_vocabulary(names)}
         refitted = {names for _, names in self.evidences.fits}
@@ -283,7 +282,7 @@ class Searched:
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
 
     def shares_of_the_unknown(self) -> dict[str, float]:
-        """Share what is unknown out over effects out of vocabulary, and over covariates for what has no formula."""
+        """Return the probabilities of an unknown effect's forms: effects out of vocabulary, and families of bases."""
         by_mean = self.posterior.by_mean
         unknown = by_mean.get(("unknown",), 0.0)
         shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}

@@ -1,4 +1,4 @@
-"""All that one search has fitted and screened so far: candidates by SSF order and names, and how another is added."""
+"""The state of a search: candidates by SSF order and names, and how another is added."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ __all__ = ["SearchState", "rivals_of"]
 
 @dataclass(eq=False)
 class SearchState:
-    """The memory of a search, filled as it goes on.
+    """The mutable state of a search.
 
     Parameters
     ----------
     effects
-        On the mean, by name.
+        Effects on the mean, by name.
     prior
         Prior odds.
     noises
         The noise models.
     templates
-        Of effects about fits.
+        Cache of templates of effects about fits.
     refits
-        How the recording is fitted.
+        Fits of the recording.
     tried_always
-        Effects that are refitted alone whatever screening says of them.
+        Effects that are always refitted alone, whatever their screening score.
     progress
-        Told how far the search is.
+        Progress function.
     is_over
-        Whether no further combination can be refitted.
+        Function that returns whether the budget of refits is spent.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
@@ -61,47 +61,47 @@ class SearchState:
     sensors: dict[int, Null] = field(default_factory=dict)
     """By SSF order."""
     about_null: dict[tuple[Names, Names], float] = field(default_factory=dict)
-    """Log evidence of (mean, noise) by screening about a null."""
+    """Log evidence of (mean, noise), by screening about a null."""
     about_parts: dict[tuple[Names, Names], float] = field(default_factory=dict)
-    """The same about a fit that holds all of the mean but one effect."""
+    """The same, about a fit with all but one of the effects."""
     undetected: set[Names] = field(default_factory=set)
-    """Combinations of which a refit has shown that one effect does nothing."""
+    """Combinations in which a refit has shown one effect to be insignificant."""
     extended: set[tuple[WeighedFit, str]] = field(default_factory=set)
-    """What was refitted: from which candidate, with which effect more."""
+    """Refits done: candidate and added effect."""
     pruned: set[Names] = field(default_factory=set)
-    """Combinations without a name that are not to be told from what has one."""
+    """Combinations out of vocabulary that are aliased with named ones."""
 
     @property
     def nulls(self) -> list[WeighedFit]:
-        """List the candidates without effects, one an SSF order."""
+        """List the candidates without effects, one per SSF order."""
         return [c for (_, names), c in self.candidates.items() if not names]
 
     @property
     def null(self) -> WeighedFit:
-        """The best of them."""
+        """The most probable candidate without effects."""
         return max(self.nulls, key=lambda c: c.log_z)
 
     @property
     def refitted(self) -> set[Names]:
-        """Combinations that are candidates, at any order."""
+        """Refitted combinations, at any order."""
         return {names for _, names in self.candidates}
 
     def of(self, names: Names) -> list[WeighedFit]:
-        """List the candidates of one combination, one an SSF order."""
+        """List the candidates of one combination, one per SSF order."""
         return [c for (_, key), c in self.candidates.items() if key == names]
 
     def odds(self, candidate: WeighedFit) -> float:
-        """Log evidence of a candidate and log prior odds of its effects."""
+        """Return the sum of a candidate's log evidence and the log prior odds of its effects."""
         return candidate.log_z + self.prior.log_mean(candidate.names)
 
     def bank(self, null: WeighedFit) -> Bank:
-        """Lay out the templates of all effects about a null."""
+        """Return the templates of all effects about a null."""
         return self.templates.bank(null.found, list(self.effects.values()))
 
     def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
-        """Give the nats against effects beside an SSF of so few degrees of freedom, where the null alone takes more.
+        """Return the penalty in nats of effects with an SSF of fewer degrees of freedom than the null alone needs.
 
-        Averaged over the null's orders: what an order wins by chance, by a fraction of a nat, must not count whole.
+        It is averaged over the null's orders, so that a small chance lead of one order has little effect.
         """
         nulls = self.nulls
         log_z = np.array([c.log_z for c in nulls])
@@ -111,16 +111,16 @@ class SearchState:
         )
 
     def keep(self, candidate: WeighedFit) -> WeighedFit:
-        """Take a candidate in, in the place of the one it had."""
+        """Store a candidate, replacing an earlier one of the same kind."""
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
     def refit(self, parent: WeighedFit, added: str) -> WeighedFit | None:
-        """Refit a candidate with one more effect and keep the best of its kind, or note that it is not significant.
+        """Refit a candidate with one more effect and keep the best of its kind, or record that it is insignificant.
 
         Returns
         -------
-        The best candidate of that kind, an earlier one perhaps; None where there is none.
+        The best candidate of that kind, possibly an earlier one; None if there is none.
         """
         against = 0.0 if parent.names else self.complexity_penalty(parent.degrees_of_freedom)
         if self.is_over():
@@ -128,7 +128,7 @@ class SearchState:
         self.extended.add((parent, added))
         try:
             candidate, scores = self.refits.extended(parent, self.effects[added], against)
-        except NotConvergedError:  # from every start its model runs away
+        except NotConvergedError:  # its model diverges from every start
             names = tuple(sorted((*parent.names, added)))
             self.about_parts |= {(names, noise): e.log_z - against for noise, e in parent.evidence.items()}
             self.undetected.add(names)
@@ -147,7 +147,7 @@ class SearchState:
         return None
 
     def reach(self, names: Names) -> None:
-        """Refit a combination, from the largest of its parts that is."""
+        """Refit a combination, starting from its largest refitted subset."""
         parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
         held = max(parts, key=lambda c: (len(c.names), c.log_z))
         for added in [n for n in names if n not in held.names]:
@@ -161,10 +161,10 @@ class SearchState:
             held = extended
 
     def screened(self) -> dict[tuple[Names, Names], float]:
-        """Give the log evidence of what was not refitted, by screening.
+        """Return the log evidence of combinations that were not refitted, by screening.
 
-        About a fit that holds part of it a combination is judged better than about the null; there, what
-        refits have made of its parts since is put right.
+        Screening about a fit with part of the effects is more accurate than about the null; the latter is corrected for
+        refits of its parts.
         """
         refitted = self.refitted
         out = {}
@@ -180,5 +180,5 @@ class SearchState:
 
 
 def rivals_of(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
-    """List those that a combination competes with: what has no name does not keep names from being tried."""
+    """List the candidates that a combination competes with: named ones do not compete with unnamed ones."""
     return [c for c in among if out_of_vocabulary(names) or not out_of_vocabulary(c.names)]

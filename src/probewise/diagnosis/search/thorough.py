@@ -1,7 +1,7 @@
-"""Weigh the leading hypotheses again by nested sampling, and let it win where Laplace's approximation fails.
+"""Recompute the evidence of the leading hypotheses by nested sampling, which replaces Laplace's where that fails.
 
-The same joint model, priors and law of the noise as `probewise.diagnosis.evidence.laplace`; what differs is the
-integral over the parameters: here the whole prior is searched, there the posterior is taken for one Gaussian peak.
+Model, priors and noise are those of `probewise.diagnosis.evidence.laplace`; only the integral over the parameters
+differs: here over the whole prior, there for one Gaussian mode.
 """
 
 from __future__ import annotations
@@ -33,50 +33,49 @@ __all__ = ["weigh_thoroughly"]
 
 N_LIVE = 100
 
-_LEAST, _MOST = 2, 3  # hypotheses that are weighed again, the null apart
+_LEAST, _MOST = 2, 3  # hypotheses to recompute, apart from the null
 _LEAST_PROBABILITY = 0.01
-_MOST_RUNS = 4  # from priors near the posterior
-_N_SAMPLES = 2000  # that say where that is
-_SHARP = 0.3  # nats: an error that leaves it open whether two evidences are a nat apart is too large
+_MOST_RUNS = 4  # runs from priors near the posterior
+_N_SAMPLES = 2000  # posterior samples that define such a prior
+_SHARP = 0.3  # nats: largest error with which a difference of one nat can be resolved
 _APART = 3.3  # standard errors: one in a thousand
 
 # Calls of a run for each live point and parameter (39 to 47 were counted), and runs of a hypothesis: most often two
 # to five, at most the first, four about its samples and four about Laplace's peak.
 _CALLS = 43
 _FEWEST_RUNS, _MOST_RUNS_IN_ALL = 2, 1 + 2 * _MOST_RUNS
-_USUAL_RUNS = 5  # a bar that counts so many ends early, or waits near its end
+_USUAL_RUNS = 5  # usual number of runs, for the progress bar
 _TIMED = 100  # hypotheses whose evaluation is timed
-_STEPS = 100  # of the bar, for each hypothesis
+_STEPS = 100  # steps of the bar per hypothesis
 Run = Callable[..., nested.NestedResult]
 
 
 def weigh_thoroughly(
     searched: Searched, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress = silent
 ) -> tuple[Searched, tuple[Weighing, ...]]:
-    """Weigh two or three leading hypotheses, and the null, by nested sampling.
+    """Compute the evidence of two or three leading hypotheses, and the null, by nested sampling.
 
-    Where the two disagree by more than a nat, and no run has doubts, nested sampling wins: the evidence of what
-    was weighed is moved, and what is unknown beside it, and all probabilities are made anew. What Laplace misses
-    of the null it misses of every hypothesis that was not weighed again, so the null is what others are moved
-    against. What was pruned by Laplace's evidence does not come back.
+    If the two methods disagree by more than a nat and no run has warnings, nested sampling takes precedence: the
+    evidences of these hypotheses, and of unknown effects beside them, are shifted, and all probabilities recomputed.
+    Laplace's error for the null is assumed for every hypothesis that was not recomputed, so shifts are relative to the
+    null. Hypotheses pruned by Laplace's evidence are not restored.
 
     Parameters
     ----------
     searched
-        What Laplace's approximation has weighed.
+        The search with Laplace evidences.
     rng
         Source of randomness.
     n_live
-        Live points of each run. One of the whole prior looks for where the posterior is; from priors near that
-        (`probewise.nested.repartitioned`) others say what the evidence is, until that is sharp.
+        Live points of each run. The first run, from the whole prior, locates the posterior; further runs, from priors
+        near it (`probewise.nested.repartitioned`), estimate the evidence until its error is small.
     progress
-        Told first how many minutes it will take, about, from the time that these readings take under the leading
-        hypothesis; then after every round.
+        Called first with an estimate of the minutes, from timed evaluations of the leading hypothesis; then after every
+        round.
 
     Returns
     -------
-    The search, with other probabilities where nested sampling wins, and each hypothesis as weighed twice,
-    the most probable first.
+    The search with updated probabilities, and both evidences of each hypothesis, the most probable first.
     """
     require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
@@ -95,9 +94,9 @@ def weigh_thoroughly(
 
 
 def _leaders(searched: Searched) -> list[tuple[WeighedFit, Names]]:
-    """List the leading refitted hypotheses about the mean, each under its best noise, then the null if not among them.
+    """List the leading refitted hypotheses on the mean, each under its best noise, and the null.
 
-    All under the SSF order that has the most evidence for each, the null under that of the first.
+    Each has its SSF order of largest evidence; the null has that of the first.
     """
     merged = searched.posterior.by_mean
     out: list[tuple[WeighedFit, Names]] = []
@@ -115,7 +114,7 @@ def _leaders(searched: Searched) -> list[tuple[WeighedFit, Names]]:
 
 
 def _noise_of(searched: Searched, mean: Names) -> Names:
-    """Find the noise model under which a hypothesis about the mean is most probable."""
+    """Return the noise model under which a hypothesis on the mean is most probable."""
     own = {noise: p for (names, noise), p in searched.posterior.probabilities.items() if names == mean}
     return max(own, key=lambda noise: own[noise])
 
@@ -140,11 +139,11 @@ def _weigh(
         rng=rng,
         n_live=n_live,
         progress=lambda state: rounds(weighing.label, state),
-        max_cost=1.0,  # each run here is checked by the next
+        max_cost=1.0,  # each run here is checked against the next
         return_interrupted=False,
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against the last of them is told
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # warnings of the last run are reported
         explored = run(once)
 
         def about(theta: FloatArray) -> Weighing:
@@ -153,13 +152,13 @@ def _weigh(
             return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
 
         told = about(explored.samples(_N_SAMPLES, rng=rng))
-        if told.gap < 0 and not told.agree:  # the search may have lost the peak that the fit has found
+        if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
             told = max(told, about(_of_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
     more = explored.log_z + candidate.log_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
         return told
-    doubt = f"the whole prior holds more than what was found in it, by {apart:.1f} standard errors"
+    doubt = f"the whole prior holds more evidence than was found near the posterior, by {apart:.1f} standard errors"
     return replace(told, doubts=(*told.doubts, doubt))
 
 
@@ -170,7 +169,7 @@ def _problem(candidate: WeighedFit, noise: Names, searched: Searched) -> JointPr
 def _minutes(
     leaders: Sequence[tuple[WeighedFit, Names]], searched: Searched, n_live: int, *, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Estimate how long the weighing takes, least and most: evaluations, times the seconds that one takes here."""
+    """Estimate the minutes that the runs take, lower and upper: evaluations times measured seconds each."""
     seconds = 0.0
     for candidate, noise in leaders:
         problem = _problem(candidate, noise, searched)
@@ -184,7 +183,7 @@ def _minutes(
 
 
 class _Bar:
-    """One bar over all hypotheses: how far the runs are, and in its title how long it may take."""
+    """One progress bar over all hypotheses, with the estimated duration in its title."""
 
     def __init__(self, progress: Progress, n: int, minutes: tuple[float, float]) -> None:
         self._progress, self._n, self._runs = progress, n, 0
@@ -193,12 +192,12 @@ class _Bar:
         progress(self._stage, 0, n * _STEPS)
 
     def told(self, k: int, label: str, state: nested.State) -> None:
-        """Take in a round of a run of the hypothesis number `k`."""
+        """Update with a round of a run of hypothesis number `k`."""
         depth = -state.log_volume
-        if k != self._at or depth < self._depth:  # a new run begins with the whole prior
+        if k != self._at or depth < self._depth:  # a new run starts from the whole prior
             self._runs = 1 if k != self._at else self._runs + 1
         self._at, self._depth = k, depth
-        to_come = max(state.log_z_remaining - state.log_z, 0.0)  # nats to go, more or less
+        to_come = max(state.log_z_remaining - state.log_z, 0.0)  # remaining nats, about
         share = (self._runs - 1 + depth / (depth + to_come + 1.0)) / _USUAL_RUNS
         done = int((k + min(share, 0.99)) * _STEPS)
         self._progress(self._stage, done, self._n * _STEPS, f"{label}, run {self._runs}")
@@ -212,7 +211,7 @@ def _in_words(minutes: tuple[float, float]) -> str:
 
 
 def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:
-    """Weigh by runs from priors near the posterior: near samples of it first, then near what the run before found."""
+    """Estimate the evidence by runs from priors near the posterior: near the samples, then near the previous run."""
     runs: list[nested.NestedResult] = []
     while True:
         nearer = nested.repartitioned(problem, theta)
@@ -239,7 +238,7 @@ def _of_laplace(candidate: WeighedFit, evidence: NoiseEvidence, rng: np.random.G
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Log evidence, its standard error, and what speaks against it."""
+    """Log evidence, its standard error, and warnings."""
 
     log_z: float
     error: float

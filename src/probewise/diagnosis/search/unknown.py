@@ -1,4 +1,4 @@
-"""Something unknown beside refitted candidates: how much it explains, and where it is pruned for a name."""
+"""Unknown effects beside refitted candidates: their evidence, and pruning in favour of named effects."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ __all__ = ["Unknown"]
 
 @dataclass(eq=False)
 class Unknown:
-    """What bases that know no physics explain beside each candidate, under each of its noises.
+    """Evidence of basis functions beside each candidate, under each of its noise models.
 
     Parameters
     ----------
     bases
-        Templates of the unknown.
+        Templates of the basis functions.
     covariates
-        Along which readings that are far out may lie together.
+        Covariates in which outlying readings may cluster.
     noises
         The noise models.
     complexity_penalty
-        The nats against it beside an SSF worth so many Gaussians.
+        Penalty in nats, by the degrees of freedom of the SSF.
     n_choices
-        Log of how many more combinations there are of as many names as these than of one.
+        Log of the ratio of the number of combinations of this many names to that of single names.
     """
 
     bases: Bank
@@ -47,11 +47,11 @@ class Unknown:
     log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
     """Log evidence by (order, mean, noise)."""
     shares: dict[str, float] = field(default_factory=dict)
-    """How much of it each family of bases has, beside the null that it explains most beside."""
+    """Share of each family of bases, beside the null with the largest evidence of an unknown effect."""
     n_choices: Callable[[Names], float] = lambda names: 0.0
 
     def weigh(self, candidates: Iterable[WeighedFit]) -> None:
-        """Weigh it beside each candidate."""
+        """Compute its evidence beside each candidate."""
         best = -np.inf
         for candidate in candidates:
             for noise, evidence in candidate.steering():
@@ -71,10 +71,10 @@ class Unknown:
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
     def prune(self, candidates: Collection[WeighedFit]) -> None:
-        """Leave it out, alone or beside a name, where a name more, or two, explain as much and leave nothing for it.
+        """Drop it, alone or beside named effects, if one or two more named effects explain as much and leave nothing.
 
-        A basis of many columns, what differs from scan to scan say, holds the traces of named effects too. Two names
-        are chosen from many more combinations than one is: they have to explain as much more as that makes by chance.
+        A basis of many columns, such as one value per scan, can imitate named effects. Two names are chosen from many
+        more combinations than one, so they must explain correspondingly more.
         """
         named = [c for c in candidates if not out_of_vocabulary(c.names)]
         for known in {c.names for c in named if len(c.names) <= 1}:
@@ -83,7 +83,7 @@ class Unknown:
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
 
     def _explained(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
-        """Tell whether a candidate makes as much of the readings as something unknown beside `known` does."""
+        """Return whether a candidate explains as much as an unknown effect beside `known`."""
         most = max((self._beside(c) for c in candidates if c.names == known), default=-np.inf)
         believed = {c: self._believed(c, len(known)) for c in rivals}
         for candidate in sorted(believed, key=lambda c: -believed[c]):

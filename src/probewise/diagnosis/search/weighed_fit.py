@@ -1,4 +1,4 @@
-"""A combination of effects, refitted and weighed."""
+"""A refitted combination of effects with its evidence."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class WeighedFit:
-    """A combination of effects on the mean at one SSF order, refitted and weighed under each noise model."""
+    """A combination of effects on the mean at one SSF order, refitted, with its evidence under each noise model."""
 
     found: Fit
-    law: NoiseLaw  # of the noise, under which it was fitted
+    law: NoiseLaw  # noise distribution of the fit
     evidence: Mapping[Names, NoiseEvidence]
-    log_share: float  # in the evidence, for the discrete choices that its effects have made
-    log_visible: float  # in the evidence: what of it is not the hypothesis with an effect less
-    weights: Mapping[str, FloatArray]  # of the variants among which each effect chose
+    log_share: float  # log prior factor of the effects' discrete choices (variants)
+    log_visible: float  # log probability that all effects have a detectable size
+    weights: Mapping[str, FloatArray]  # weights of each effect's variants
 
     @property
     def names(self) -> Names:
@@ -41,24 +41,24 @@ class WeighedFit:
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_visible: float) -> WeighedFit:
-        """Take a fit with the evidence of its parameters, as if nothing else had been chosen."""
+        """Build from a fit and the evidence of its parameters, without factors for discrete choices."""
         return cls(found, law, {}, 0.0, log_visible, {}).with_evidence(plain)
 
     @property
     def log_factor(self) -> float:
-        """Log of what the evidence of its parameters alone is multiplied by."""
+        """Log of the factor on the evidence of its parameters."""
         return self.log_share + self.log_visible
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
-        """Take the evidence of its parameters under each noise model."""
+        """Return it with other evidences of its parameters under each noise model."""
         return replace(self, evidence=plain).moved(self.log_factor)
 
     def as_share(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
-        """Let it stand for all the variants of its effects."""
+        """Return it with the factor and the weights for all variants of its effects."""
         return replace(self.moved(log_share - self.log_share), log_share=log_share, weights=weights)
 
     def moved(self, by: float) -> WeighedFit:
-        """Move its log evidence under every noise model alike."""
+        """Return it with its log evidence shifted equally under every noise model."""
         return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
 
     @property
@@ -68,39 +68,39 @@ class WeighedFit:
 
     @property
     def sd(self) -> float:
-        """Sd of a whitened reading, a tail aside, rounding with it."""
+        """Sd of a whitened reading, including rounding but not a tail."""
         return self.found.sd * self.law.widening
 
     @property
     def degrees_of_freedom(self) -> int:
-        """How many Gaussians its SSF is as free as."""
+        """Effective degrees of freedom of its SSF, counted in Gaussians."""
         return self.found.model.sensor.degrees_of_freedom
 
     @property
     def log_z(self) -> float:
-        """Log evidence under the noise model of the most."""
+        """Log evidence under the best noise model."""
         return max(e.log_z for e in self.evidence.values())
 
     def steering(self) -> Iterator[tuple[Names, NoiseEvidence]]:
-        """List the noise models that are not far behind the best, and the plainest.
+        """List the noise models that are not far behind the best, and the simplest one.
 
-        What is missing from the mean can look like noise of any kind, and be seen under plain noise alone.
+        A missing effect on the mean can look like any noise effect, and be detectable under white noise only.
         """
         best, plain = self.log_z, min(self.evidence, key=len)
         return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
 
 
 def expected_nats(first: WeighedFit, second: WeighedFit) -> float:
-    """Log Bayes factor to be expected between two refitted models if the first is true.
+    """Return the expected log Bayes factor between two refitted models if the first is true.
 
-    Half of the squared distance between their predictions, in sds of the noise as the first has it.
+    It is half the squared distance between their predictions, in noise sds of the first.
     """
     apart = first.law((first.found.residuals - second.found.residuals)[:, None])
     return 0.5 * float(np.sum(apart**2)) / first.sd**2
 
 
 def in_vocabulary(noise: Names) -> Names:
-    """Leave out of a noise model what is no name of the vocabulary's."""
+    """Return the effects of a noise model that are in the vocabulary."""
     return tuple(name for name in noise if name not in NUISANCES)
 
 

@@ -1,4 +1,4 @@
-"""A hypothesis weighed twice: by Laplace's approximation and by nested sampling."""
+"""The evidence of a hypothesis by both methods: Laplace's approximation and nested sampling."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ A_NAT = 1.0
 
 @dataclass(frozen=True)
 class Weighing:
-    """Log evidence of one hypothesis, both ways; the same model, priors and law of the noise.
+    """Log evidence of one hypothesis by both methods, with the same model, priors and noise.
 
     `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `error` of the nested runs, one
-    standard error; `doubts` are what they have against themselves.
+    standard error; `doubts` are the warnings of those runs.
     """
 
     effects: tuple[str, ...]
@@ -27,22 +27,22 @@ class Weighing:
 
     @property
     def label(self) -> str:
-        """Its name."""
+        """Label of the hypothesis."""
         return "+".join(self.effects) or "clean"
 
     @property
     def gap(self) -> float:
-        """What nested sampling finds beyond Laplace, nats."""
+        """Log evidence by nested sampling minus that by Laplace, in nats."""
         return self.nested - self.laplace
 
     @property
     def agree(self) -> bool:
-        """Whether the two are within a nat, beyond the nested runs' own error."""
+        """Whether the two agree within a nat, beyond the standard error of nested sampling."""
         return abs(self.gap) <= A_NAT + self.error
 
 
 def with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
-    """Add to a sentence whether nested sampling agrees, where not, by how much, and what it has against itself."""
+    """Add to a sentence whether nested sampling agrees, the differences, and its warnings."""
     if not weighings:
         return reason
     apart = ", ".join(f"{w.label} by {w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree)

@@ -1,1 +1,1 @@
-"""A person's simulator over a plain table, as an apparatus: its forms, covariates, held-out runs, words."""
+"""A user's simulator over a table, as an `Apparatus`: forms, covariates, held-out runs, words."""

@@ -1,4 +1,4 @@
-"""A person's simulator: what the engine asks of whatever took the readings."""
+"""A user's simulator as an `Apparatus`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _BY_SIZE = (0.318, 0.02, 0.002)
 
 @dataclass(frozen=True, eq=False)
 class PersonsSystem:
-    """A system about a first fit of it: the forms take their scale from there.
+    """A system with a first fit, which sets the scales of the forms.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class PersonsSystem:
 
     @property
     def words(self) -> Words:
-        """Speak of the simulator."""
+        """Words for sentences about the simulator."""
         return Words(
             null="the simulator",
             find_signal="record where the reading changes",
@@ -86,22 +86,22 @@ class PersonsSystem:
         )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Bind every form that this table could show, and what may be wrong with its noise."""
+        """Return every form that could be detectable in this table, and the noise effects."""
         extent = Extent.of(recording)
         on_noise = [effect for kind in ON_NOISE if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
         return forms | {effect.name: effect for effect in on_noise}
 
     def proposals(self) -> dict[str, NamedEffect[Any]]:
-        """Propose short expressions of columns and states."""
+        """Return short formulas of columns and states."""
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in proposals(self.about)})
 
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Name the extra effects of a person's file."""
+        """Return the names of the extra effects of the user's file."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     def refits_are_over(self) -> bool:
-        """Tell whether `simulate`, one sample after the other, has been called often enough, or a law integrated."""
+        """Return whether the budget of calls of `simulate`, or of integration steps, is spent."""
         caller, tally = self.system.caller, self.system.tally
         if caller is None:
             tally.cut_short = tally.cut_short or tally.n_steps >= STEPS_OF_A_SEARCH
@@ -112,15 +112,15 @@ class PersonsSystem:
         return True
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Share the odds out over these effects."""
+        """Divide the prior odds among these effects."""
         return replace(PriorOdds.over(effects), by_size=_BY_SIZE, unknown_explains_most=True)
 
     def null_forms(self, recording: Recording) -> Any:
-        """There is one: the simulator."""
+        """Raise an error: the only null is the simulator."""
         raise NotImplementedError("a simulator is its own null")
 
     def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        """List time, columns, level, states, the change since the row before, and runs, as far as they vary."""
+        """Return the covariates that vary: time, columns, level, states, change since the previous row, and runs."""
         table = cast(RunTable, recording.plan)
         usable = np.flatnonzero(recording.usable)
         by_row = self.covariates_by_row(found.model.predict(found.z[None, :])[0])
@@ -135,7 +135,7 @@ class PersonsSystem:
         return out, pooled["previous"]
 
     def covariates_by_row(self, predicted: FloatArray) -> dict[str, FloatArray]:
-        """Give every covariate at each row, (n_points,), where these readings are predicted; that of runs last."""
+        """Return every covariate at each row, (n_points,), for these predictions; that of runs is last."""
         table, own = self.about.table, self.system.simulator
         out = {"time" if table.has_time else "row": table.time_s, "level": predicted}
         out |= {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
@@ -152,7 +152,7 @@ class PersonsSystem:
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Choose the first of an effect's covariates that varies; None where none does, or nothing changes."""
+        """Return the first of an effect's covariates that varies; None if none varies, or nothing changes."""
         pooled = {c.name: c for c in known}
         name = next((name for name in effect.covariates if name in pooled), None)
         if name is None or not np.any(change):
@@ -160,11 +160,11 @@ class PersonsSystem:
         return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Give no columns: a simulator has no structure finer than itself."""
+        """Return no columns: a simulator has no fine structure."""
         return np.zeros((len(usable), 0))
 
     def held_out_parts(self, recording: Recording) -> Parts:
-        """Hold out runs; of one run, blocks of rows that follow each other."""
+        """Return runs as parts or, for a single run, blocks of successive rows."""
         table, usable = cast(RunTable, recording.plan), recording.usable
         run = table.scan[usable]
         if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:
@@ -176,7 +176,7 @@ class PersonsSystem:
     def commands(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> list[RunCommand]:
-        """List runs that a person could record; the other arguments play no part."""
+        """List runs that could be recorded; the other arguments are not used."""
         own = self.system.simulator
         return run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
@@ -185,7 +185,7 @@ class PersonsSystem:
 
 
 def _change(values: FloatArray, table: RunTable) -> FloatArray:
-    """Change since the row before of the run, 0 at its first, (n_points,)."""
+    """Return the change since the previous row of the run, 0 at its first, (n_points,)."""
     out = np.zeros(len(table))
     for rows in table.rows_by_scan():
         out[rows[1:]] = np.diff(values[rows])

@@ -1,1 +1,1 @@
-"""What is said of it: the Diagnosis value, the verdict in one sentence, diagnosis.json."""
+"""The `Diagnosis` value, the verdict in one sentence, and diagnosis.json."""

@@ -1,4 +1,4 @@
-"""What is said beyond the verdict: what a repair leaves, and the formula of what has no name."""
+"""Findings beyond the verdict: residuals after the repair, and a formula for an unknown effect."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _N_DRAWS = 199
 
 @dataclass(frozen=True)
 class Remainder:
-    """What is left when everything named is in the model.
+    """The residual after all named effects.
 
-    `share_of_gain` is its share of the log evidence that the named and what is left gain together; `where` the
-    covariate in which it shows most, None where in none.
+    `share_of_gain` is its share of the total gain in log evidence; `where` the covariate in which it is most
+    significant, or None.
     """
 
     p_value: float
@@ -36,9 +36,9 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Formula:
-    """A short expression proposed for what has no name: on which side, of what, and what it gains.
+    """A formula proposed for an unknown effect: its side, its target, and what it gains over the null.
 
-    In log evidence, nats, and `heldout_log_density_per_reading`, nats per held-out reading; both over the null.
+    The gain is in log evidence (nats), and `heldout_log_density_per_reading` in nats per held-out reading.
     """
 
     expression: str
@@ -50,7 +50,7 @@ class Formula:
 
 
 def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.random.Generator) -> Remainder | None:
-    """Describe what the repair leaves; None where nothing is named, or nothing is left."""
+    """Describe the residual after the repair; None if nothing is named, or nothing is left."""
     p_value, names = best.improvement.p_value_after, best.fit.names
     if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
         return None
@@ -70,7 +70,7 @@ def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.rand
 
 
 def formula_of(searched: Searched, judged: Judged, best: Best, samples: ModelSamples) -> Formula | None:
-    """Give the formula that a repair of something unknown holds; None where there is none."""
+    """Return the formula in the repair of an unknown effect; None if there is none."""
     if judged.verdict != "unknown":
         return None
     unit = searched.prepared.recording.plan.instrumentation.unit

@@ -1,4 +1,4 @@
-"""The Diagnosis value: what is missing, where, how sure, what it gains, what to measure next."""
+"""The `Diagnosis` value: verdict, probabilities, places, repair, next measurement."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ _MOVED = {
     "is_repaired": "repair.changes_predictions",
     "left_open": "repair.left_open",
 }
-"""Names of 0.1, and where what they stood for is now."""
+"""Attributes of version 0.1, and their replacements."""
 
 
 @dataclass(frozen=True)
 class VerdictReport:
-    """What is said of a verdict: one sentence, each effect's and the noise's numbers, what was weighed twice."""
+    """The verdict in words and numbers: reason, effects, noise, evidences by both methods."""
 
     reason: str
     effects: tuple[EffectFound, ...]
@@ -60,24 +60,24 @@ class VerdictReport:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis(ShowsItself):
-    """Hold everything of diagnosis.json, and the arrays that its figures show.
+    """The content of diagnosis.json, and the arrays for its figures.
 
     Attributes
     ----------
     recording
-        What was diagnosed, recordings joined.
+        The diagnosed recording (several are joined).
     judged
         Verdict, probabilities, aliases.
     repair
-        The calibrated model and the repaired one, and what is gained.
+        The calibrated and the repaired model, and the gain.
     where
-        Where something is missing, strongest first.
+        Places of significant residuals, strongest first.
     next_measurement
-        What to read next; None where nothing would tell more.
+        The next measurement; None if none would be informative.
     report
         The verdict in words, and the numbers of effects and noise.
     apparatus
-        What took the readings.
+        The apparatus that took the readings.
     """
 
     recording: Recording
@@ -90,7 +90,7 @@ class Diagnosis(ShowsItself):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether something is missing, and of what kind."""
+        """The verdict: clean, named, cannot_tell, unknown or noise."""
         return self.judged.verdict
 
     @property
@@ -100,27 +100,27 @@ class Diagnosis(ShowsItself):
 
     @property
     def p_value(self) -> float:
-        """That nothing is missing from the mean."""
+        """p-value of the global test of the mean."""
         return self.judged.p_value
 
     @property
     def combination(self) -> tuple[str, ...]:
-        """Most probable set of effects; () when clean, ("unknown",) when unknown."""
+        """Most probable set of effects; () if clean, ("unknown",) if unknown."""
         return self.judged.combination
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """All, most probable first."""
+        """All hypotheses, most probable first."""
         return self.judged.hypotheses
 
     @property
     def effects(self) -> tuple[EffectFound, ...]:
-        """Every effect that matters, most probable first."""
+        """Relevant effects, most probable first."""
         return self.report.effects
 
     @property
     def improvement(self) -> Improvement:
-        """What the repaired model gains."""
+        """Gain of the repaired model."""
         return self.repair.improvement
 
     @property
@@ -135,13 +135,13 @@ class Diagnosis(ShowsItself):
 
     @property
     def carried(self) -> tuple[tuple[str, float, str], ...]:
-        """What the repaired model carries and no hypothesis with a name has: name, share of the samples, sentence."""
+        """Effects in the repaired model that no named hypothesis has: name, share of the samples, sentence."""
         return self.repair.carried_beside({effect.name for effect in self.effects})
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Give what had another name in the last release, with a warning."""
+            """Return attributes by their old names, with a warning."""
             if name not in _MOVED:
                 raise AttributeError(name)
             warnings.warn(f"Diagnosis.{name} is Diagnosis.{_MOVED[name]} now", DeprecationWarning, stacklevel=2)
@@ -151,7 +151,7 @@ class Diagnosis(ShowsItself):
         """Describe the diagnosis in plain text."""
         lines = [f"{self.verdict}: {self.reason}", _p_value_said(self.p_value), "probability  explanation"]
         lines += [f"  {h.probability:9.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
-        # What the reason says already is not said again.
+        # The reason is not repeated.
         lines += [
             f"{e.name}, in all explanations together {e.probability:.3f}: {e.sentence}"
             for e in self.effects
@@ -180,7 +180,7 @@ class Diagnosis(ShowsItself):
 
 
 def _p_value_said(p_value: float) -> str:
-    """Write the p-value with what it means."""
+    """Write the p-value with its meaning."""
     meant = "how often chance alone, with nothing missing from the mean, gives readings as odd as these"
     return f"{p_in_words(p_value)} ({meant})"
 

@@ -1,4 +1,4 @@
-"""diagnosis.json: strict JSON with the keys that the command line promises, and the schema that holds it to them."""
+"""diagnosis.json: strict JSON with the documented keys, and its schema."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ def diagnosis_schema() -> dict[str, Any]:
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Lay a diagnosis out as diagnosis.json: finite numbers, texts, lists; file names relative to it.
+    """Convert a diagnosis to the content of diagnosis.json: finite numbers, texts, lists; relative file names.
 
-    The witness figures (`where`) and the next plan are named here and written by the report and the
-    command line.
+    The figures of places (`where`) and the next plan are named here, and written by the report and the command line.
     """
     require_diagnosis(diagnosis)
     gain, plan = diagnosis.improvement, diagnosis.next_measurement
@@ -104,7 +103,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _names(effects: Iterable[str]) -> list[str]:
-    """Name effects as a person knows them; one that is there twice is listed twice."""
+    """Return the public names of effects; one that occurs twice is listed twice."""
     return sorted(map(public_name, effects))
 
 

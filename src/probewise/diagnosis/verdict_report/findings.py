@@ -1,4 +1,4 @@
-"""What is stated of each effect: how probable, how large, its parameters, in words."""
+"""The findings on each effect: probability, size, parameters, and a sentence."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from probewise.recordings.plan import Plan
 __all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
 
 _LEAST_PROBABILITY = 1e-3
-_IS_UNKNOWN = 0.5  # probability that something is unknown, from which effects beside it are listed
-_STANDS_BESIDE = 0.5  # share of what is unknown, from which an effect stands beside it
+_IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
+_STANDS_BESIDE = 0.5  # conditional probability from which an effect counts as beside the unknown one
 _N_DRAWS = 999
 
 
@@ -43,7 +43,7 @@ class ParameterFound:
 
 @dataclass(frozen=True)
 class EffectFound:
-    """One effect: how probable, how large (lambda), what it does in words, its parameters, the scans it is bound to."""
+    """One effect: probability, size lambda, sentence, parameters, and the scans to which it is bound."""
 
     name: str
     probability: float
@@ -55,7 +55,7 @@ class EffectFound:
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """The noise model, a test of what it leaves, its parameters."""
+    """The noise model, the p-value of its test, and its parameters."""
 
     model: str
     p_value: float
@@ -70,17 +70,17 @@ def effects_found(
     *,
     rng: np.random.Generator,
 ) -> tuple[EffectFound, ...]:
-    """Give probability, size, parameters and sentence of every effect of the vocabulary that matters.
+    """Return probability, size, parameters and sentence of every relevant effect of the vocabulary.
 
     Parameters
     ----------
     searched
-        What was weighed.
+        Result of the search.
     hypotheses
-        All, with their probabilities.
+        All hypotheses with their probabilities.
     best, samples
-        The repair and its posterior samples: the numbers of its effects are from there. Those of the others are from
-        the most probable fit that holds them.
+        The repair and its posterior samples, which give the numbers of its effects; those of other effects are from the
+        most probable fit that contains them.
     rng
         Source of randomness.
     """
@@ -119,7 +119,7 @@ def effects_found(
 
 
 def _holder(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
-    """Find the most probable refitted candidate that holds an effect."""
+    """Return the most probable refitted candidate that contains an effect."""
     ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
     for (mean, noise), p in ranked:
         if p > 0 and name in (*mean, *noise):
@@ -132,9 +132,9 @@ def _holder(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
 def _too_small(
     searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
 ) -> tuple[NamedEffect[Any], FloatArray, float]:
-    """Bound an effect that is not significant: amplitudes by the linearised null, the rest as the prior has it.
+    """Return bounds of an insignificant effect: amplitudes by the linearised null, other parameters from the prior.
 
-    Of its variants the one is taken that stands in the middle.
+    The middle one of its variants is used.
     """
     null, screening = searched.null, searched.screening
     best = max(null.evidence.values(), key=lambda e: e.log_z)
@@ -146,21 +146,21 @@ def _too_small(
     if not effect.amplitudes:
         return effect, values, 0.0
     projected = problem.project(templates.columns[middle])
-    # A ridge of one prior scale keeps amplitudes that the plan cannot see from running off.
+    # A ridge of one prior scale keeps undetectable amplitudes finite.
     precision = projected.T @ projected + np.eye(projected.shape[1])
     amount = np.linalg.solve(precision, projected.T @ problem.residual)
     spread = np.linalg.cholesky(np.linalg.inv(precision))
     draws = amount + rng.standard_normal((N_SAMPLES, len(amount))) @ spread.T
     for k in effect.amplitudes:
         values[:, k] = draws @ templates.settings[middle][:, k]
-    # Signs that the prior rules out are folded back.
+    # Amplitudes of an excluded sign are reflected.
     inside = np.isfinite(effect.prior.log_prob(values))
     values[~inside] = np.abs(values[~inside])
     return effect, values, float(np.linalg.norm(projected @ amount))
 
 
 def _size(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
-    """Measure lambda: what is left on noise-free readings after a full refit without the effect."""
+    """Return lambda: the residual norm on noise-free readings after a full refit without the effect."""
     law = holder.evidence[noise].law
     found = holder.found
     if name in searched.certain:
@@ -168,20 +168,20 @@ def _size(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> fl
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
     prepared = searched.prepared
     if name in prepared.on_noise:
-        # On the noise: the evidence for it, as the effect of that many sd on the mean would leave.
+        # For noise effects: the size of an effect on the mean with equal evidence.
         without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]
         gain = holder.evidence[noise].log_z - max(without)
         return math.sqrt(2 * max(gain, 0.0))
     model, stay = found.model.without(name)
     noise_free = prepared.recording.with_readings(prepared.spread(found.predicted)).unlimited()
-    # With the noise's own sd as floor the refit weighs readings against priors as the real one did.
+    # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = float(law.scale(law(found.residuals)[:, None])[0])
     refit = fit(model, noise_free, found.z[stay], law.at_least(sigma), max_steps=12, tolerance=0.02)
     return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.information)
 
 
 def noise_found(searched: Searched, best: Best, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
-    """Test the repaired model's residual for memory, heavy tails and a spread that follows the level."""
+    """Test the repaired model's residuals for autocorrelation, heavy tails and level-dependent spread."""
     prepared, after = searched.prepared, best.problem
     steps = steps_within_scans(prepared.recording)
     own = after.residual[: after.n_points, None]

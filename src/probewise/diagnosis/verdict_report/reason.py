@@ -18,28 +18,28 @@ __all__ = ["Grounds", "reason_of"]
 
 @dataclass(frozen=True)
 class Grounds:
-    """What a sentence is made of, besides what was judged.
+    """The facts for the sentence, in addition to the verdict.
 
     Parameters
     ----------
     words
-        How to speak of the apparatus.
+        Words for the apparatus.
     n_readings, least_readings
-        Usable readings, and the fewest that a verdict is given on.
+        Usable readings, and the fewest for a verdict.
     form
-        What the SSF of a clean sensor is, "" where there is none.
+        Description of the SSF of a clean sensor, "" if there is none.
     sentences
-        What each effect does, by name.
+        Sentence on each effect, by name.
     like
-        What is unknown may be this: sentences.
+        Sentences on the effects that the unknown one resembles.
     family
-        The family of bases that explains most of what is unknown.
+        The most probable family of bases of the unknown effect.
     beside
-        Effects that something unknown is beside.
+        Named effects beside the unknown one.
     shows_in
-        Covariates in which something shows, strongest first.
+        Covariates in which residuals are significant, strongest first.
     p_value_after
-        That nothing is missing from the repaired model.
+        p-value of the test of the repaired model.
     settles
         The readings to take next, in words.
     """
@@ -58,7 +58,7 @@ class Grounds:
 
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:
-    """Say in one sentence what the verdict is and why."""
+    """Return the verdict and its reason in one sentence."""
     if judged.too_little:
         return _too_little(grounds)
     if judged.withdrawn:
@@ -127,5 +127,5 @@ def _stated(judged: Judged, grounds: Grounds) -> str:
 
 
 def _is_of_a_person(word: str, names: Iterable[str]) -> bool:
-    """Tell whether a word is a name that a person gave, which stays as it is."""
+    """Return whether a word is a user's own name, which is not changed."""
     return "_" in word or any(word in name.split(":")[1:] for name in names)

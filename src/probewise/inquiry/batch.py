@@ -1,4 +1,4 @@
-"""Several readings chosen at once, before any of them is known."""
+"""Choose several readings at once (a batch)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from probewise.inquiry.prospect import Prospect
 
 __all__ = ["choose_several"]
 
-_OUTCOMES = 16  # imagined results of the readings chosen so far
-_FEW = 600  # hypotheses that imagine them
+_OUTCOMES = 16  # simulated outcomes of the readings chosen so far
+_FEW = 600  # hypotheses used to simulate them
 
 
 def choose_several(prospect: Prospect, n: int, *, rng: np.random.Generator) -> tuple[int, ...]:
-    """Choose readings that together tell most: the best one, then the best one beside it, and so on.
+    """Choose readings with large joint information, greedily one after another.
 
     Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the
-    best set (Nemhauser, Wolsey & Fisher 1978). The condition is averaged over imagined results: each
-    is a draw from what the posterior predicts, and leaves a posterior of its own.
+    best set (Nemhauser, Wolsey & Fisher 1978). The condition is averaged over simulated outcomes: each is a draw from
+    the predictive distribution, with its own posterior.
 
     Parameters
     ----------
     prospect
         Posterior, designs and sensor.
     n
-        How many readings.
+        Number of readings.
     rng
         Source of randomness.
 
@@ -55,7 +55,7 @@ def choose_several(prospect: Prospect, n: int, *, rng: np.random.Generator) -> t
 def _after_imagined(
     prospect: Prospect, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Draw a result of one design for each posterior and take it in."""
+    """Simulate an outcome of one design for each posterior, and update the posterior."""
     readout = prospect.readout
     level = prospect.forecast.predict(prospect.theta, prospect.plan.take(prospect.rows[[row]]))[:, 0]
     sd = readout.noise_sd / np.sqrt(prospect.designs.n_repeats[prospect.rows[row]])

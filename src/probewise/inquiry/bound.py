@@ -1,4 +1,4 @@
-"""How few readings could do: the bits that are needed over the most that one reading can carry."""
+"""A lower bound on the number of readings: the bits needed over the capacity of one reading."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _CLOSE_BITS = 1e-4
 
 @dataclass(frozen=True)
 class Bound:
-    """Fewest readings on average, search and refinement apart.
+    """Lower bound on the mean number of readings, for search and refinement separately.
 
     Attributes
     ----------
     search_bits, refinement_bits
-        Bits needed until the shape is met for the first time, and from there to the target.
+        Bits needed until the first reading on the shape, and from there to the target.
     search_capacity_bits, capacity_bits
-        Most that one reading carries: while nothing has been met, of a yes or no that is as likely as it can
-        be made; afterwards the sensor's capacity.
+        Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
+        yes; afterwards, that of the sensor.
     """
 
     search_bits: float
@@ -39,12 +39,12 @@ class Bound:
 
     @property
     def search(self) -> float:
-        """Readings until the shape is met."""
+        """Readings until the shape is found."""
         return self.search_bits / self.search_capacity_bits
 
     @property
     def refinement(self) -> float:
-        """Readings from there on."""
+        """Readings after that."""
         return self.refinement_bits / self.capacity_bits
 
     @property
@@ -61,13 +61,13 @@ def fewest_readings(
     Parameters
     ----------
     prior_bits, met_bits, target_bits
-        Differential entropy of the parameters: of the prior, at the first reading on the shape (on
-        average), and when they are known well enough (`target_entropy`).
+        Differential entropy of the parameters: under the prior, at the first reading on the shape (on average), and at
+        the target (`target_entropy`).
     most_covered
-        Probability that the best first place lies on the shape. A reading of the search says yes or no,
-        and it says yes no more often than that while the places left are no better.
+        Probability that the best first place lies on the shape. A search reading answers yes or no, with at most this
+        probability of yes as long as no better place arises.
     capacity
-        Of the sensor, bits a reading (`capacity_bits`).
+        Capacity of the sensor, bits per reading (`capacity_bits`).
     """
     if not 0 < most_covered < 1:
         raise ParameterError("most_covered", most_covered, "between 0 and 1")
@@ -81,15 +81,15 @@ def fewest_readings(
 
 
 def target_entropy(n_params: int, sd: float) -> float:
-    """Greatest differential entropy, bits, of parameters that are all known to an sd: the independent Gaussian's."""
+    """Return the largest differential entropy in bits of parameters with a given sd: that of independent Gaussians."""
     return n_params * 0.5 * math.log2(2 * math.pi * math.e * sd**2)
 
 
 def capacity_bits(low: float, high: float, readout: Readout) -> float:
-    """Capacity of the sensor, bits a reading: the most that a reading can tell of a level from `low` to `high`.
+    """Return the capacity of the sensor in bits per reading, for levels from `low` to `high`.
 
-    The levels' distribution that carries most is found by Blahut and Arimoto's iteration (1972), until
-    its upper and lower bound are within 1e-4 bits.
+    The capacity-achieving distribution of levels is found by the Blahut-Arimoto iteration (1972), until the bounds are
+    within 1e-4 bits.
     """
     if not low < high:
         raise ParameterError("(low, high)", (low, high), "low < high")

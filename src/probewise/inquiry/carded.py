@@ -1,4 +1,4 @@
-"""Known cards on the field, over what tables tell of the shape."""
+"""Predictions with known cards on the field, over tabulated predictions of the shape."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from probewise.sensor.stages import Poses, SensorModel
 __all__ = ["CardedForecast", "CardedModel", "cards_of"]
 
 _REACH = 6.0  # sds of the footprint
-_SHOWS = 1e-4  # share of the view on a card, from which on the card counts
+_SHOWS = 1e-4  # share of the footprint on a card from which the card counts
 _MOST_ASKED = 400
 
 
@@ -31,7 +31,7 @@ def cards_of(model: SensorModel) -> tuple[Card, ...]:
 
 @dataclass(frozen=True, eq=False)
 class CardedModel:
-    """A sensor without effects over a shape, from its tables, and over known cards, in closed form."""
+    """A sensor model without effects: the shape by tables, known cards in closed form."""
 
     chain: Chain
     plain: SensorModel
@@ -55,13 +55,13 @@ class CardedModel:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """What is read over black and over white."""
+        """Readings over black and over white."""
         levels = self.chain.levels
         assert isinstance(levels, FixedLevels)
         return levels.i_min, levels.i_max
 
     def covered(self, poses: Poses, plan: Plan) -> list[FloatArray]:
-        """Tell which share of each view is on each card, (n_samples or 1, n_points) each."""
+        """Return the share of the footprint on each card, (n_samples or 1, n_points) each."""
         mixture = self.chain.ssf
         assert isinstance(mixture, FixedMixture)
         sd = np.sqrt(np.linalg.eigvalsh(mixture.covs_mm2)[:, -1])
@@ -85,7 +85,7 @@ class CardedModel:
 
 @dataclass(frozen=True, eq=False)
 class CardedForecast:
-    """All hypotheses, from the tables of a shape alone; where a card is seen, some are asked."""
+    """A forecast by the shape's tables for all hypotheses; near cards, by direct predictions for some."""
 
     base: Forecast
     chain: Chain
@@ -130,7 +130,7 @@ class _Predicts:
 
 @dataclass(frozen=True, eq=False)
 class _CardedOutlook:
-    """What the tables say, but for the designs that see a card: `answers` are those of `asked` hypotheses there."""
+    """Predictions by tables except for designs near a card; `answers` are predictions of `asked` hypotheses there."""
 
     base: Outlook
     asked: IntArray

@@ -1,4 +1,4 @@
-"""Choose the next place: at random among the best that the arm can reach."""
+"""Choose the next place at random among the best reachable ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from probewise.errors import ReachError, ShapeError
 __all__ = ["TIE", "best_places", "choose"]
 
 TIE = 1e-9
-"""Utilities closer than this count as equal: the same counts added in another order differ by rounding."""
+"""Utilities closer than this count as equal, since they differ by rounding only."""
 
 
 def best_places(utility: FloatArray, reachable: BoolArray) -> BoolArray:

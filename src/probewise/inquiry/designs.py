@@ -1,4 +1,4 @@
-"""The readings that might be taken next: places of a grid, and whatever else of a reading may be chosen."""
+"""Designs: the possible next readings, by place, orientation, repeats and other settings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Design", "Designs"]
 
 @dataclass(frozen=True)
 class Design:
-    """One reading that might be taken: where, how turned, how often, and at which other settings."""
+    """One possible reading: place, orientation, repeats and other settings."""
 
     x_mm: float
     y_mm: float
@@ -39,12 +39,12 @@ class Designs:
     grid
         The places.
     orientations_rad
-        How the sensor may be turned.
+        Possible orientations of the sensor.
     repeats
-        How many readings may be taken on the spot; their mean counts.
+        Possible numbers of repeated readings, which are averaged.
     settings
-        Other quantities by name, each with the values it may take, as a covariate of the plan: a
-        sensor's height, for instance, as ("height_mm", (8.0, 14.0)).
+        Other quantities by name with their possible values, which become covariates of the plan, such as
+        ("height_mm", (8.0, 14.0)).
     """
 
     grid: Grid = field(default_factory=Grid)
@@ -66,7 +66,7 @@ class Designs:
 
     @cached_property
     def combinations(self) -> tuple[Design, ...]:
-        """What is combined with each place, as designs at the field's corner; repeats of one way to stand in a row."""
+        """The combinations of settings as designs at the field's corner; repeats of one setting are adjacent."""
         names = [name for name, _ in self.settings]
         return tuple(
             Design(0.0, 0.0, turn, n, tuple(zip(names, values, strict=True)))
@@ -76,7 +76,7 @@ class Designs:
         )
 
     def __getitem__(self, row: int) -> Design:
-        """Take one design by its row."""
+        """Return one design by its row."""
         which, place = divmod(row, self.grid.n_places)
         x_mm, y_mm = self.grid.places_mm[place]
         return replace(self.combinations[which], x_mm=float(x_mm), y_mm=float(y_mm))
@@ -87,12 +87,12 @@ class Designs:
         return np.repeat([combination.repeats for combination in self.combinations], self.grid.n_places)
 
     def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
-        """Lay out one possible reading a design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
+        """Return a plan with one row per design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
         return replace(self._layout, pattern_names=(pattern_name,), time_s=np.full(len(self), time_s))
 
     @cached_property
     def _layout(self) -> Plan:
-        """The plan of all designs but for its time and the name of its pattern: thousands of names are made once."""
+        """The plan of all designs except time and pattern name, cached because it has thousands of scan names."""
         n_places, n_designs = self.grid.n_places, len(self)
         once = self.grid.plan("")
         rows = np.tile(np.arange(n_places), len(self.combinations))
@@ -109,13 +109,13 @@ class Designs:
         )
 
     def cost_s(self, travel_s: FloatArray, read_s: float) -> FloatArray:
-        """Seconds that each design takes, (n_designs,).
+        """Return the duration of each design in seconds, (n_designs,).
 
         Parameters
         ----------
         travel_s
             Seconds to move to each place and read there once, (n_places,).
         read_s
-            Seconds of each further reading on the spot.
+            Seconds of each repeated reading.
         """
         return np.tile(travel_s, len(self.combinations)) + read_s * (self.n_repeats - 1)

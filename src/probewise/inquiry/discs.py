@@ -1,9 +1,8 @@
-"""What a known sensor reads of a disc, tabulated: away from the edge it is dark or bright, near it a smooth function.
+"""Tabulated response of a known sensor to a disc: constant away from the edge, smooth near it.
 
-The response to a disc depends on three numbers: how far the sensor stands from the edge, in which
-direction of its own frame the edge lies, and how strongly it is bent. The sensor model itself fills
-a table of them once; a prediction is then an interpolation, and the map of all hypotheses over a
-grid needs one only in the ring about each edge, a few hundred places of many thousand.
+The response to a disc depends on three numbers: the distance of the sensor from the edge, the direction of the edge in
+the sensor's frame, and its curvature. The table is filled once by the sensor model; predictions are interpolations,
+needed only in the ring about each edge, at a few hundred of many thousand places.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ __all__ = ["DiscTable", "is_alike_everywhere"]
 
 NAMES = ("x_mm", "y_mm", "radius_mm")
 
-_COARSE_MM = 0.5  # between distances at which the model is asked; a cubic spline leads from one to the next
-_FINE_MM = 0.125  # between entries
-_PROBE_MM = 80.0  # how far from the edge the model is asked at all
-_FLAT = 1e-5  # share of the levels' difference by which a level counts as that far from any edge
+_COARSE_MM = 0.5  # spacing of distances at which the model is evaluated, for a cubic spline
+_FINE_MM = 0.125  # spacing of entries
+_PROBE_MM = 80.0  # largest distance from the edge that is evaluated
+_FLAT = 1e-5  # share of the levels' difference below which a level counts as constant
 _DIRECTIONS = 128
 _BENDS = 8
 _TINY = 1e-30
@@ -44,7 +43,7 @@ class DiscTable:
     Attributes
     ----------
     dark, bright
-        Levels read far outside and far inside.
+        Readings far outside and far inside.
     margin_mm
         Distance from the edge within which the level differs from these.
     bend_per_mm
@@ -62,7 +61,7 @@ class DiscTable:
 
     @classmethod
     def of(cls, model: SensorModel) -> Self | None:
-        """Tabulate a model, or return None for one that a table does not hold.
+        """Tabulate a model, or return None if that is not possible.
 
         A table holds a known mixture, or the naive sensor, over a single circle, with no effects but those of
         `is_alike_everywhere`; it must see no farther than 80 mm.
@@ -105,14 +104,14 @@ class DiscTable:
     def predict_at(
         self, theta: FloatArray, x_mm: FloatArray, y_mm: FloatArray, orientation_rad: FloatArray
     ) -> FloatArray:
-        """Noise-free readings where each hypothesis stands in places of its own.
+        """Return noise-free readings at different places for each hypothesis.
 
         Parameters
         ----------
         theta
             Discs, (n_samples, 3).
         x_mm, y_mm, orientation_rad
-            Where the sensor stands, and how it is turned: broadcasting to (n_samples, n_points).
+            Poses of the sensor, broadcasting to (n_samples, n_points).
         """
         require_columns(theta, NAMES)
         away_x, away_y = x_mm - theta[:, :1], y_mm - theta[:, 1:2]
@@ -149,12 +148,12 @@ class DiscTable:
     def mass(
         self, theta: FloatArray, weight: FloatArray, grid: Grid, levels: FloatArray, turn_rad: FloatArray
     ) -> FloatArray:
-        """Weigh the levels that hypotheses predict at every place of a grid.
+        """Return the weighted histogram of predicted levels at every place of a grid.
 
         Parameters
         ----------
         theta, weight
-            Hypotheses (n_samples, 3) and what each weighs, (n_samples,).
+            Hypotheses (n_samples, 3) and their weights, (n_samples,).
         grid
             The places.
         levels
@@ -178,7 +177,7 @@ class DiscTable:
             y_mm = single(grid.y_mm[start : start + ROWS])
             spans = _spans(discs, grid, y_mm, margin)
             ring = spans.ring()
-            level: IntArray = np.full(len(ring.place), bright)  # a place on the very edge is inside
+            level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
                 away = _Away.of(discs, spans, ring, y_mm, turn[start : start + ROWS].ravel())
                 level = nearest.reshape(-1)[self._entry(away)]
@@ -187,7 +186,7 @@ class DiscTable:
         return mass
 
     def _margin_of(self, nearest: IntArray, ends: tuple[int, int]) -> float:
-        """Distance from an edge beyond which the nearest of a list of levels is that of no edge."""
+        """Return the distance from an edge beyond which the nearest of a list of levels is constant."""
         if self.margin_mm == 0.0:
             return 0.0
         distance = np.linspace(-self.margin_mm, self.margin_mm, nearest.shape[2])
@@ -195,7 +194,7 @@ class DiscTable:
         return float(np.abs(distance[off]).max(initial=0.0))
 
     def _entry(self, away: _Away) -> IntArray:
-        """Index of the table's nearest entry for pairs of disc and place."""
+        """Return the index of the table's nearest entry for pairs of disc and place."""
         _, n_directions, n_distances = self.levels.shape
         step = away.distance_mm + np.float32(self.margin_mm)
         step *= self._per_mm
@@ -225,7 +224,7 @@ def is_alike_everywhere(effect: AnyEffect) -> bool:
 
 
 def _spans(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> Spans:
-    """Find where discs, (n_samples, 3), cross rows of a grid, (n_rows,), both in single precision."""
+    """Return the intervals in which discs, (n_samples, 3), cross rows of a grid, (n_rows,), in single precision."""
     x, y, radius = discs.T
     every_up = y_mm[:, None] - y
     row, hypothesis = np.nonzero(np.abs(every_up) <= radius + np.float32(margin_mm))
@@ -264,13 +263,13 @@ class _Away:
 
 
 def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Grow from 0 to 4 around the origin as an angle does, without a trigonometric function."""
+    """Return a pseudo-angle from 0 to 4 around the origin, monotonic in the angle, without trigonometry."""
     across = x / np.maximum(np.abs(x) + np.abs(y), _TINY)
     return np.asarray(2.0 - np.copysign(1.0 + across, y))
 
 
 def _direction(pseudo_angle: FloatArray) -> FloatArray:
-    """Turn pseudo-angles into unit vectors, (n, 2)."""
+    """Convert pseudo-angles to unit vectors, (n, 2)."""
     upper = pseudo_angle <= 2.0
     across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
     up = np.where(upper, 1.0, -1.0) * (1.0 - np.abs(across))
@@ -278,13 +277,13 @@ def _direction(pseudo_angle: FloatArray) -> FloatArray:
 
 
 def _cell(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
-    """Split positions in units of the spacing into the entry below and the way to the next."""
+    """Split positions in units of the spacing into the index below and the fraction to the next."""
     below = np.clip(position.astype(np.int64), 0, n - 2)
     return below, position - below
 
 
 def _asked(model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray) -> FloatArray:
-    """Ask the model at places about one disc, -> (n_directions, n_distances)."""
+    """Evaluate the model at places about one disc, -> (n_directions, n_distances)."""
     away = (radius_mm + distance_mm)[:, None] * directions[:, None, :]
     places = away.reshape(-1, 2)
     n = len(places)
@@ -295,7 +294,7 @@ def _asked(model: SensorModel, radius_mm: float, directions: FloatArray, distanc
 
 
 def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
-    """Levels far outside and at the middle of a large disc."""
+    """Return the levels far outside and at the middle of a large disc."""
     east = np.array([[1.0, 0.0]])
     dark, bright = _asked(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
     if dark == bright:
@@ -306,7 +305,7 @@ def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
 def _margin(
     model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
 ) -> float:
-    """Distance from an edge beyond which the level is that of no edge, for the smallest and the largest disc."""
+    """Return the distance from an edge beyond which the level is constant, for the smallest and the largest disc."""
     margin = _COARSE_MM
     for radius in (low_mm, high_mm):
         distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)

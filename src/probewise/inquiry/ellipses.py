@@ -1,4 +1,4 @@
-"""Ellipses under a known footprint: the nearest point of the edge, and how it bends there, decide what is seen."""
+"""Response of a known footprint to ellipses, from the nearest point of the edge and its curvature there."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _TINY = np.float32(1e-6)
 
 @dataclass(frozen=True, eq=False)
 class Ellipses:
-    """Hold ellipses in the lab frame, and, for each Gaussian, in the frame in which that is the unit one.
+    """Ellipses in the lab frame and, for each Gaussian of the footprint, in the frame in which it is the unit Gaussian.
 
-    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1, dx and dy from where the footprint's middle
-    lies over the ellipse's: `lab` (5, n_ellipses) holds that place, then xx, xy, yy. `grows` is what one sd of the
-    footprint adds to the scale of each ellipse at most, `off` what the Gaussians' distance from that middle adds.
-    `into` maps a place to the frames of the semi-axes `axes`, (n_gaussians, 2, n_ellipses), major and minor:
-    (n_gaussians, 2, 3, n_ellipses), the last but one what is multiplied with x, with y, and added.
-    `rows_mm` (2, n_ellipses) are the lowest and the highest point.
+    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1, dx and dy from the place at which the
+    footprint's centre is over the ellipse's: `lab` (5, n_ellipses) holds that place, then xx, xy, yy. `grows` is the
+    largest increase of each ellipse's scale per sd of the footprint, `off` the increase by the Gaussians' offsets from
+    the centre. `into` maps a place to the frames of the semi-axes `axes`, (n_gaussians, 2, n_ellipses), major and
+    minor: (n_gaussians, 2, 3, n_ellipses), the last but one what is multiplied with x, with y, and added. `rows_mm` (2,
+    n_ellipses) are the lowest and the highest point.
     """
 
     rows_mm: FloatArray
@@ -40,7 +40,7 @@ class Ellipses:
 
     @classmethod
     def of(cls, region: EllipseRegion, footprint: FixedMixture) -> Self:
-        """Take ellipses, (n_ellipses of them), under a footprint in the lab frame."""
+        """Build from n_ellipses ellipses under a footprint in the lab frame."""
         cosine, sine = np.cos(region.angle_rad), np.sin(region.angle_rad)
         turn = np.stack([np.stack([cosine, sine], axis=-1), np.stack([-sine, cosine], axis=-1)], axis=1)
         form = np.einsum("nki,nk,nkj->nij", turn, region.semi_axes_mm**-2, turn)
@@ -63,7 +63,7 @@ class Ellipses:
         )
 
     def along(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
-        """Cross ellipses with rows of places, both (n_crossings,)."""
+        """Intersect ellipses with rows of places, both (n_crossings,)."""
         lab, grows, off, into, axes = (
             values.take(which, axis=-1) for values in (self.lab, self.grows, self.off, self.into, self.axes)
         )
@@ -73,10 +73,10 @@ class Ellipses:
 
 @dataclass(frozen=True, eq=False)
 class CrossedEllipses:
-    """Ellipses crossed by rows: as `Ellipses`, with one along the last axis for every crossing.
+    """Ellipses intersected by rows: as `Ellipses`, with one crossing per entry of the last axis.
 
-    In the frames of the semi-axes a place is `slope` x + `base`, (n_gaussians, 2, n_crossings); the second row of
-    `lab` is how far the row is above the ellipse.
+    In the frames of the semi-axes a place is `slope` x + `base`, (n_gaussians, 2, n_crossings); the second row of `lab`
+    is the height of the row above the ellipse.
     """
 
     share: FloatArray
@@ -88,10 +88,9 @@ class CrossedEllipses:
     axes: FloatArray
 
     def within(self, reach: float) -> Interval:
-        """Find where the edge is farther than `reach` sds inside; no farther beside than that where it is negative.
+        """Return the interval deeper than `reach` sds inside the edge; for negative `reach`, up to that far outside.
 
-        An ellipse scaled by 1 + d / (its shortest semi-axis) holds all that is within d of it, since no support is
-        shorter than that axis; and likewise inwards.
+        An ellipse scaled by 1 + d / (its shortest semi-axis) contains all points within d of it; and likewise inwards.
         """
         x_mm, up, xx, xy, yy = self.lab
         scale = 1.0 - np.float32(reach) * self.grows - np.float32(np.sign(reach)) * self.off
@@ -101,7 +100,7 @@ class CrossedEllipses:
         return np.where((room > 0) & (scale > 0), middle - half, np.inf), middle + half
 
     def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Share of the footprint over the ellipse with the sensor at places of crossings, both (n_pairs,).
+        """Return the share of the footprint over the ellipse for places of crossings, both (n_pairs,).
 
         The nearest point is found by one step along the circle of curvature from the point on the same ray.
         """

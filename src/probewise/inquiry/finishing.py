@@ -1,4 +1,4 @@
-"""Near the end, ask for the reading after which there may be nothing left to ask."""
+"""Near the end of a run, choose the reading most likely to end it."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from probewise.inquiry.utility import InformationGain, Utility
 
 __all__ = ["Finishing"]
 
-_NEAR = 15.0  # times the sd that is asked for: farther off than that no single reading ends a run
+_NEAR = 15.0  # times the target sd: beyond it, no single reading ends a run
 _MOST_ASKED = 800  # hypotheses
 _MOST_DESIGNS = 250  # the best by the other utility
 
 
 @dataclass(frozen=True)
 class Finishing:
-    """Probability that the next reading ends the run, where some reading may well do so; otherwise another utility.
+    """Utility: the probability that the next reading ends the run, if some reading may; otherwise another utility.
 
-    Information counts every bit alike, also of what is known well enough. Greedy for bits, a robot goes on
-    sharpening one length while another is still too wide; this looks at the sds that the run is to end on.
+    Information counts bits on every parameter, even one that is known well enough: a greedy robot would refine one
+    length while another is still too uncertain. This utility uses the sds of the stopping rule.
 
     Parameters
     ----------
     of
-        What a reading is worth until then.
+        The utility until then.
     least
-        Probability of ending the run from which on it is all that counts.
+        Probability of ending the run from which it replaces the other utility.
     """
 
     of: Utility = field(default_factory=InformationGain)
@@ -44,15 +44,15 @@ class Finishing:
 
     @property
     def label(self) -> str:
-        """The other's, and what stands in its place near the end."""
+        """Label of the other utility and of its replacement near the end."""
         return f"{self.of.label}, or chance to finish"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
-        """Value every design that can be taken, (n,): all by the one measure or all by the other."""
+        """Return the utility of every available design, (n,), all by the same measure."""
         return self.measure(prospect)[0]
 
     def measure(self, prospect: Prospect) -> tuple[FloatArray, str]:
-        """Value every design that can be taken, (n,), and say by which of the two measures, as a colour bar does."""
+        """Return the utility of every available design, (n,), and the label of the measure used."""
         worth = self.of(prospect)
         if prospect.goal is None or not _is_near(prospect, prospect.goal):
             return worth, self.of.label
@@ -66,14 +66,14 @@ class Finishing:
 
 
 def _is_near(prospect: Prospect, goal: Goal) -> bool:
-    """Whether one more reading may end the run, and none has yet."""
+    """Return whether one more reading may end the run."""
     lengths = prospect.theta[:, goal.columns]
     spread = prospect.weight @ (lengths - prospect.weight @ lengths) ** 2
     return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
 
 
 def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
-    """Probability of a reading after which every length is known well enough, at some designs, (n_designs,)."""
+    """Return the probability that a reading at each design reaches the target precision, (n_designs,)."""
     rows, share = thinned(prospect.weight, _MOST_ASKED)
     away = prospect.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()

@@ -1,4 +1,4 @@
-"""What hypotheses predict at every design, as weights of levels; by asking them one by one, where no table serves."""
+"""Predictive distributions at every design, as weights of levels, by direct predictions if there is no table."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ __all__ = [
 ]
 
 MOST_LEVELS = 1000
-"""Levels, and cells of the reading, that the choice of a place tells apart: more than hypotheses can fill."""
+"""Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 
 
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
-_MOST_ASKED = 400  # hypotheses that are asked one by one
-_PER_SD = 8.0  # levels a noise sd: of a few hundred hypotheses each counts by itself
+_MOST_ASKED = 400  # hypotheses predicted directly
+_PER_SD = 8.0  # levels per noise sd: fine, since each of a few hundred hypotheses matters
 
 
 class Outlook(Protocol):
-    """What hypotheses predict at some designs, by level."""
+    """Predictive distribution of the noise-free reading at some designs, as weights of levels."""
 
     @property
     def levels(self) -> FloatArray:
@@ -44,7 +44,7 @@ class Outlook(Protocol):
         ...
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Weigh the hypotheses that predict each level, one combination of the designs with all places after another.
+        """Yield the weight of each level, for one combination of settings with all places after another.
 
         Parameters
         ----------
@@ -53,17 +53,17 @@ class Outlook(Protocol):
 
         Yields
         ------
-        Which of the designs that are looked at these are, (n,), and the weight of each level there, (n, n_levels).
+        Indices into the designs, (n,), and the weight of each level there, (n, n_levels).
         """
         ...
 
 
 class Forecast(Protocol):
-    """Predict for many hypotheses at many designs at once."""
+    """Predictions for many hypotheses at many designs at once."""
 
     @property
     def model(self) -> SensorModel:
-        """The sensor model that readings are held against."""
+        """The sensor model."""
         ...
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -73,25 +73,25 @@ class Forecast(Protocol):
     def outlook(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> Outlook:
-        """Look ahead.
+        """Return the predictive distribution at designs.
 
         Parameters
         ----------
         theta, weight
-            Hypotheses, (n_samples, n_params), and their weights, (n_samples,), where not all can be asked.
+            Hypotheses, (n_samples, n_params), and their weights, (n_samples,), used if only some can be predicted.
         designs, plan
             The designs, and the same as rows of a plan.
         rows
-            Which of them to look at, (n,).
+            Indices of the designs to predict, (n,).
         noise_sd
-            Sd of a reading's noise: levels need be no closer than to be hidden by it.
+            Sd of a reading's noise, which sets the spacing of levels.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class AskedForecast:
-    """Any model: at most 400 hypotheses, taken evenly by their weight, asked at every design."""
+    """A forecast for any model: direct predictions of at most 400 hypotheses, resampled systematically."""
 
     model: SensorModel
 
@@ -136,7 +136,7 @@ def by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
 
 
 def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """Split rows of designs, (n,): number of the combination, which of the rows are of it, and their places."""
+    """Split rows of designs, (n,), by combination: its number, indices of its rows, and their places."""
     combination, place = np.divmod(rows, n_places)
     for number in np.unique(combination).tolist():
         at = np.flatnonzero(combination == number)
@@ -144,7 +144,7 @@ def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArra
 
 
 def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
-    """Ask every hypothesis at every row of a long plan where it can show: (n_samples, n_points)."""
+    """Predict every hypothesis at every row of a long plan, skipping rows that cannot see it: (n_samples, n_points)."""
     sight = Sight.of(model, theta, plan)
     if sight is not None:
         out = np.full((len(theta), len(plan)), sight.beside)
@@ -160,14 +160,14 @@ def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
 
 
 def spread_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
-    """Even levels from one reading to another, no further apart than `spacing` unless that takes more than `most`."""
+    """Return evenly spaced levels between two readings, at most `spacing` apart, but at most `most` levels."""
     low, high = min(low, high), max(low, high)
     n = max(2, int(np.ceil((high - low) / spacing)) + 1)
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
 
 
 def thinned(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
-    """Rows of at most `n` hypotheses and what each stands for: systematic resampling without its random start."""
+    """Return indices of at most `n` hypotheses and their weights, by systematic resampling with a fixed start."""
     some = np.flatnonzero(weight > 0)
     if len(some) <= n:
         return some, weight[some]

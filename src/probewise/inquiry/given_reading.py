@@ -1,4 +1,4 @@
-"""What weighted hypotheses amount to given each value that a reading may take, for many designs at once."""
+"""Posterior means given each possible value of a reading, for many designs at once."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from probewise.inquiry.readout import Readout
 
 __all__ = ["GivenReading"]
 
-_PER_SD = 2.0  # levels of the predicted reading per sd of the noise
+_PER_SD = 2.0  # levels of the predicted reading per noise sd
 _LEAST = 1e-12
 
 
 class GivenReading:
-    """Means over the hypotheses given each cell of a reading.
+    """Sums over the hypotheses given each cell of a reading.
 
-    Hypotheses that predict nearly the same reading are summed first, so that the noise is applied to some hundred
-    levels and not to every hypothesis.
+    Hypotheses with nearly equal predictions are summed first, so that the noise is applied to some hundred levels
+    instead of every hypothesis.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class GivenReading:
 
     @cached_property
     def mass(self) -> FloatArray:
-        """Weight of all hypotheses together in each cell, (n_designs, n_cells); never 0."""
+        """Total weight in each cell, (n_designs, n_cells); never 0."""
         return np.maximum(self.sum(np.ones(len(self._weight))), _LEAST)
 
     def sum(self, values: FloatArray) -> FloatArray:

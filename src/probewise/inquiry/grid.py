@@ -1,4 +1,4 @@
-"""Where the arm might look next: the fine grid of places over the field."""
+"""The fine grid of possible places over the field."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Grid"]
 
 @dataclass(frozen=True)
 class Grid:
-    """Spread places evenly over the field, edges included; the default is the paper's 131 x 65 over 1048 x 520 mm."""
+    """Evenly spaced places over the field, edges included; by default the paper's 131 x 65 over 1048 x 520 mm."""
 
     width_mm: float = 1048.0
     height_mm: float = 520.0
@@ -34,7 +34,7 @@ class Grid:
 
     @property
     def n_places(self) -> int:
-        """How many places there are."""
+        """Number of places."""
         return self.n_x * self.n_y
 
     @cached_property
@@ -54,16 +54,16 @@ class Grid:
         return _read_only(np.stack([x.ravel(), y.ravel()], axis=-1))
 
     def image(self, values: FloatArray) -> FloatArray:
-        """Arrange one value a place as rows and columns, (n_places,) -> (n_y, n_x), lower row first."""
+        """Arrange one value per place as an image, (n_places,) -> (n_y, n_x), lower row first."""
         if values.shape != (self.n_places,):
             raise ShapeError(f"values have shape {values.shape}; allowed: ({self.n_places},), one a place")
         return values.reshape(self.n_y, self.n_x)
 
     def plan(self, pattern_name: str, *, orientation_rad: float = 0.0, time_s: float = 0.0) -> Plan:
-        """Lay out one possible reading a place, all at the same time.
+        """Return a plan with one reading per place, all at the same time.
 
-        Each place is a scan of its own, because they are alternatives and not a sequence:
-        nothing that depends on the order of readings may carry over from one to the next.
+        Each place is a scan of its own, because they are alternatives and not a sequence: effects of the order of
+        readings must not act between them.
         """
         n = self.n_places
         return Plan(

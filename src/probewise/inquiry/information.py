@@ -1,4 +1,4 @@
-"""Bits learned about the parameters: prior minus posterior differential entropy, by three routes.
+"""Information gained on the parameters: prior minus posterior differential entropy, by three methods.
 
 The first comes with nested sampling: its information H is the relative entropy of the
 posterior to the prior, and the two entropies differ from it by the mean log prior only.
@@ -22,7 +22,7 @@ __all__ = ["bits_gained", "gaussian_entropy", "neighbour_entropy", "prior_entrop
 
 
 def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, prior_entropy_bits: float) -> float:
-    """Turn nested sampling's information into prior minus posterior differential entropy.
+    """Convert nested sampling's information to prior minus posterior differential entropy.
 
     With p the prior and P the posterior, h(P) = -H - E_P[ln p], so h(p) - h(P) = H + E_P[ln p] + h(p).
     For a uniform prior the last two cancel and the bits are H / ln 2.
@@ -42,13 +42,13 @@ def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, p
 
 
 def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20_000) -> float:
-    """Differential entropy of a prior in bits: minus the mean log2 density of draws from it."""
+    """Return the differential entropy of a prior in bits, by minus the mean log2 density of draws from it."""
     theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
     return -float(np.mean(prior.log_prob(theta))) / math.log(2)
 
 
 def gaussian_entropy(theta: FloatArray) -> float:
-    """Differential entropy in bits of the Gaussian with the samples' covariance, theta (n_samples, n_params)."""
+    """Return the entropy in bits of a Gaussian with the samples' covariance, theta (n_samples, n_params)."""
     n_samples, n_params = theta.shape
     if n_samples <= n_params:
         raise ParameterError("n_samples", n_samples, f"more than the {n_params} parameters")
@@ -58,7 +58,7 @@ def gaussian_entropy(theta: FloatArray) -> float:
 
 
 def neighbour_entropy(theta: FloatArray, *, neighbour: int = 4) -> float:
-    """Differential entropy in bits from distances to the k-th neighbour, theta (n_samples, n_params).
+    """Return the differential entropy in bits from distances to the k-th neighbour, theta (n_samples, n_params).
 
     Kozachenko and Leonenko's estimate (k as in Kraskov et al. 2004): psi(n) - psi(k) + ln V_d
     + d mean(ln r_k). The columns are scaled to unit sd first, and the scale is added back,

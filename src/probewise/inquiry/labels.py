@@ -1,4 +1,4 @@
-"""What a measurement may be asked to tell apart: hypotheses get labels."""
+"""Labels of hypotheses: a measurement may target the information on a label only."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ __all__ = ["FunctionValue", "Label", "ParameterValue", "WhichShape"]
 
 
 class Label(Protocol):
-    """Label hypotheses: those of one label need not be told apart."""
+    """A labelling of hypotheses; those with the same label need not be distinguished."""
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
-        """Label weighted hypotheses, names of the columns, (n_samples, n_params), (n_samples,) -> (n_samples,)."""
+        """Return labels of weighted hypotheses: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
         ...
 
 
 @dataclass(frozen=True)
 class ParameterValue:
-    """Tell the values of one parameter apart, in bins that are equally probable now."""
+    """Labels by the value of one parameter, in bins of equal posterior probability."""
 
     name: str
     n_bins: int = 16
@@ -44,7 +44,7 @@ class ParameterValue:
 
 @dataclass(frozen=True)
 class FunctionValue:
-    """Tell the values of any function of the parameters apart, (n_samples, n_params) -> (n_samples,)."""
+    """Labels by the value of a function of the parameters, (n_samples, n_params) -> (n_samples,)."""
 
     function: Callable[[FloatArray], FloatArray]
     n_bins: int = 16
@@ -62,7 +62,7 @@ class FunctionValue:
 
 @dataclass(frozen=True)
 class WhichShape:
-    """Tell apart which shape of a set lies there."""
+    """Labels by the shape in a set of shapes."""
 
     def __str__(self) -> str:
         return "the shape"
@@ -80,7 +80,7 @@ def _require_bins(n_bins: int) -> None:
 
 
 def _evenly_binned(values: FloatArray, weight: FloatArray, n_bins: int) -> IntArray:
-    """Put values into bins of equal weight, numbered from the lowest."""
+    """Return the bin of each value, for bins of equal weight numbered from the lowest."""
     order = np.argsort(values, kind="stable")
     before = np.cumsum(weight[order]) - 0.5 * weight[order]
     out = np.empty(len(values), dtype=np.int64)

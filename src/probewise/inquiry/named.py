@@ -1,4 +1,4 @@
-"""Utilities by the names that a command line or a table of rows gives them."""
+"""Utilities by name, for the command line and studies."""
 
 from __future__ import annotations
 

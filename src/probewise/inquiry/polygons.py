@@ -1,4 +1,4 @@
-"""Convex polygons under a known footprint: the two nearest edges decide what is seen."""
+"""Response of a known footprint to convex polygons, from the two nearest edges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEAST = np.float32(1e-9)
 
 @dataclass(frozen=True, eq=False)
 class Polygons:
-    """Hold every polygon's edges as half-planes, in sds of each Gaussian of the footprint across the edge.
+    """Edges of polygons as half-planes, in sds of each Gaussian of the footprint across the edge.
 
     Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons). `opening` numbers
     the corner of edges k and m (see `seen_of_corner`), (n_gaussians, 2^n_edges, n_polygons), at 2^k + 2^m; `share` is
@@ -38,7 +38,7 @@ class Polygons:
 
     @classmethod
     def of(cls, region: PolygonRegion, footprint: FixedMixture) -> Self | None:
-        """Take convex polygons, (n_polygons of them), under a footprint in the lab frame; None for any other."""
+        """Build from n_polygons convex polygons under a footprint in the lab frame; None for other shapes."""
         edges = region.edges_mm
         n_edges = edges.shape[1]
         along = edges[:, :, 1] - edges[:, :, 0]
@@ -67,14 +67,14 @@ class Polygons:
         )
 
     def along(self, which: IntArray, y_mm: FloatArray) -> CrossedPolygons:
-        """Cross polygons with rows of places, both (n_crossings,)."""
+        """Intersect polygons with rows of places, both (n_crossings,)."""
         slope, up, offset = (values.take(which, axis=-1) for values in (self.across, self.up, self.offset))
         return CrossedPolygons(self.share, slope, up * y_mm + offset, self.opening, which)
 
 
 @dataclass(frozen=True, eq=False)
 class CrossedPolygons:
-    """Polygons `which`, (n_crossings,), crossed by rows.
+    """Polygons `which`, (n_crossings,), intersected by rows.
 
     Distance inside edge k = slope x + base, (n_gaussians, n_edges, n_crossings).
     """
@@ -86,9 +86,9 @@ class CrossedPolygons:
     which: IntArray
 
     def within(self, reach: float) -> Interval:
-        """Find where every edge is farther inside than `reach` sds; no farther beside than that where it is negative.
+        """Return the interval deeper than `reach` sds inside every edge; for negative `reach`, up to that far outside.
 
-        Of several Gaussians it is the farthest inside that counts beside the polygon, and the nearest deep inside.
+        For several Gaussians, the outermost counts outside the polygon, and the innermost inside.
         """
         slope = np.where(np.abs(self.slope) < _LEAST, _LEAST, self.slope)
         at = (np.float32(reach) - self.base) / slope
@@ -98,7 +98,7 @@ class CrossedPolygons:
         return outermost(low, axis=0).max(axis=0), innermost(high, axis=0).min(axis=0)
 
     def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Share of the footprint over the polygon with the sensor at places of crossings, both (n_pairs,)."""
+        """Return the share of the footprint over the polygon for places of crossings, both (n_pairs,)."""
         which = self.which.take(crossing)
         out = single(np.zeros(x_mm.shape))
         for share, slope, base, opening in zip(self.share, self.slope, self.base, self.opening, strict=True):

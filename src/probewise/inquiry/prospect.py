@@ -1,4 +1,4 @@
-"""What the hypotheses that are still believed promise of every design: all that a utility may ask."""
+"""Posterior, designs and predictive distributions: the input of every utility."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from probewise.recordings.plan import Plan
 
 __all__ = ["Goal", "Prospect"]
 
-_CELL = 0.75  # width of a cell, in sds of noise, of readings that are not rounded: hides 2 % of a nat, everywhere alike
-_SETTLED = 1.0 - 1e-7  # share of the hypotheses that predict one level, from which on it is certain
-_BLOCK = 512  # designs whose readings are weighed at a time: they stay in the cache
+_CELL = 0.75  # width of a cell in noise sds, for unrounded readings: loses 2 % of a nat, uniformly
+_SETTLED = 1.0 - 1e-7  # weight of one level from which it counts as certain
+_BLOCK = 512  # designs per batch, to fit the cache
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What a run is to end on: the posterior sd of every parameter in these columns of theta below `sd`."""
+    """The stopping rule of a run: posterior sds of these columns of theta below `sd`."""
 
     columns: tuple[int, ...]
     sd: float
@@ -31,26 +31,26 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Prospect:
-    """Hold posterior, designs and sensor; answer what a utility asks of them.
+    """Posterior, designs and sensor, with the quantities that utilities need.
 
     Attributes
     ----------
     forecast
-        Predicts, with its sensor model.
+        Predictions, with the sensor model.
     readout
         Noise, rounding and range of a reading.
     theta, weight
         The whole posterior, (n_samples, n_params), and its weights, (n_samples,), summing to one.
     drawn
-        A few equally weighted samples of it, (n_drawn, n_params); the paper has 50.
+        A few equally weighted posterior samples, (n_drawn, n_params); 50 in the paper.
     designs, plan
         The designs, and the same as rows of a plan.
     rows
-        Those that can be taken, (n,): every answer is about these, in this order.
+        Indices of the available designs, (n,); all results are for these, in this order.
     cost_s
         Seconds that each of them takes, (n,).
     goal
-        What the run is to end on, where it is a matter of sds.
+        The stopping rule, if it is one of sds.
     """
 
     forecast: Forecast
@@ -77,24 +77,24 @@ class Prospect:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters, one a column of theta."""
+        """Names of the parameters, one per column of theta."""
         return self.forecast.model.names
 
     @cached_property
     def predicted(self) -> FloatArray:
-        """Noise-free readings of the few samples at every design that can be taken, (n_drawn, n)."""
+        """Noise-free readings of the drawn samples at every available design, (n_drawn, n)."""
         answers = self.forecast.predict(self.drawn, self.plan.take(self.rows))
         require_finite("predicted", answers)
         return answers
 
     @cached_property
     def outlook(self) -> Outlook:
-        """Levels that the whole posterior predicts."""
+        """Predictive distribution under the whole posterior."""
         noise_sd = self.readout.noise_sd / np.sqrt(max(self.designs.repeats))
         return self.forecast.outlook(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
 
     def information(self, weight: FloatArray) -> FloatArray:
-        """Give the bits expected of the reading at every design, were the hypotheses so weighted, (n_samples,)."""
+        """Return the expected information in bits of a reading at every design, for weights (n_samples,)."""
         out = np.empty(len(self.rows))
         for at, mass in self.outlook.maps(weight):
             chance = self._chance(at)
@@ -102,9 +102,9 @@ class Prospect:
         return out
 
     def reading_entropy(self, weight: FloatArray) -> FloatArray:
-        """Give the entropy, bits, of the reading at every design: levels, noise, rounding and range together.
+        """Return the entropy in bits of the reading at every design, including noise, rounding and range.
 
-        The weights, (n_samples,), may leave out some hypotheses; they are taken to one.
+        The weights, (n_samples,), are normalised, and may be 0 for some hypotheses.
         """
         out = np.empty(len(self.rows))
         for at, mass in self.outlook.maps(weight):
@@ -112,14 +112,14 @@ class Prospect:
         return out
 
     def _chance(self, at: IntArray) -> FloatArray:
-        """Probability of each cell given each level, for designs that are read equally often."""
+        """Return the probability of each cell given each level, for designs with equal repeats."""
         n = int(self.designs.n_repeats[self.rows[at[0]]])
         chance = self.readout.probability(self.outlook.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
         return np.asarray(chance.astype(np.float32))
 
 
 def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
-    """Entropy, bits, of the cell that is read, of weights of levels (n, n_levels) that are taken to one: (n,)."""
+    """Return the entropy in bits of the reading's cell, for unnormalised weights of levels (n, n_levels): (n,)."""
     level = mass.argmax(axis=1)
     settled = mass[np.arange(len(mass)), level] >= _SETTLED * mass.sum(axis=1)
     out = np.asarray(entropy_bits(chance)[level], dtype=np.float64)
@@ -133,5 +133,5 @@ def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
 
 
 def _entropy_of_noise(mass: FloatArray, chance: FloatArray) -> FloatArray:
-    """Entropy, bits, that is left on average when the level is known, of weights of levels (n, n_levels): (n,)."""
+    """Return the mean entropy in bits of a reading given its level, for weights of levels (n, n_levels): (n,)."""
     return np.asarray(mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1))

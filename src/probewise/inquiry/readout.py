@@ -1,4 +1,4 @@
-"""From a noise-free level to the number that is read: noise, rounding, the ends of the scale."""
+"""From a noise-free level to the recorded number: noise, rounding, range."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from probewise.errors import ParameterError
 
 __all__ = ["Readout", "entropy_bits"]
 
-_REACH = 5.0  # sds of noise beyond the levels that the cells cover
-_FINE = 0.25  # width of a cell, in sds of noise, where readings are not rounded: it hides 0.3 % of a nat
+_REACH = 5.0  # noise sds beyond the levels that the cells cover
+_FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
 _LEAST = np.float32(1e-30)
 
 
 @dataclass(frozen=True)
 class Readout:
-    """Noise of known sd, then rounding to whole steps, then the ends of the scale.
+    """Noise of known sd, then rounding to whole steps, then clipping to the range.
 
     Parameters
     ----------
     noise_sd
         Sd of the Gaussian noise of one reading, in the sensor's unit.
     step
-        What readings are whole multiples of; None: they are not rounded.
+        Rounding step of the readings; None: not rounded.
     low, high
-        Least and greatest reading that the sensor can return.
+        Smallest and largest possible reading.
     """
 
     noise_sd: float
@@ -46,7 +46,7 @@ class Readout:
             raise ParameterError("(low, high)", (self.low, self.high), "low < high")
 
     def require(self, value: float) -> None:
-        """Refuse a reading that this sensor cannot return; NaN is a reading that did not come."""
+        """Raise ParameterError for a reading out of range; NaN is a missing reading."""
         if not (math.isnan(value) or self.low <= value <= self.high):
             raise ParameterError(
                 "reading",
@@ -55,25 +55,24 @@ class Readout:
             )
 
     def edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
-        """Edges of the cells that readings of these levels may fall into, (n_cells - 1,); the end cells are open.
+        """Return the edges of the cells for readings of these levels, (n_cells - 1,); the end cells are open.
 
-        Readings that are not rounded fall into cells of `fine` sds of noise; where that makes more than `most` cells,
-        neighbours are taken together.
+        Cells of unrounded readings are `fine` noise sds wide; above `most` cells, neighbours are merged.
         """
         width = fine * self.noise_sd if self.step is None else self.step
         least = max(float(np.min(levels)) - _REACH * self.noise_sd, self.low)
         greatest = min(float(np.max(levels)) + _REACH * self.noise_sd, self.high)
         if most is not None:
-            width *= max(1, math.ceil((greatest - least) / (most * width))) | 1  # odd: no edge lies on a step
+            width *= max(1, math.ceil((greatest - least) / (most * width))) | 1  # odd, so that no edge is on a step
         first, last = math.floor(least / width + 0.5), math.ceil(greatest / width - 0.5)
         return np.asarray((np.arange(first, max(last, first + 1)) + 0.5) * width, dtype=np.float64)
 
     def probability(
         self, levels: FloatArray, *, repeats: int = 1, fine: float = _FINE, most: int | None = None
     ) -> FloatArray:
-        """Probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `edges`.
+        """Return the probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `edges`.
 
-        Of several repeats it is that of their mean, as if it were rounded as finely as its noise is small.
+        For repeats it is that of their mean, with cells scaled to its smaller noise.
         """
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
@@ -83,7 +82,7 @@ class Readout:
 
 
 def entropy_bits(probability: FloatArray) -> FloatArray:
-    """Shannon entropy in bits along the last axis, any shape and precision; what cannot be has none."""
+    """Return the Shannon entropy in bits along the last axis; zero probabilities contribute 0."""
     log = np.log2(np.maximum(probability, _LEAST))
     log *= probability
     return np.asarray(-log.sum(axis=-1))

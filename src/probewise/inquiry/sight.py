@@ -1,4 +1,4 @@
-"""Where a sensor can see a shape at all: elsewhere it reads what it reads beside it, and need not be asked."""
+"""Culling bounds: the region in which each hypothesis changes the reading; elsewhere no prediction is needed."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from probewise.sensor.stages import SensorModel
 
 __all__ = ["Sight"]
 
-_REACH = 6.0  # sds of a footprint beyond which it sees nothing: 1e-9 of the levels' difference
+_REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
 _TILE_MM = 110.0
 _FAR_MM = 1e5
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """Bounds about each hypothesis, `low_mm` and `high_mm`, (n_samples, 2); outside the reading is `beside`."""
+    """Bounding boxes of the hypotheses, `low_mm` and `high_mm`, (n_samples, 2); outside, the reading is `beside`."""
 
     low_mm: FloatArray
     high_mm: FloatArray
@@ -33,9 +33,9 @@ class Sight:
 
     @classmethod
     def of(cls, model: SensorModel, theta: FloatArray, plan: Plan) -> Self | None:
-        """Bound what hypotheses, (n_samples, n_params), can show; None for a model whose readings depend on more.
+        """Compute the bounds of hypotheses, (n_samples, n_params); None if readings depend on more than the shape.
 
-        A known mixture, known levels and no effects leave nothing but the shape to make a difference.
+        Only the shape matters for a known mixture and known levels without effects.
         """
         if not isinstance(model, Chain) or model.effects or is_commanded(plan) or len(plan) == 0:
             return None
@@ -46,7 +46,7 @@ class Sight:
         region = model.scene.shape.region(theta)
         try:
             edges = outlines(region)
-        except ParameterError:  # no closed edge: it may be seen anywhere
+        except ParameterError:  # no closed edge: it may be visible anywhere
             return None
         sds = np.sqrt(np.linalg.eigvalsh(model.ssf.covs_mm2)[:, -1])
         reach = float((np.linalg.norm(model.ssf.means_mm, axis=1) + _REACH * sds).max())
@@ -56,7 +56,7 @@ class Sight:
         return cls(frozen(low - reach), frozen(high + reach), float(beside))
 
     def parts(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
-        """Split a plan into tiles of the field: rows of the plan, and the hypotheses that show something there."""
+        """Yield tiles of the field: rows of the plan, and the hypotheses visible there."""
         column, row = (np.floor(place / _TILE_MM).astype(np.int64) for place in (plan.x_mm, plan.y_mm))
         tiles = np.unique(np.stack([column, row]), axis=1, return_inverse=True)[1].ravel()
         order = np.argsort(tiles, kind="stable")

@@ -1,4 +1,4 @@
-"""What a known sensor reads of any ellipses and convex polygons, from tables of the unit Gaussian."""
+"""Tabulated response of a known sensor to ellipses and convex polygons, by tables of the unit Gaussian."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["Silhouettes"]
 
 
 class _Crossed(Protocol):
-    """Shapes of one kind, each crossed by a row of places."""
+    """Shapes of one kind, each intersected by a row of places."""
 
     def within(self, reach: float) -> Interval:
-        """Find where along the row the footprint is `reach` sds inside, or no farther than -`reach` sds beside."""
+        """Return the interval in which the footprint is `reach` sds inside, or at most -`reach` sds outside."""
         ...
 
     def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Share of the footprint over the shape with the sensor at places of crossings, both (n_pairs,)."""
+        """Return the share of the footprint over the shape for places of crossings, both (n_pairs,)."""
         ...
 
 
@@ -42,15 +42,15 @@ class _Kind(Protocol):
         ...
 
     def along(self, which: IntArray, y_mm: FloatArray) -> _Crossed:
-        """Cross shapes with rows of places, arrays of one shape."""
+        """Intersect shapes with rows of places, arrays of one shape."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouettes:
-    """Shapes under a footprint in the lab frame, by kind: rows of the hypotheses, and their geometry.
+    """Shapes under a footprint in the lab frame, by kind: indices of the hypotheses, and their geometry.
 
-    `footprint_mm` says how far off the sensor the middle of a Gaussian is at most, and its widest sd.
+    `footprint_mm` is the largest offset of a Gaussian from the sensor, and its largest sd.
     """
 
     n_shapes: int
@@ -59,7 +59,7 @@ class Silhouettes:
 
     @classmethod
     def of(cls, region: Region, footprint: FixedMixture) -> Self | None:
-        """Take the regions of hypotheses; None for any that are not white ellipses and convex polygons."""
+        """Build from the regions of hypotheses; None unless all are white ellipses or convex polygons."""
         parts = []
         for rows, part in _by_kind(region):
             kind = _kind_of(part, footprint)
@@ -71,7 +71,7 @@ class Silhouettes:
         return cls(region.n_regions, tuple(parts), (float(off), float(widest)))
 
     def seen(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Share of the footprint over every shape, with the sensor at places, (n_places,) -> (n_shapes, n_places)."""
+        """Return the share of the footprint over every shape at places, (n_places,) -> (n_shapes, n_places)."""
         out = np.empty((self.n_shapes, len(x_mm)))
         for rows, kind in self.parts:
             every = np.repeat(np.arange(len(rows)), len(x_mm))
@@ -81,16 +81,16 @@ class Silhouettes:
         return out
 
     def mass(self, weight: FloatArray, grid: Grid, dark: float, bright: float, levels: FloatArray) -> FloatArray:
-        """Weigh the levels that the shapes' readings have at every place of a grid.
+        """Return the weighted histogram of predicted levels at every place of a grid.
 
         Parameters
         ----------
         weight
-            What each shape weighs, (n_shapes,).
+            Weight of each shape, (n_shapes,).
         grid
             The places.
         dark, bright
-            What is read outside and inside.
+            Readings outside and inside.
         levels
             Evenly spaced levels, (n_levels,), from the darkest to the brightest; a reading counts for the nearest.
 
@@ -102,7 +102,7 @@ class Silhouettes:
         first, per_level = float(levels[0]), 1.0 / float(levels[1] - levels[0])
         lowest, per_share = (dark - first) * per_level, (bright - dark) * per_level
         ends = round(lowest), round(lowest + per_share)
-        # So far from any edge the nearest level is that of no edge; half of half a level, for two edges may add up.
+        # Beyond this distance the nearest level is constant: a quarter of a level, since two edges may add up.
         reach = min(REACH, -float(ndtri(0.25 / max(abs(per_share), 1.0))))
         pad_mm = self.footprint_mm[0] + reach * self.footprint_mm[1]
         mass = np.zeros((grid.n_places, n_levels))

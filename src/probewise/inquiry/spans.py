@@ -1,4 +1,4 @@
-"""Which places of a grid lie in shapes, and which near their edges: row by row, for many shapes at once."""
+"""Scanline intervals: places of a grid inside shapes, and near their edges, row by row for many shapes at once."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from probewise.inquiry.grid import Grid
 __all__ = ["ROWS", "Interval", "Ring", "Spans", "single", "whole"]
 
 ROWS = 3
-"""Rows of a grid that are weighed at a time: what is counted there stays in the cache."""
+"""Rows of a grid per batch, to fit the cache."""
 
 Interval = tuple[FloatArray, FloatArray]
-"""From where to where along a row, mm, one array each; nowhere where the first is above the second."""
+"""Ends of intervals along a row, mm, one array each; empty if the first exceeds the second."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ring:
-    """Pairs of a span and a place near the edge, (n_pairs,): which span, which column, and which place of the rows."""
+    """Pairs of a span and a place near the edge, (n_pairs,): indices of span, column, and place."""
 
     span: IntArray
     column: IntArray
@@ -31,10 +31,10 @@ class Ring:
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Where shapes cross some rows of a grid, (n_spans,) each: which row, which shape, and columns there.
+    """Intersections of shapes with some rows of a grid, (n_spans,) each: row, shape, and columns.
 
     The row is counted from the first of them. Columns from `first` to `last` are in the shape or near its edge,
-    those from `inner_first` to `inner_last` deep inside; where none is, these are `last` + 1 and `last`.
+    those from `inner_first` to `inner_last` deep inside; if there are none, these are `last` + 1 and `last`.
     """
 
     grid: Grid
@@ -55,9 +55,9 @@ class Spans:
         Parameters
         ----------
         grid, n_rows, row, hypothesis
-            The grid, how many of its rows are looked at, and the row and the shape of each span.
+            The grid, the number of its rows used, and the row and the shape of each span.
         outer, inner
-            Intervals along the row, in single precision, which holds a place to a ten-thousandth of a millimetre.
+            Intervals along the row, in single precision, which resolves a ten-thousandth of a millimetre.
         """
         per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
 
@@ -73,11 +73,11 @@ class Spans:
         return cls(grid, n_rows, row, hypothesis, first, last, inner_first, inner_last)
 
     def ring(self) -> Ring:
-        """Pairs of span and place in the ring about the edge: left of what is deep inside, then right of it."""
+        """Pairs of span and place in the ring about the edge: left of the interior, then right of it."""
         n = len(self.row)
         count = np.concatenate([self.inner_first - self.first, self.last - self.inner_last])
         begin = np.concatenate([self.first, self.inner_last + 1])
-        # Repeating is the slow step: it is done once, and everything else is looked up.
+        # Repeating is the slow step: it is done once, and everything else is indexed.
         span = np.repeat(np.arange(2 * n), count)
         column = whole(begin - np.cumsum(count) + count)[span]
         column += whole(np.arange(len(span)))
@@ -87,16 +87,16 @@ class Spans:
     def weigh(
         self, weight: FloatArray, ring: Ring, level: IntArray, ends: tuple[int, int], n_levels: int
     ) -> FloatArray:
-        """Weigh the levels read at every place of the rows.
+        """Return the weighted histogram of levels at every place of the rows.
 
         Parameters
         ----------
         weight
-            What each shape weighs, (n_shapes,).
+            Weight of each shape, (n_shapes,).
         ring, level
-            Pairs near the edges, and the number of the level that is read there, (n_pairs,).
+            Pairs near the edges, and the index of the level there, (n_pairs,).
         ends, n_levels
-            Numbers of the levels of no edge, outside and inside, and how many levels there are.
+            Indices of the constant levels outside and inside, and the number of levels.
 
         Returns
         -------
@@ -104,7 +104,7 @@ class Spans:
         """
         n_places = self.n_rows * self.grid.n_x
         near = np.bincount(ring.place * n_levels + level, weight[self.hypothesis][ring.span], n_places * n_levels)
-        mass = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # NumPy counts nothing in whole numbers
+        mass = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # integers if there are no pairs
         inside = self._inside(weight)
         outside = weight.sum() - inside - mass.sum(axis=1)
         mass[:, ends[1]] += inside
@@ -112,7 +112,7 @@ class Spans:
         return mass
 
     def _inside(self, weight: FloatArray) -> FloatArray:
-        """Weight of the shapes that each place of the rows lies deep in, (n_rows * n_x,)."""
+        """Return the weight of the shapes that contain each place deep inside, (n_rows * n_x,)."""
         width = self.grid.n_x + 1
         own, size = weight[self.hypothesis], self.n_rows * width
         begins = np.bincount(self.row * width + self.inner_first, own, minlength=size)
@@ -121,10 +121,10 @@ class Spans:
 
 
 def single(values: NDArray[Any]) -> FloatArray:
-    """Round to single precision, which the checker of types does not tell from double."""
+    """Round to single precision, which the type checker does not distinguish from double."""
     return cast(FloatArray, np.asarray(values, dtype=np.float32))
 
 
 def whole(values: NDArray[Any]) -> IntArray:
-    """Cut to whole numbers of 32 bits, which the checker of types does not tell from 64."""
+    """Truncate to 32-bit integers, which the type checker does not distinguish from 64-bit ones."""
     return cast(IntArray, values.astype(np.int32))

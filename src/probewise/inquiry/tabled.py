@@ -1,4 +1,4 @@
-"""What all hypotheses predict at every design, from tables: one of discs, or those of the unit Gaussian."""
+"""Forecasts by tables: of the response to discs, or of the unit Gaussian's response to edges."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from probewise.sensor.stages import SensorModel
 
 __all__ = ["DiscForecast", "SilhouetteForecast", "forecast_of"]
 
-_PER_SD = 2.0  # levels a noise sd: rounding adds 2 % to its variance, and thousands of hypotheses average over it
-_N_CHECKED = 64  # shapes of the prior, at 16 places each
+_PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
+_N_CHECKED = 64  # shapes drawn from the prior, checked at 16 places each
 _PLACES = 16
-_MOST_OFF = 0.005  # rms share of the difference between dark and bright
+_MOST_OFF = 0.005  # largest rms error, as a share of the difference between dark and bright
 _REACH = 3.0  # sds of the footprint about an edge
 _FEW = 1000  # rows of a plan
-_MOST_WAYS = 8  # in which the sensor stands
+_MOST_WAYS = 8  # orientations and heights of the sensor
 
 
 @dataclass(frozen=True, eq=False)
 class DiscForecast:
-    """All hypotheses, from the table of what the sensor reads of a disc."""
+    """A forecast for discs, by the table of the sensor's response."""
 
     model: SensorModel
     table: DiscTable
@@ -72,7 +72,7 @@ class _DiscOutlook:
     levels: FloatArray
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `Outlook.maps`: one map for each way that the sensor stands; the table knows no other setting."""
+        """See `Outlook.maps`: one map per orientation of the sensor; the table has no other setting."""
         some = weight > 0
         stood, mass = None, np.empty(0)
         for number, at, places in by_combination(self.rows, self.grid.n_places):
@@ -84,10 +84,10 @@ class _DiscOutlook:
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteForecast:
-    """All hypotheses of any ellipses and convex polygons, from tables of what the unit Gaussian sees.
+    """A forecast for ellipses and convex polygons, by tables of the unit Gaussian's response.
 
-    They hold the readings of a known mixture of Gaussians to 0.5 % of the difference between dark and bright in the
-    mean square: held against the model itself when they are made.
+    Its rms error is at most 0.5 % of the difference between dark and bright, which is checked against the sensor model
+    on construction.
     """
 
     model: Chain
@@ -97,14 +97,15 @@ class SilhouetteForecast:
 
     @classmethod
     def of(cls, model: SensorModel, *, highest: float = 1.0) -> Self | None:
-        """Make one, or return None for a model that the tables do not serve.
+        """Build the forecast, or return None if the tables do not apply to the model.
 
         Parameters
         ----------
         model
-            A known mixture over a hypothesised scene, without effects, whose shapes are wide against its footprint.
+            A known mixture over a hypothesised scene, without effects, with shapes that are wide compared to its
+            footprint.
         highest
-            Greatest height at which the sensor may stand, over that of its calibration: there its footprint is widest.
+            Largest height of the sensor over that of its calibration, at which its footprint is widest.
         """
         if not isinstance(model, Chain) or model.effects or not isinstance(model.scene, HypothesisScene):
             return None
@@ -114,7 +115,7 @@ class SilhouetteForecast:
         return made if made._is_faithful(max(highest, 1.0)) else None
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `Forecast.predict`: at few places for every pair by the tables; at many only where shapes can show."""
+        """See `Forecast.predict`: by the tables; for many places, only where shapes are visible."""
         if len(plan) > _FEW:
             return predicted(self.model, theta, plan)
         ways, which = np.unique(np.stack([plan.orientation_rad, _heights(plan)]), axis=1, return_inverse=True)
@@ -131,7 +132,7 @@ class SilhouetteForecast:
     def outlook(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> Outlook:
-        """See `Forecast.outlook`; asked one by one where the arm turns the sensor from place to place."""
+        """See `Forecast.outlook`; by direct predictions if the orientation changes from place to place."""
         turns, heights = (a.reshape(-1, designs.grid.n_places) for a in (plan.orientation_rad, _heights(plan)))
         asked = partial(AskedForecast(self.model).outlook, theta, weight, designs, plan, rows, noise_sd)
         if (turns != turns[:, :1]).any() or set(plan.covariates) - {"height_mm"}:
@@ -149,7 +150,7 @@ class SilhouetteForecast:
         return _SilhouetteOutlook(sights, ways, designs.grid, rows, levels)
 
     def _silhouettes(self, theta: FloatArray, turn_rad: float, height: float) -> Silhouettes | None:
-        """Put shapes under the sensor, turned, at `height` times that of its calibration."""
+        """Return the shapes under the sensor at an orientation, and at `height` times that of its calibration."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         stands = height * np.array([[cosine, -sine], [sine, cosine]])
         seen = FixedMixture(
@@ -158,11 +159,11 @@ class SilhouetteForecast:
         return Silhouettes.of(self.shape.region(theta), seen)
 
     def _ends(self, height: float) -> tuple[float, float]:
-        """Give the readings beside the shape and deep inside: light fades with the square of the height."""
+        """Return the readings outside and deep inside a shape; light falls with the square of the height."""
         return self.levels.i_min, self.levels.i_min + (self.levels.i_max - self.levels.i_min) / height**2
 
     def _is_faithful(self, highest: float) -> bool:
-        """Hold the tables against the model, at places about the edges of some shapes of the prior."""
+        """Return whether tables and model agree, at places about the edges of some shapes from the prior."""
         prior, rng = self.shape.prior, np.random.default_rng(0)
         theta = prior.from_unit_cube(rng.random((_N_CHECKED, len(prior.names))))
         silhouettes = self._silhouettes(theta, 0.0, highest)
@@ -181,7 +182,7 @@ class SilhouetteForecast:
 
 
 class _Sight(NamedTuple):
-    """All shapes under a sensor that stands in one way, and what it reads beside and deep inside them."""
+    """All shapes under a sensor of one orientation and height, and its readings outside and deep inside them."""
 
     silhouettes: Silhouettes
     dark: float
@@ -197,7 +198,7 @@ class _SilhouetteOutlook:
     levels: FloatArray
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `Outlook.maps`: one map for each way that the sensor stands, however often it reads there."""
+        """See `Outlook.maps`: one map per orientation and height, for all numbers of repeats."""
         stood, mass = None, np.empty(0)
         for number, at, places in by_combination(self.rows, self.grid.n_places):
             if stood != self.ways[number]:
@@ -208,10 +209,9 @@ class _SilhouetteOutlook:
 
 
 def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast:
-    """Choose the way that a model allows: tables where they can be made.
+    """Choose the forecast for a model: tables if possible.
 
-    `highest` is the greatest height at which the sensor may stand, over that of its calibration, where it can be
-    chosen; None: it stands as it was calibrated.
+    `highest` is the largest height of the sensor over that of its calibration; None: always the calibrated height.
     """
     if cards_of(model):
         return _over_cards(model, highest)
@@ -230,7 +230,7 @@ def _tabled(model: Chain) -> TabledChain | None:
 
 
 def _over_cards(model: SensorModel, highest: float | None) -> Forecast:
-    """Take tables of the shape alone, where there are such, and lay the cards over them."""
+    """Use tables for the shape alone, if possible, with cards on top."""
     if not isinstance(model, Chain) or model.effects or highest is not None:
         return AskedForecast(model)
     base = forecast_of(replace(model, scene=HypothesisScene(model.scene.shape)))  # type: ignore[attr-defined]
@@ -238,13 +238,13 @@ def _over_cards(model: SensorModel, highest: float | None) -> Forecast:
 
 
 def _heights(plan: Plan) -> FloatArray:
-    """Height of every row over that of the calibration, (n_points,)."""
+    """Return the height of every row over that of the calibration, (n_points,)."""
     ratio = height_ratio(plan)
     return np.ones(len(plan)) if ratio is None else ratio
 
 
 def _plan_at(places_mm: FloatArray, height: float) -> Plan:
-    """Lay out readings at places, (n_points, 2), at `height` times that of the calibration."""
+    """Return a plan of readings at places, (n_points, 2), at `height` times that of the calibration."""
     n = len(places_mm)
     zero = np.zeros(n, dtype=np.int64)
     return Plan(

@@ -1,4 +1,4 @@
-"""Effects before and after what the sensor sees of a disc: what it sees there comes from the table."""
+"""Predictions with effects that act before or after the response to a disc, which is tabulated."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class TabledChain:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The chain's."""
+        """Names of the chain's parameters."""
         return self.chain.names
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Where to measure to learn which model is true: one Gaussian or two, this effect or that one."""
+"""Expected information of readings on which of several models is true."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from probewise.sensor.stages import SensorModel
 
 __all__ = ["Rival", "tell_apart"]
 
-_PER_SD = 8.0  # levels a noise sd
+_PER_SD = 8.0  # levels per noise sd
 _BLOCK = 512
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """One of the models that may be true: samples of its posterior and how probable it is.
+    """One of several competing models: posterior samples and probability.
 
     `theta` has shape (n_samples, n_params), equally weighted; `probability` need not be normalised.
     """
@@ -40,18 +40,18 @@ class Rival:
 
 
 def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatArray:
-    """Give the bits that each reading of a plan is expected to tell of which rival is true.
+    """Return the expected information in bits of each reading of a plan on which rival is true.
 
-    The entropy of what may be read whoever is right, less its average when it is known who is: the
-    Jensen-Shannon divergence of the rivals' predictive distributions, each with its own uncertain
-    parameters. It is at most the entropy of the rivals' probabilities.
+    It is the Jensen-Shannon divergence of the rivals' predictive distributions, marginalised over their parameters: the
+    entropy of the reading minus its mean entropy given the rival. It is at most the entropy of the rivals'
+    probabilities.
 
     Parameters
     ----------
     rivals
         Two models or more, of any parameters.
     plan
-        Readings that might be taken, n_points rows, each by itself.
+        Possible readings, n_points rows, each by itself.
     readout
         Noise, rounding and range of a reading.
 
@@ -80,7 +80,7 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
 
 
 def _shares(answers: FloatArray, levels: FloatArray) -> FloatArray:
-    """Share of the samples that predict each level, (n_samples, n_points) -> (n_points, n_levels)."""
+    """Return the share of samples that predict each level, (n_samples, n_points) -> (n_points, n_levels)."""
     n_samples, n_points = answers.shape
     index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
     key = index + np.arange(n_points) * len(levels)

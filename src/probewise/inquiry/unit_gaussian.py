@@ -1,7 +1,7 @@
-"""What the unit Gaussian sees of a corner and of a bent edge, tabulated once: any Gaussian over any shape is near one.
+"""Tables of the unit Gaussian's mass inside a corner and inside a curved edge, which approximate any shape locally.
 
-Distances are in sds of the footprint across the edge, positive inside. The tables are even and the nearest entry
-counts: off by 0.4 % of the span between dark and bright in the mean square at most, less than noise hides.
+Distances are in sds of the footprint across the edge, positive inside. Entries are evenly spaced and the nearest one is
+used, with an rms error of at most 0.4 % of the span between dark and bright, less than the noise.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from probewise.inquiry.spans import single, whole
 __all__ = ["N_OPENINGS", "REACH", "seen_of_bend", "seen_of_corner"]
 
 REACH = 4.0
-"""Sds beyond which an edge is not seen: 3e-5 of the span."""
+"""Sds beyond which an edge is negligible: 3e-5 of the span."""
 
 N_OPENINGS = 64
-"""Kinds of corner in the table: correlations of the two distances, evenly spaced in their arc sine."""
+"""Number of corners in the table: correlations of the two distances, evenly spaced in their arc sine."""
 
 _PER_SD = 32
 _N = int(2 * REACH * _PER_SD) + 1
@@ -29,7 +29,7 @@ _NODES = 40
 
 
 def seen_of_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> FloatArray:
-    """Mass of the unit Gaussian within two edges: bivariate normal of their distances, arrays of one shape.
+    """Return the mass of the unit Gaussian within two edges: bivariate normal CDF of their distances.
 
     `opening` numbers the correlation r of the two distances: floor((arcsin(r) / pi + 1 / 2) N_OPENINGS).
     """
@@ -39,7 +39,7 @@ def seen_of_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> 
 
 
 def seen_of_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
-    """Mass of the unit Gaussian within an edge that bends away, `bend` the curvature times the sd; one shape."""
+    """Return the mass of the unit Gaussian within a curved edge; `bend` is the curvature times the sd."""
     index = np.minimum(whole(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
     index += _entry(distance)
     return np.asarray(_bends().reshape(-1)[index])
@@ -51,7 +51,7 @@ def _entry(distance: FloatArray) -> IntArray:
 
 @cache
 def _corners() -> FloatArray:
-    """Tabulate the bivariate normal (N_OPENINGS, n, n), by Plackett's integral over the arc sine of the correlation.
+    """Tabulate the bivariate normal CDF (N_OPENINGS, n, n), by Plackett's integral over the correlation's arc sine.
 
     d/dt F(h, k; sin t) = exp(-(h^2 - 2 h k sin t + k^2) / (2 cos^2 t)) / 2 pi (Plackett 1954), from F(h, k; 0), the
     product; and F(h, k; -r) = F(h) - F(h, -k; r).
@@ -76,7 +76,7 @@ def _corners() -> FloatArray:
 
 @cache
 def _bends() -> FloatArray:
-    """Tabulate (n_bends, n): along a parabola, E[F(distance - bend t^2 / 2)], t unit Gaussian, by Gauss and Hermite."""
+    """Tabulate (n_bends, n): for a parabola, E[F(distance - bend t^2 / 2)], t unit Gaussian, by Gauss-Hermite."""
     node, share = np.polynomial.hermite_e.hermegauss(_NODES)
     middle = (np.arange(_N_BENDS) + 0.5) / _N_BENDS
     bend = (middle / (1.0 - middle))[:, None, None]

@@ -1,4 +1,4 @@
-"""How much a reading at each design would be worth: one small function a utility, behind one seam."""
+"""Utilities (acquisition functions) of readings, behind one interface."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["InformationAbout", "InformationGain", "PerSecond", "ReadingEntropy",
 
 
 class Utility(Protocol):
-    """Worth of a reading at each design; more is better. A frozen dataclass, so that a journal can name it."""
+    """Utility of a reading at each design; larger is better. A frozen dataclass, so that a journal can record it."""
 
     @property
     def label(self) -> str:
-        """What the worth is, with its unit, for a colour bar."""
+        """Label with unit, for a colour bar."""
         ...
 
     def __call__(self, prospect: Prospect) -> FloatArray:
-        """Value every design that can be taken, (n,)."""
+        """Return the utility of every available design, (n,)."""
         ...
 
 
@@ -55,8 +55,8 @@ class ReadingEntropy:
 class InformationGain:
     """Expected information, in bits, about all parameters together (Lindley 1956).
 
-    The entropy of what may be read (uncertain parameters, noise, rounding and range together) less
-    the entropy of the noise, which is all that would be left if the parameters were known.
+    The entropy of the predictive distribution (parameters, noise, rounding and range) minus the expected entropy given
+    the parameters, which is due to noise.
     """
 
     label: ClassVar[str] = "expected information (bits)"
@@ -68,17 +68,17 @@ class InformationGain:
 
 @dataclass(frozen=True)
 class InformationAbout:
-    """Expected information, in bits, about what a label tells apart: a function of the parameters, the kind of shape.
+    """Expected information, in bits, about a label: a function of the parameters, or the kind of shape.
 
-    The entropy of what may be read, less that which is left when the label is known: what the
-    hypotheses of one label disagree on among themselves is of no interest.
+    The entropy of the predictive distribution minus its expected entropy given the label: differences among hypotheses
+    of the same label do not count.
     """
 
     of: Label
 
     @property
     def label(self) -> str:
-        """Information, and what about."""
+        """Label of the information and its target."""
         return f"information about {self.of} (bits)"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
@@ -94,17 +94,17 @@ class InformationAbout:
 
 @dataclass(frozen=True)
 class PerSecond:
-    """Worth of a reading over the seconds that it takes, travel included."""
+    """Utility of a reading per second, including travel."""
 
     of: Utility = field(default_factory=InformationGain)
 
     @property
     def label(self) -> str:
-        """The other's, per second."""
+        """Label of the other utility, per second."""
         return f"{self.of.label} per second"
 
     def __call__(self, prospect: Prospect) -> FloatArray:
-        """Worth a second at every design, (n,)."""
+        """Return the utility per second at every design, (n,)."""
         if not (prospect.cost_s > 0).all():
             raise ParameterError(
                 "cost_s", float(prospect.cost_s.min()), "greater than 0: a reading takes time where the arm stands, too"
@@ -113,7 +113,7 @@ class PerSecond:
 
 
 def label_entropy(labels: FloatArray) -> FloatArray:
-    """Entropy, in bits, of the labels in each column, (n_samples, n_places) -> (n_places,).
+    """Return the entropy, in bits, of the labels in each column, (n_samples, n_places) -> (n_places,).
 
     H = log2(n) - sum_j c_j log2(c_j) / n over the distinct labels j of a column, c_j their
     counts: those are the lengths of the runs of a sorted column, found for all at once.

@@ -1,4 +1,4 @@
-"""The map: what a reading at each design would be worth, and the choice of the next."""
+"""The map of a utility over designs, and the choice of the next reading."""
 
 from __future__ import annotations
 
@@ -22,16 +22,15 @@ from probewise.sensor.stages import SensorModel
 __all__ = ["UtilityMap", "entropy_map", "utility_map"]
 
 FLAT = 1e-5
-"""Utilities that differ by less are equal for every purpose: single precision computes them."""
+"""Utilities that differ by less count as equal, since they are computed in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class UtilityMap:
-    """Hold the worth of each design.
+    """The utility of each design.
 
-    `values` has shape (n_designs,), bits where the utility is an entropy or an information, 0 where
-    `reachable` is False: nothing can be learned where the arm cannot go. `label` says what the values are, with
-    their unit.
+    `values` has shape (n_designs,), bits where the utility is an entropy or an information, and 0 where `reachable` is
+    False. `label` names the values with their unit.
     """
 
     designs: Designs
@@ -46,9 +45,9 @@ class UtilityMap:
 
     @property
     def image(self) -> FloatArray:
-        """The map as rows and columns, shape (n_y, n_x), lower row first; NaN, for drawing, out of reach.
+        """The map as an image, shape (n_y, n_x), lower row first; NaN out of reach.
 
-        Where a place allows several designs, the best of them.
+        With several designs per place, the best of them.
         """
         every = np.where(self.reachable, self.values, -np.inf).reshape(-1, self.grid.n_places)
         best = every.max(axis=0)
@@ -56,18 +55,18 @@ class UtilityMap:
 
     @property
     def highest(self) -> float:
-        """The best that a reading can promise."""
+        """The largest utility."""
         return float(self.values[self.reachable].max())
 
     @property
     def flat(self) -> bool:
-        """Whether there is nothing to choose: all that can be taken promise the same, or the only one nothing."""
+        """Whether there is no choice: all available designs have equal utility, or the only one has none."""
         values = self.values[self.reachable]
         return bool(np.ptp(values) <= FLAT and (len(values) > 1 or values[0] <= FLAT))
 
     @property
     def best(self) -> BoolArray:
-        """The designs that tie for the best, shape (n_designs,)."""
+        """Mask of the designs with the largest utility, shape (n_designs,)."""
         return best_places(self.values, self.reachable)
 
     def choose(self, *, rng: np.random.Generator) -> tuple[float, float]:
@@ -77,16 +76,16 @@ class UtilityMap:
 
 
 def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
-    """Value every design that can be taken (paper, the machine learning system).
+    """Compute the utility of every available design (paper, the machine learning system).
 
     Raises
     ------
     ShapeError
-        If the utility gives another number of values than designs.
+        If the utility returns a wrong number of values.
     ParameterError
         If one of its values is not finite.
     """
-    # The one utility with two measures says which of them these values are.
+    # The utility with two measures reports which one these values are.
     worth, label = utility.measure(prospect) if isinstance(utility, Finishing) else (utility(prospect), utility.label)
     found = np.asarray(worth, dtype=np.float64)
     if found.shape != prospect.rows.shape:
@@ -94,7 +93,7 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
     values = np.zeros(len(prospect.designs))
     reachable = np.zeros(len(prospect.designs), dtype=np.bool_)
     values[prospect.rows], reachable[prospect.rows] = found, True
-    best_places(values, reachable)  # raises where a value is not finite
+    best_places(values, reachable)  # raises if a value is not finite
     values.flags.writeable = False
     return UtilityMap(prospect.designs, values, reachable, label)
 
@@ -109,7 +108,7 @@ def entropy_map(
     noise_sd: float,
     utility: Utility | None = None,
 ) -> UtilityMap:
-    """Ask every hypothesis what it would read at every reachable place: the paper's map, by hand.
+    """Compute the paper's entropy map from the predictions of every hypothesis at every reachable place.
 
     Parameters
     ----------
@@ -120,11 +119,11 @@ def entropy_map(
     grid, plan
         The places, and the same places as rows of a plan (see `Grid.plan`).
     reachable
-        Places the arm can take, shape (n_places,).
+        Mask of reachable places, shape (n_places,).
     noise_sd
-        Sd of the noise of one reading, for utilities that weigh it.
+        Sd of the noise of one reading, for utilities that use it.
     utility
-        What a reading is worth; by default the entropy of the predicted ones.
+        The utility; by default the entropy of the predicted readings.
 
     Raises
     ------
@@ -140,7 +139,7 @@ def entropy_map(
 
 
 def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1) -> IntArray:
-    """Rows of the designs at places that can be reached, (n_places,) -> (n,)."""
+    """Return the indices of the designs at reachable places, (n_places,) -> (n,)."""
     if reachable.shape != (n_places,):
         raise ShapeError(f"reachable has shape {reachable.shape}; allowed: ({n_places},), one a place")
     if not reachable.any():
